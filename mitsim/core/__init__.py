@@ -1,0 +1,1 @@
+"""What every stage shares: errors, units, named random streams, frames on disk, manifests, this machine."""

@@ -1,0 +1,125 @@
+"""Frames on disk: named 2-D channels and metadata in, one OpenEXR file out, and back.
+
+Channels are float32 (expected electrons, variances) or uint32 (digital numbers), stored losslessly. Every
+metadata entry is a header attribute `mitsim.<key>` holding JSON text: EXR's own numbers are 32-bit and would cut seeds
+and exposure times short.
+"""
+
+import hashlib
+import json
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+
+from mitsim.core.errors import MitsimError
+
+Value = str | int | float
+Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
+
+_PREFIX = "mitsim."
+_MAGIC = b"\x76\x2f\x31\x01"
+
+
+def write_frame(path: Path | str, channels: Mapping[str, Channel], metadata: Mapping[str, Value]) -> None:
+    """Write equally shaped 2-D `channels` (float32 or uint32) and `metadata` to `path`, all or nothing.
+
+    The file appears under its name only when complete (a temporary in the same folder, then a rename). Raises
+    TypeError or ValueError for channels that cannot be stored as they are (nothing is converted silently),
+    MitsimError when the file cannot be written.
+    """
+    path = Path(path)
+    _check_channels(channels)
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header.update({_PREFIX + key: json.dumps(_scalar(value)) for key, value in metadata.items()})
+    pixels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
+    try:
+        # Opened here first: OpenEXR reports a folder it cannot write to on stderr, past any caller.
+        temporary.touch()
+        OpenEXR.File(header, pixels).write(str(temporary))
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:
+        raise MitsimError(
+            f"frame {path}: cannot be written ({_one_line(error)}); choose a writable folder with room"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
+    """Channels (2-D, float32 or uint32; half floats of foreign files become float32) and metadata of a frame.
+
+    Files of other programs are read too; their metadata is then empty. Raises MitsimError for a file that is
+    missing, is not OpenEXR, or is damaged.
+    """
+    path = Path(path)
+    _check_magic(path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            header = file.header()
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        metadata = {
+            key[len(_PREFIX) :]: json.loads(value) for key, value in header.items() if key.startswith(_PREFIX)
+        }
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise MitsimError(
+            f"frame {path}: damaged or incomplete OpenEXR file ({_one_line(error)}); write or copy it again"
+        ) from error
+    wide = {name: c.astype(np.float32) if c.dtype == np.float16 else c for name, c in channels.items()}
+    return wide, metadata
+
+
+def checksum(path: Path | str) -> str:
+    """SHA-256 of a file's bytes as 64 hexadecimal digits. Raises MitsimError when it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        with open(path, "rb") as file:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+    except OSError as error:
+        raise MitsimError(f"file {path}: cannot be read ({error.strerror}); check the path") from error
+    return digest.hexdigest()
+
+
+def _check_channels(channels: Mapping[str, Channel]) -> None:
+    if not channels:
+        raise ValueError("write_frame: no channels given; a frame needs at least one")
+    shapes = {np.shape(values) for values in channels.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
+        raise ValueError(
+            f"write_frame: channel shapes are {sorted(shapes)}; all must be one non-empty 2-D shape"
+        )
+    for name, values in channels.items():
+        if np.asarray(values).dtype not in (np.float32, np.uint32):
+            raise TypeError(
+                f"write_frame: channel {name!r} is {np.asarray(values).dtype}; make it float32 or uint32"
+            )
+
+
+def _scalar(value: Value) -> Value:
+    plain: Any = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(plain, (str, int, float)):
+        raise TypeError(
+            f"write_frame: metadata value {value!r} is {type(value).__name__}; use str, int or float"
+        )
+    return plain
+
+
+def _check_magic(path: Path) -> None:
+    try:
+        with open(path, "rb") as file:
+            start = file.read(4)
+    except OSError as error:
+        raise MitsimError(f"frame {path}: cannot be read ({error.strerror}); check the path") from error
+    if start != _MAGIC:
+        raise MitsimError(f"frame {path}: not an OpenEXR file (first bytes {start!r}); give a .exr frame")
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
