@@ -63,10 +63,11 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header = file.header()
+            # Both are emptied when the file closes, so they are copied here.
+            metadata = {
+                key[len(_PREFIX) :]: json.loads(header[key]) for key in header if key.startswith(_PREFIX)
+            }
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-        metadata = {
-            key[len(_PREFIX) :]: json.loads(value) for key, value in header.items() if key.startswith(_PREFIX)
-        }
     except (RuntimeError, ValueError, TypeError) as error:
         raise MitsimError(
             f"frame {path}: damaged or incomplete OpenEXR file ({_one_line(error)}); write or copy it again"
