@@ -1,0 +1,110 @@
+"""Frames are added one at a time to W = sum_ij U_Li^T Y_ij U_Rj; memory does not grow with their number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.factors import FloatArray, Side, Slab
+
+
+class Accumulator:
+    """Sum over frames of what the solver needs: W, the frames' energy, and which frames came.
+
+    Made by :meth:`mitsim.reconstruct.solver.Prepared.accumulator`; belongs to the factors that made it.
+    """
+
+    def __init__(self, left: Side, right: Side, centre: bool) -> None:
+        self._left = left
+        self._right = right
+        self._centre = centre
+        self._sum = np.zeros((left.accumulated_size, right.accumulated_size))
+        self._energy = 0.0
+        self._seen = np.zeros((left.pattern_count, right.pattern_count), dtype=np.bool_)
+
+    @property
+    def sum(self) -> FloatArray:
+        """W (r_left, r_right), or for the Gram method the paper's Q (n, n); a copy."""
+        return self._sum.copy()
+
+    @property
+    def energy(self) -> float:
+        """Sum of the squares of all added frames, after centring when that was asked for."""
+        return self._energy
+
+    @property
+    def missing(self) -> list[tuple[int, int]]:
+        """Pattern indices (i, j) whose frame has not been added."""
+        return [(int(i), int(j)) for i, j in np.argwhere(~self._seen)]
+
+    def belongs_to(self, left: Side, right: Side) -> bool:
+        """Whether these are the factors the frames were projected on."""
+        return self._left is left and self._right is right
+
+    def add(self, frame: npt.ArrayLike, row: int, column: int) -> None:
+        """Add the frame (m, m') taken under pattern P_L[:, row] P_R[:, column]^T.
+
+        Any real dtype is taken; sums are float64. For a signed pattern the frame is the difference of its
+        two captures. MitsimError for another shape, a value that is not finite, a pattern index out of
+        range, or a pattern added twice (average repeated captures first).
+        """
+        self._check_index(row, column)
+        values = self._checked(frame, row, column)
+        if self._centre:
+            values = centred(values)
+        flat = values.ravel()
+        energy = float(np.dot(flat, flat))
+        if not np.isfinite(energy):
+            bad = int(np.count_nonzero(~np.isfinite(values)))
+            raise MitsimError(
+                f"frame of pattern ({row}, {column}) has {bad} values that are not finite; capture it again"
+            )
+        left, right = self._left.slabs[row], self._right.slabs[column]
+        where: Any = (left.columns, right.columns)
+        if isinstance(left.columns, np.ndarray) and isinstance(right.columns, np.ndarray):
+            where = np.ix_(left.columns, right.columns)
+        self._sum[where] += _project(values, left, right)
+        self._energy += energy
+        self._seen[row, column] = True
+
+    def _check_index(self, row: int, column: int) -> None:
+        rows, columns = self._seen.shape
+        whole = all(isinstance(k, (int, np.integer)) and not isinstance(k, bool) for k in (row, column))
+        if not (whole and 0 <= row < rows and 0 <= column < columns):
+            raise MitsimError(
+                f"pattern index is ({row}, {column}); allowed are 0 to {rows - 1} and 0 to {columns - 1}"
+            )
+        if self._seen[row, column]:
+            raise MitsimError(
+                f"frame of pattern ({row}, {column}) was added before; average repeated captures first"
+            )
+
+    def _checked(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
+        values = np.asarray(frame)
+        expected = (self._left.sensor_size, self._right.sensor_size)
+        if values.shape != expected or values.dtype.kind not in "buif":
+            raise MitsimError(
+                f"frame of pattern ({row}, {column}) is {values.dtype} of shape {values.shape}; "
+                f"the factors take real numbers of shape {expected}"
+            )
+        return values.astype(np.float64, copy=False)
+
+
+def centred_columns(matrix: FloatArray) -> FloatArray:
+    """C matrix: the mean of each column taken out."""
+    return np.asarray(matrix - matrix.mean(axis=0, keepdims=True))
+
+
+def centred(frame: FloatArray) -> FloatArray:
+    """C Y C with C = I - 1 1^T / m: row and column means taken out, as FlatCam's constant term demands."""
+    return centred_columns(frame - frame.mean(axis=1, keepdims=True))
+
+
+def _project(frame: FloatArray, left: Slab, right: Slab) -> FloatArray:
+    """left^T frame right, the thinner factor first: the frame is then read with the least arithmetic."""
+    if left.matrix.shape[1] < right.matrix.shape[1]:
+        return np.asarray((left.matrix.T @ frame) @ right.matrix)
+    return np.asarray(left.matrix.T @ (frame @ right.matrix))

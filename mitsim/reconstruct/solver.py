@@ -1,0 +1,237 @@
+"""Sensor frames of a separable lensless camera under separable patterns in; the scene's image out.
+
+Solves min_X sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + lambda ||X||^2 (arXiv 2111.12862, eq. 6) with the
+factors prepared once and the frames added one by one:
+
+>>> prepared = prepare(left, right, P_L, P_R)
+>>> frames = prepared.accumulator()
+>>> frames.add(Y, i, j)                           # for each pattern P_L[:, i] P_R[:, j]^T
+>>> solution = prepared.solve(frames, "auto")
+
+With B_L = U_L S_L V_L^T (see :mod:`mitsim.reconstruct.factors`) and W = sum_ij U_Li^T Y_ij U_Rj the
+solution is X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. Its rounding error is about eps /
+sqrt(lambda_rel), with lambda_rel = lambda / (max s_L^2 max s_R^2); with the paper's Q = sum (Phi_L^T Y
+Phi_R) o P in place of W it is eps / lambda_rel (docs/decisions/0001-projected-accumulation.md).
+``method="gram"`` keeps that form for comparison.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.accumulator import Accumulator, centred_columns
+from mitsim.reconstruct.factors import FloatArray, Method, Side, Structure, check_choices, factorise
+from mitsim.reconstruct.regularisation import Spectrum, automatic_lambda
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """An image and how far to trust it.
+
+    Attributes
+    ----------
+    image
+        (n, n') estimate of X, neither clipped nor normalised.
+    lam
+        lambda that was used, in the unit of (Phi_L Phi_R)^2; ``lam_relative`` is that over the largest
+        sigma^2.
+    rank, unknowns
+        numerical rank of the whole model, and n n'.
+    condition
+        the larger cond(A) of the two sides; inf when rank deficient.
+    residual
+        ||Y - model|| / ||Y|| over all frames; rounding hides what is below about 1e-8.
+    ok
+        False when the image lacks something that no lambda explains; ``status`` says what and what to do.
+    status
+        one sentence.
+    """
+
+    image: FloatArray
+    lam: float
+    lam_relative: float
+    rank: int
+    unknowns: int
+    condition: float
+    residual: float
+    ok: bool
+    status: str
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Factorised model, ready for any number of scenes; applying it changes nothing in it."""
+
+    left: Side
+    right: Side
+    method: Method
+    centre: bool
+
+    @property
+    def condition(self) -> float:
+        """The larger cond(A) of the two sides; inf when rank deficient."""
+        return max(self.left.condition, self.right.condition)
+
+    @property
+    def rank(self) -> int:
+        """Numerical rank of the whole model."""
+        return self.left.rank * self.right.rank
+
+    @property
+    def unknowns(self) -> int:
+        """Number of scene pixels."""
+        return self.left.scene_size * self.right.scene_size
+
+    def accumulator(self) -> Accumulator:
+        """An empty sum to add frames to."""
+        return Accumulator(self.left, self.right, self.centre)
+
+    def spectrum(self, frames: Accumulator) -> Spectrum:
+        """Data and singular values in the basis where the problem is diagonal.
+
+        MitsimError when frames are missing: the closed form holds for all patterns or none.
+        """
+        if not frames.belongs_to(self.left, self.right):
+            raise MitsimError(
+                "frames were added to an accumulator of other factors; use this one's accumulator()"
+            )
+        missing = frames.missing
+        if missing:
+            total = self.left.pattern_count * self.right.pattern_count
+            raise MitsimError(
+                f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all"
+            )
+        sigma = np.outer(self.left.singular, self.right.singular)
+        projected = frames.sum
+        if self.method == "gram":
+            rotated = self.left.basis.T @ projected @ self.right.basis
+            projected = np.divide(rotated, sigma, out=np.zeros_like(sigma), where=sigma > 0)
+        data_count = self.left.data_rows * self.right.data_rows
+        return Spectrum(sigma, projected, frames.energy, data_count)
+
+    def image(self, coefficients: npt.ArrayLike) -> FloatArray:
+        """Scene image (n, n') of coefficients (r, r') in the diagonal basis: V_L coefficients V_R^T."""
+        return np.asarray(self.left.basis @ np.asarray(coefficients) @ self.right.basis.T)
+
+    def coefficients(self, image: npt.ArrayLike) -> FloatArray:
+        """Adjoint of :meth:`image`: V_L^T image V_R."""
+        return np.asarray(self.left.basis.T @ np.asarray(image) @ self.right.basis)
+
+    def solve(self, frames: Accumulator, lam: float | Literal["auto"] = "auto") -> Solution:
+        """Tikhonov solution of the added frames.
+
+        ``lam`` is lambda >= 0 in the unit of (Phi_L Phi_R)^2; 0 gives the pseudo-inverse, in which singular
+        values below max(rows, columns) eps of the largest of their side count as zero. ``"auto"`` chooses
+        it by generalised cross-validation. MitsimError for missing frames or another lambda.
+        """
+        spectrum = self.spectrum(frames)
+        if isinstance(lam, str):
+            if lam != "auto":
+                raise MitsimError(f"lambda is {lam!r}; give a number of at least 0, or auto")
+            lam = automatic_lambda(spectrum)
+        lam = float(lam)
+        if not (np.isfinite(lam) and lam >= 0):
+            raise MitsimError(f"lambda is {lam}; give a finite number of at least 0, or auto")
+        sigma = spectrum.sigma
+        filtered = np.divide(
+            sigma * spectrum.projected, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0
+        )
+        residual = spectrum.residual_energy(lam)
+        ok, status = self._verdict(lam)
+        return Solution(
+            image=self.image(filtered),
+            lam=lam,
+            lam_relative=lam / spectrum.scale,
+            rank=self.rank,
+            unknowns=self.unknowns,
+            condition=self.condition,
+            residual=float(np.sqrt(residual / spectrum.energy)) if spectrum.energy > 0 else 0.0,
+            ok=ok,
+            status=status,
+        )
+
+    def _verdict(self, lam: float) -> tuple[bool, str]:
+        """Whether the image is complete, and the sentence that says why not and what to do."""
+        for name, side in (("row", self.left), ("column", self.right)):
+            if side.data_rows < side.scene_size:
+                return False, (
+                    f"Under-determined: {side.data_rows} sensor {name}s over all patterns for "
+                    f"{side.scene_size} scene {name}s; use more patterns, more sensor pixels or fewer scene pixels."
+                )
+        lost = self.unknowns - self.rank
+        if lost and lam == 0:
+            return False, (
+                f"Rank deficient: {lost} of {self.unknowns} directions are not measured and left at zero "
+                "by the pseudo-inverse; use more patterns, or lambda above 0."
+            )
+        if lost:
+            return True, (
+                f"Solved, but {lost} of {self.unknowns} directions are not measured above rounding and follow "
+                "from lambda alone; use more patterns."
+            )
+        return True, "Solved: every direction of the image is measured."
+
+
+def prepare(
+    left: npt.ArrayLike,
+    right: npt.ArrayLike,
+    P_L: npt.ArrayLike,
+    P_R: npt.ArrayLike,
+    method: Method = "svd",
+    structure: Structure = "auto",
+    centre: bool = False,
+) -> Prepared:
+    """Factorise the model of a camera and a pattern family.
+
+    Parameters
+    ----------
+    left, right
+        Phi_L (m, n) and Phi_R (m', n'): scene rows to sensor rows, scene columns to sensor columns.
+    P_L, P_R
+        (n, K) and (n', K') pattern columns; pattern (i, j) is P_L[:, i] P_R[:, j]^T.
+    method
+        ``svd``: factorise the stacked matrix. ``gram``: the paper's Gram matrices, for comparison.
+    structure
+        ``block`` and ``auto`` factorise each group of scene pixels that shares no pattern energy with the
+        others alone; ``full`` takes one group.
+    centre
+        True takes row and column means out of factors and of each added frame: the constant term of a
+        FlatCam mask (1 + m m^T)/2 vanishes as long as the mask covers all that the sensor sees. Where it
+        does not, the leak is (C Phi_1) X (C Phi_1)^T / 2, with Phi_1 the shadow of the mask's outline.
+
+    Raises
+    ------
+    MitsimError
+        for shapes that do not fit, values that are not finite, patterns that light nothing, unknown choices.
+    """
+    check_choices(method, structure)
+    factors = [_matrix("left factor", left), _matrix("right factor", right)]
+    patterns = [_matrix("patterns P_L", P_L), _matrix("patterns P_R", P_R)]
+    for name, factor, pattern in zip(("left", "right"), factors, patterns, strict=True):
+        if factor.shape[1] != pattern.shape[0]:
+            raise MitsimError(
+                f"{name} factor of shape {factor.shape} has {factor.shape[1]} scene pixels "
+                f"but its patterns have {pattern.shape[0]}; both need the same number"
+            )
+        if not (factor.any() and pattern.any()):
+            raise MitsimError(f"{name} factor or its patterns are all zero; there is nothing to solve for")
+    same = np.array_equal(factors[0], factors[1]) and np.array_equal(patterns[0], patterns[1])
+    if centre:
+        factors = [centred_columns(factor) for factor in factors]
+    first = factorise(factors[0], patterns[0], method, structure, centre)
+    second = first if same else factorise(factors[1], patterns[1], method, structure, centre)
+    return Prepared(first, second, method, centre)
+
+
+def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
+    values = np.asarray(array, dtype=np.float64)
+    if values.ndim != 2 or values.size == 0:
+        raise MitsimError(f"{name} have shape {values.shape}; give a 2-D array")
+    if not np.isfinite(values).all():
+        raise MitsimError(f"{name} hold {np.count_nonzero(~np.isfinite(values))} values that are not finite")
+    return values
