@@ -1,0 +1,114 @@
+"""A lensless camera's geometry: from the numbers of a scene's sensor to its pixel grid, mask and shadow factors.
+
+Every part that needs the camera (the renderer's sensor, the factored frames, calibration files) reads this one model,
+so that a fact such as the mask distance is written once. Coordinates are index coordinates (``s_row = -y``,
+``s_col = -x``) in mm, centred on the optical axis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from mitsim.core.configuration import validated
+from mitsim.core.errors import MitsimError
+from mitsim.optics.mask import Mask, MaskKind, mls_mask
+from mitsim.optics.shadow import centred_edges, shadow_factor
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class CameraGeometry(BaseModel):
+    """Bare sensor under a coded mask; the defaults are the geometry of Zheng & Asif, section IV-A."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side (square sensor)")
+    pixel_pitch: float = Field(0.01172, gt=0, description="sensor pixel pitch [mm]")
+    mask: MaskKind = Field("separable", description="mask construction")
+    mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
+    mask_feature: float = Field(0.06, gt=0, description="mask feature size [mm]")
+    mask_distance: float = Field(2.0, gt=0, description="sensor to mask [mm]")
+    scene_distance: float = Field(
+        400.0, gt=0, description="sensor to the plane that the rig is aligned to [mm]"
+    )
+    fov: float = Field(20.0, gt=0, lt=180, description="full angle of the square field stop [degrees]")
+
+    @model_validator(mode="after")
+    def _mask_lies_before_the_scene(self) -> CameraGeometry:
+        if self.mask_distance >= self.scene_distance:
+            raise ValueError(
+                f"mask_distance {self.mask_distance} mm must be less than scene_distance {self.scene_distance} mm"
+            )
+        return self
+
+    @classmethod
+    def checked(cls, where: str, **values: object) -> CameraGeometry:
+        """Build from loose values; a bad one raises MitsimError with one line that names ``where``."""
+        return validated(cls, values, where)
+
+    @property
+    def half_width(self) -> float:
+        """Half the sensor's side [mm]."""
+        return self.pixels * self.pixel_pitch / 2
+
+    @property
+    def tan_half_fov(self) -> float:
+        """Largest |x/z| and |y/z| of a ray that passes the field stop."""
+        return math.tan(math.radians(self.fov) / 2)
+
+    @property
+    def pixel_edges(self) -> FloatArray:
+        """(pixels + 1,) pixel edges [mm]."""
+        return centred_edges(self.pixels, self.pixel_pitch)
+
+    def build_mask(self) -> Mask:
+        """The mask that these numbers describe."""
+        return mls_mask(self.mask, self.mask_feature, self.mask_order)
+
+    def fresnel_number(self, wavelength_nm: float) -> float:
+        """a^2 / (lambda d) of one mask feature: well above 1 means that a geometric shadow is good."""
+        return self.mask_feature**2 / (wavelength_nm * 1e-6 * self.mask_distance)
+
+    def shadow_terms(
+        self, row_edges: FloatArray, column_edges: FloatArray, depth: float
+    ) -> list[tuple[FloatArray, FloatArray]]:
+        """Geometric shadow of tan-angle cells at one depth as separable terms: [(left (m, r), right (m, c)), ...].
+
+        The weight of each term is folded into its left factor. Edges are tan-angles x/z in index coordinates.
+        """
+        mask, edges = self.build_mask(), self.pixel_edges
+        cache: dict[tuple[int, int], FloatArray] = {}
+
+        def factor(profile: FloatArray, cells: FloatArray) -> FloatArray:
+            key = (hash(profile.tobytes()), hash(cells.tobytes()))
+            if key not in cache:
+                cache[key] = shadow_factor(profile, mask.feature_mm, edges, cells, self.mask_distance, depth)
+            return cache[key]
+
+        return [
+            (weight * factor(rows, row_edges), factor(columns, column_edges))
+            for weight, rows, columns in mask.terms
+        ]
+
+
+def anchor_positions(count: int, half_width: float) -> FloatArray:
+    """(count,) sensor coordinates of the anchors [mm]: Chebyshev nodes, the near-best points for interpolation."""
+    if count < 1:
+        raise MitsimError(f"number of anchors a side is {count}; give at least 1")
+    k = np.arange(count)
+    return -half_width * np.cos(np.pi * (2 * k + 1) / (2 * count))
+
+
+def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
+    """(len(at), len(anchors)) Lagrange weights that interpolate values known at ``anchors`` to the points ``at``."""
+    nodes = np.asarray(anchors, dtype=np.float64)
+    weights = np.ones((len(at), len(nodes)))
+    for j, node in enumerate(nodes):
+        for other in np.delete(nodes, j):
+            weights[:, j] *= (at - other) / (node - other)
+    return weights

@@ -1,0 +1,185 @@
+"""Frames in closed form: from light per (anchor, tan-angle cell) to irradiance on every sensor pixel, and its error.
+
+A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
+distribution T is ``sum over mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and its columns
+over (anchor column, cell column). Only rows and columns that hold light enter the product: for k x k shifting dots that
+is one in k of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.core.seeds import stream
+from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
+
+FloatArray = npt.NDArray[np.float64]
+_AT_ONCE = 32
+_LARGEST_BASIS = 256
+_PROBES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Expected irradiance (pixels, pixels) [W m^-2] of one capture, and its Monte Carlo variance, mean over pixels."""
+
+    irradiance: FloatArray
+    variance: float
+
+
+class FrameOptics:
+    """Prepared once for a camera, a cell grid, a depth and a number of anchors; applying it changes nothing."""
+
+    def __init__(
+        self,
+        geometry: CameraGeometry,
+        row_edges: FloatArray,
+        column_edges: FloatArray,
+        depth: float,
+        anchors: int,
+    ) -> None:
+        """``row_edges``, ``column_edges``: (r + 1,), (c + 1,) tan-angles; ``depth`` [mm]; ``anchors`` a side."""
+        edges = geometry.pixel_edges
+        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), (edges[:-1] + edges[1:]) / 2)
+        self.mean_weights = weights.mean(axis=0)
+        self.anchors = anchors
+        self.pixels = geometry.pixels
+        self.cells = (len(row_edges) - 1, len(column_edges) - 1)
+        self.shape = (anchors * self.cells[0], anchors * self.cells[1])
+        # Stored with the light's index first, so that picking lit rows copies contiguous memory.
+        self._terms = [
+            (_stack(left, weights), _stack(right, weights))
+            for left, right in geometry.shadow_terms(row_edges, column_edges, depth)
+        ]
+
+    def frame(self, flat: npt.NDArray[np.int64], light: FloatArray) -> FloatArray:
+        """(pixels, pixels) irradiance of sparse light: distinct flat indices into ``shape``, values [W m^-2]."""
+        rows, columns, block = self._block(flat, light)
+        return np.asarray(sum(left[rows].T @ block @ right[columns] for left, right in self._terms))
+
+    def probe(self, flat: npt.NDArray[np.int64], light: FloatArray, vectors: FloatArray) -> FloatArray:
+        """(pixels, probes): the frame of that light times ``vectors`` (pixels, probes), without forming the frame."""
+        rows, columns, block = self._block(flat, light)
+        return np.asarray(
+            sum(left[rows].T @ (block @ (right[columns] @ vectors)) for left, right in self._terms)
+        )
+
+    def total(self, light: sparse.csr_array) -> FloatArray:
+        """(len(light),) irradiance without the mask, mean over the sensor, of each row of ``light`` [W m^-2]."""
+        row = np.repeat(self.mean_weights, self.cells[0])
+        column = np.repeat(self.mean_weights, self.cells[1])
+        return np.asarray(light @ np.outer(row, column).ravel())
+
+    def _block(
+        self, flat: npt.NDArray[np.int64], light: FloatArray
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], FloatArray]:
+        """Lit rows, lit columns and the dense light between them."""
+        row, column = np.divmod(flat, self.shape[1])
+        lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
+        lit_row[row], lit_column[column] = True, True
+        rows, columns = np.flatnonzero(lit_row), np.flatnonzero(lit_column)
+        place_row, place_column = np.cumsum(lit_row) - 1, np.cumsum(lit_column) - 1
+        block = np.zeros((len(rows), len(columns)))
+        block[place_row[row], place_column[column]] = light
+        return rows, columns, block
+
+
+class ExpectedFrames:
+    """Frames of every capture of a family, each with the Monte Carlo variance of its mean; iterate as often as needed.
+
+    Light is linear, so the frames are formed once for a *basis* of light distributions and mixed: the classes of
+    projector pixels that a family always lights together. A family with too many classes is formed capture by capture
+    and never held in memory as a whole.
+
+    The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``. Squared norms are estimated
+    without bias from products with random signs (Hutchinson's estimator), because forming G times as many frames would
+    cost more than the frames themselves.
+    """
+
+    def __init__(
+        self,
+        optics: FrameOptics,
+        groups: Sequence[sparse.csr_array],
+        labels: npt.NDArray[np.int64],
+        weights: FloatArray,
+        seed: int,
+    ) -> None:
+        """``groups``: independent estimates of the light, (pixels of the projector, cells) each; their mean is used.
+
+        ``labels``: (pixels of the projector,) class 0..C-1 of each; ``weights``: (captures, C) fraction of full power
+        that each class emits; ``seed``: of the random signs.
+        """
+        self._optics, self._groups, self._seed = optics, tuple(groups), seed
+        self._mean = sum(self._groups[1:], self._groups[0]) / len(self._groups)
+        classes, pixels = weights.shape[1], labels.size
+        indicator = sparse.csr_array((np.ones(pixels), (labels, np.arange(pixels))), shape=(classes, pixels))
+        self._mixed = classes <= _LARGEST_BASIS
+        self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(weights) @ indicator)
+        self._weights = weights
+        self._formed: tuple[FloatArray, FloatArray] | None = None
+
+    def __len__(self) -> int:
+        return int(self._weights.shape[0])
+
+    def __iter__(self) -> Iterator[Frame]:
+        if not self._mixed:
+            for start in range(0, len(self), _AT_ONCE):
+                yield from self._frames(*self._form(start, min(start + _AT_ONCE, len(self))))
+            return
+        if self._formed is None:
+            self._formed = self._form(0, self._basis.shape[0])
+        irradiance, deviation = self._formed
+        for start in range(0, len(self), _AT_ONCE):
+            weights = self._weights[start : start + _AT_ONCE]
+            if np.array_equal(self._weights, np.eye(len(self))):
+                stop = start + len(weights)
+                yield from self._frames(irradiance[start:stop], deviation[start:stop])
+            else:
+                yield from self._frames(
+                    np.tensordot(weights, irradiance, axes=1), np.tensordot(weights, deviation, axes=1)
+                )
+
+    def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
+        """(b, pixels, pixels) frames of basis lights, (b, groups * pixels * probes) deviations of their groups."""
+        chosen = self._basis[start:stop]
+        light, parts = chosen @ self._mean, [chosen @ group for group in self._groups]
+        signs = stream(self._seed, "probe").choice((-1.0, 1.0), size=(self._optics.pixels, _PROBES))
+        frames, deviations = [], []
+        for row in range(stop - start):
+            frame = self._optics.frame(*_row(light, row))
+            probed = [self._optics.probe(*_row(part, row), signs) for part in parts]
+            frames.append(frame)
+            deviations.append((np.stack(probed) - frame @ signs).ravel())
+        return np.stack(frames), np.stack(deviations)
+
+    def _frames(self, irradiance: FloatArray, deviation: FloatArray) -> Iterator[Frame]:
+        count = len(self._groups)
+        pairs = count * (count - 1)
+        for frame, one in zip(irradiance, deviation, strict=True):
+            squared = float(one @ one) / _PROBES
+            yield Frame(frame, squared / pairs / frame.size if pairs else float("nan"))
+
+
+def relative_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
+    """Monte Carlo part of ||a - b|| / ||b|| over all frames and pixels (DESIGN section 6)."""
+    variance = energy = 0.0
+    for frame in frames:
+        variance += frame.variance * frame.irradiance.size
+        energy += float(np.square(frame.irradiance).sum())
+    return float(np.sqrt(variance / energy)) if energy > 0 else 0.0
+
+
+def _row(matrix: sparse.csr_array, row: int) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    inside = slice(matrix.indptr[row], matrix.indptr[row + 1])
+    return matrix.indices[inside].astype(np.int64), matrix.data[inside]
+
+
+def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:
+    """(anchors * cells, pixels): the factor (pixels, cells) once for each anchor, scaled by the anchor's weight."""
+    scaled = weights.T[:, None, :] * factor.T[None, :, :]
+    return np.ascontiguousarray(scaled.reshape(-1, factor.shape[0]))

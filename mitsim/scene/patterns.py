@@ -1,0 +1,210 @@
+"""Pattern families: from a name such as ``dots:7`` to the factors P_L, P_R and the captures that show every pattern.
+
+Pattern (i, j) is ``P_L[:, i] P_R[:, j]^T`` over the projector's n x n pixels (paper, section III-B). A family with values
++-1 cannot be projected as it is: each of its patterns is captured twice, as (1 + P)/2 and (1 - P)/2, and the
+measurement is the difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import hadamard as sylvester
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
+
+IntArray = npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One projected frame: pattern (row, column), whole (sign 0) or the positive or negative half of a +-1 pattern."""
+
+    row: int
+    column: int
+    sign: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PatternFamily:
+    """Separable patterns on an n x n grid.
+
+    Attributes
+    ----------
+    name
+        as given on the command line.
+    left, right
+        P_L and P_R, (n, K) of 0/1 or +-1.
+    """
+
+    name: str
+    left: IntArray
+    right: IntArray
+
+    @property
+    def n(self) -> int:
+        """Projector pixels a side."""
+        return int(self.left.shape[0])
+
+    @property
+    def signed(self) -> bool:
+        """Whether the patterns take the value -1."""
+        return bool((self.left < 0).any() or (self.right < 0).any())
+
+    @property
+    def captures(self) -> tuple[Capture, ...]:
+        """Every frame to project, row-major over (i, j); a positive half is followed by its negative half."""
+        signs = (1, -1) if self.signed else (0,)
+        return tuple(
+            Capture(i, j, sign)
+            for i in range(self.left.shape[1])
+            for j in range(self.right.shape[1])
+            for sign in signs
+        )
+
+    def light(self, capture: Capture) -> npt.NDArray[np.float64]:
+        """(n, n) fraction 0..1 of full power that each projector pixel emits in one capture."""
+        pattern = np.outer(self.left[:, capture.row], self.right[:, capture.column]).astype(np.float64)
+        return pattern if capture.sign == 0 else (1 + capture.sign * pattern) / 2
+
+    def classes(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Finest partition of the pixels whose members are always lit alike: labels (n * n,) and weights.
+
+        ``weights`` is (captures, C): the fraction of full power that class c emits in each capture.
+        """
+        _, row = np.unique(self.left, axis=0, return_inverse=True)
+        _, column = np.unique(self.right, axis=0, return_inverse=True)
+        label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
+        _, first, labels = np.unique(label, return_index=True, return_inverse=True)
+        captures = self.captures
+        i, j = np.array([c.row for c in captures]), np.array([c.column for c in captures])
+        sign = np.array([c.sign for c in captures])[:, None]
+        pattern = self.left[first // self.n][:, i].T * self.right[first % self.n][:, j].T.astype(np.float64)
+        return labels.ravel(), np.where(sign == 0, pattern, (1 + sign * pattern) / 2)
+
+
+def shifting_dots(n: int, k: int) -> IntArray:
+    """(n, k): column i lights every k-th pixel from i on; n need not be a multiple of k."""
+    return (np.arange(n)[:, None] % k == np.arange(k)[None, :]).astype(np.int8)
+
+
+def repeated_hadamard(n: int, k: int) -> IntArray:
+    """(n, k): rows of the order-k Hadamard matrix, repeated down the grid."""
+    return hadamard_matrix(k)[np.arange(n) % k]
+
+
+def random_binary(n: int, k: int, seed: int, side: str) -> IntArray:
+    """(n, k) fair coin flips, each pixel lit by at least one column (the paper asks that the union covers the scene)."""
+    rng = stream(seed, "patterns", "random", side)
+    bits = rng.integers(0, 2, size=(n, k), dtype=np.int8)
+    dark = np.flatnonzero(~bits.any(axis=1))
+    bits[dark, rng.integers(0, k, size=dark.size)] = 1
+    return bits
+
+
+def hadamard_matrix(order: int) -> IntArray:
+    """(order, order) matrix H of +-1 with H H^T = order I, first column all ones.
+
+    Built from Sylvester's doubling (SciPy) and Paley's two constructions over prime fields (R. Paley, 1933), and their
+    Kronecker products; :func:`hadamard_orders` lists what that covers (every multiple of 4 up to 48, then gaps).
+
+    Raises
+    ------
+    MitsimError
+        for an order that these constructions do not reach, with the nearest ones that they do.
+    """
+    matrix = _construct(order)
+    if matrix is None:
+        below = max((o for o in hadamard_orders(order) if o < order), default=1)
+        above = next(o for o in range(order + 1, 4 * order + 5) if _construct(o) is not None)
+        raise MitsimError(f"no Hadamard matrix of order {order} is available; use {below} or {above}")
+    return (matrix * matrix[:, :1]).astype(np.int8)
+
+
+def hadamard_orders(limit: int) -> list[int]:
+    """Orders up to ``limit`` that :func:`hadamard_matrix` can build."""
+    return [order for order in range(1, limit + 1) if _construct(order) is not None]
+
+
+def _construct(order: int) -> npt.NDArray[np.int64] | None:
+    if order < 1 or (order > 2 and order % 4):
+        return None
+    if order & (order - 1) == 0:
+        return np.asarray(sylvester(order), dtype=np.int64)
+    if _is_prime(order - 1) and (order - 1) % 4 == 3:
+        skew = _conference(order - 1)
+        return skew + np.eye(order, dtype=np.int64)
+    half = order // 2
+    if _is_prime(half - 1) and (half - 1) % 4 == 1:
+        symmetric, eye = _conference(half - 1), np.eye(half, dtype=np.int64)
+        return np.kron(symmetric, [[1, 1], [1, -1]]) + np.kron(eye, [[1, -1], [-1, -1]])
+    for factor in range(2, order // 2 + 1):
+        if order % factor == 0:
+            left, right = _construct(factor), _construct(order // factor)
+            if left is not None and right is not None:
+                return np.kron(left, right)
+    return None
+
+
+def _conference(q: int) -> npt.NDArray[np.int64]:
+    """(q + 1, q + 1) Paley conference matrix of the prime q: skew for q = 3 mod 4, symmetric for q = 1 mod 4."""
+    squares = set((np.arange(1, q) ** 2 % q).tolist())
+    character = np.array([0] + [1 if value in squares else -1 for value in range(1, q)])
+    jacobsthal = character[(np.arange(q)[:, None] - np.arange(q)[None, :]) % q]
+    matrix = np.zeros((q + 1, q + 1), dtype=np.int64)
+    matrix[0, 1:] = 1
+    matrix[1:, 0] = 1 if q % 4 == 1 else -1
+    matrix[1:, 1:] = jacobsthal
+    return matrix
+
+
+def _is_prime(value: int) -> bool:
+    return value > 1 and all(value % factor for factor in range(2, int(value**0.5) + 1))
+
+
+def _uniform(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
+    return np.ones((n, 1), dtype=np.int8), np.ones((n, 1), dtype=np.int8)
+
+
+def _dots(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
+    return shifting_dots(n, k), shifting_dots(n, k)
+
+
+def _hadamard(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
+    return repeated_hadamard(n, k), repeated_hadamard(n, k)
+
+
+def _random(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
+    return random_binary(n, k, seed, "left"), random_binary(n, k, seed, "right")
+
+
+FAMILIES: dict[str, Callable[[int, int, int], tuple[IntArray, IntArray]]] = {
+    "uniform": _uniform,
+    "dots": _dots,
+    "hadamard": _hadamard,
+    "random": _random,
+}
+
+
+def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
+    """The family named ``uniform``, ``dots:K``, ``hadamard:K`` or ``random:K`` on an n x n projector.
+
+    Raises
+    ------
+    MitsimError
+        for an unknown family, a K that is not a whole number, or K outside 1..n.
+    """
+    name, _, size = text.partition(":")
+    if name not in FAMILIES or (name == "uniform") != (size == ""):
+        raise MitsimError(f"patterns {text!r}: use uniform, dots:K, hadamard:K or random:K")
+    if size and not (size.isascii() and size.isdigit()):
+        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {n}")
+    k = int(size or 1)
+    if not 1 <= k <= n:
+        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {n}, the projector's pixels a side")
+    left, right = FAMILIES[name](n, k, seed)
+    return PatternFamily(text, left, right)

@@ -1,0 +1,123 @@
+"""The projector's pixel grid: from a stock ``projector`` emitter to n x n pixels and the directions they light.
+
+The emitter's texture in the scene file is its all-white frame: the rectangle of lit texels is the *window* that the
+patterns use, n x n pixels, and the dark texels around it are canvas. A window off the canvas's centre is a lens shift,
+as real projectors have it, and casts no keystone. Rows and columns follow the project's convention (row 0 at +y, column
+0 at +x for one looking along +z), which is also how Mitsuba lays texels out for an unrotated projector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.errors import MitsimError
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ProjectorGrid:
+    """Window of n x n projector pixels in a canvas, and where it lands on the camera's aligned plane.
+
+    Attributes
+    ----------
+    n
+        pixels a side of the window.
+    first_row, first_column
+        canvas texel of the window's pixel (0, 0).
+    canvas
+        (rows, columns) of the whole texture.
+    row_tan, column_tan
+        (first edge, last edge) of the window as tan-angles y/z and x/z from the camera, index coordinates, on the plane
+        at the camera's scene distance (bounding box when the projector casts a keystone).
+    keystone
+        largest departure of the window's corners from that box, in projector pixels; 0 for a shifted lens.
+    """
+
+    n: int
+    first_row: int
+    first_column: int
+    canvas: tuple[int, int]
+    row_tan: tuple[float, float]
+    column_tan: tuple[float, float]
+    keystone: float
+
+
+def locate_projector(where: str, projector: Any, camera: Any) -> ProjectorGrid:
+    """Find the lit window of ``projector`` and its place in front of ``camera``.
+
+    Raises
+    ------
+    MitsimError
+        when the texture is no bitmap with a lit square window, or it does not light the camera's aligned plane.
+    """
+    parameters = mi.traverse(projector)
+    if "irradiance.data" not in parameters:
+        raise MitsimError(
+            f"{where}: the projector's irradiance is not a bitmap; "
+            "give a raw bitmap texture whose white texels are the projector's pixels"
+        )
+    texels = np.array(parameters["irradiance.data"])
+    lit = texels.reshape(texels.shape[0], texels.shape[1], -1).max(axis=-1) > 0
+    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+    if not rows.size:
+        raise MitsimError(f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels")
+    height, width = int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1
+    if height != width or not lit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
+        raise MitsimError(
+            f"{where}: the lit texels of the projector's bitmap span {height}x{width} and must fill a square; "
+            "paint the window white"
+        )
+    corners = _window_corners(where, projector, camera, lit.shape, (int(rows[0]), int(columns[0])), width)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    ideal = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
+    keystone = float(np.abs((corners - ideal) / (high - low)).max()) * width
+    return ProjectorGrid(
+        n=width,
+        first_row=int(rows[0]),
+        first_column=int(columns[0]),
+        canvas=(int(lit.shape[0]), int(lit.shape[1])),
+        row_tan=(float(low[0]), float(high[0])),
+        column_tan=(float(low[1]), float(high[1])),
+        keystone=keystone if keystone > 1e-3 else 0.0,
+    )
+
+
+def _window_corners(
+    where: str, projector: Any, camera: Any, canvas: tuple[int, ...], first: tuple[int, int], n: int
+) -> FloatArray:
+    """(4, 2) tan-angles (row, column) of the window's corners on the aligned plane, in index coordinates.
+
+    Between that plane and the projector's image lies a homography; four probes of the emitter determine it.
+    """
+    z = camera.geometry.scene_distance
+    half = 0.25 * z
+    probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(probes))
+    interaction.p = camera.world_transform() @ mi.Point3f(probes[:, 0], probes[:, 1], z)
+    sample, _ = projector.sample_direction(interaction, mi.Point2f(0.5))
+    uv = np.array(sample.uv, dtype=np.float64).T
+    uv = uv.T if uv.shape[0] == 2 and uv.shape[1] == len(probes) else uv
+    homography = _homography(uv, probes)
+    rows = (first[0] + n * np.array([0, 0, 1, 1])) / canvas[0]
+    columns = (first[1] + n * np.array([0, 1, 0, 1])) / canvas[1]
+    mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T
+    points = mapped[:, :2] / mapped[:, 2:]
+    if not np.isfinite(points).all():
+        raise MitsimError(f"{where}: the projector does not light the plane at scene_distance {z} mm; aim it at the scene")
+    return np.stack([-points[:, 1] / z, -points[:, 0] / z], axis=1)
+
+
+def _homography(source: FloatArray, target: FloatArray) -> FloatArray:
+    """3 x 3 matrix that maps four points (x, y) of ``source`` to ``target`` (direct linear transform)."""
+    rows = []
+    for (x, y), (u, v) in zip(source, target, strict=True):
+        rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y, -u])
+        rows.append([0, 0, 0, x, y, 1, -v * x, -v * y, -v])
+    return np.linalg.svd(np.array(rows))[2][-1].reshape(3, 3)

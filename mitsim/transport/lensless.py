@@ -1,0 +1,145 @@
+"""The reference estimator: a Mitsuba sensor, from rays leaving a bare sensor to irradiance behind a coded mask.
+
+Plugin ``mitsim_lensless``
+--------------------------
+Irradiance at sensor point u, in the units of the scene's radiance times steradian (W m^-2 for W m^-2 sr^-1)::
+
+    E(u) = integral of  L(u, t) M(u + d t) (1 + |t|^2)^-2  dt
+
+over tan-angles t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, and the last factor
+is cos(theta) d omega written in t. A sample draws u inside its pixel and t uniformly over the field stop, traces the ray
+from u, and returns weight M (1 + |t|^2)^-2 (2 T)^2, T = tan(fov / 2). The mask is a factor, not geometry: thin geometry
+suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
+
+The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks along
++z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.
+
+======================  ========  ==========  =================================================================
+parameter               unit      default     meaning
+======================  ========  ==========  =================================================================
+``pixel_pitch``         mm        0.01172     pixel pitch; the film's size gives the number of pixels (square)
+``mask``                -         separable   ``separable``, ``flatcam`` or ``open``
+``mask_order``          -         9           order of the maximum length sequence (2^order - 1 features a side)
+``mask_feature``        mm        0.06        feature size
+``mask_distance``       mm        2           sensor to mask
+``scene_distance``      mm        400         plane to which the rig is aligned (calibration board, cell grid)
+``fov``                 degrees   20          full angle of the square field stop, a baffle: no light beyond it
+``to_world``            -         identity    rigid transform of the camera
+======================  ========  ==========  =================================================================
+
+XML::
+
+    <sensor type="mitsim_lensless">
+        <float name="mask_distance" value="2"/>
+        <film type="hdrfilm">
+            <integer name="width" value="512"/> <integer name="height" value="512"/>
+            <rfilter type="box"/> <string name="pixel_format" value="luminance"/>
+        </film>
+    </sensor>
+
+Python: ``register(); mi.load_dict({"type": "scene", "camera": {"type": "mitsim_lensless", "mask": "open"}, ...})``.
+
+Importance sampling of the mask is left out on purpose: the reference is the judge, and simple enough to check by eye.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.core.errors import MitsimError
+from mitsim.optics.camera import CameraGeometry
+
+PLUGIN = "mitsim_lensless"
+_REGISTERED: set[str] = set()
+
+
+def register() -> None:
+    """Make ``mitsim_lensless`` known to the current variant; calling it again does nothing."""
+    variant = mi.variant()
+    if variant is None:
+        raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
+    if variant not in _REGISTERED:
+        mi.register_sensor(PLUGIN, _sensor_class())
+        _REGISTERED.add(variant)
+
+
+def _geometry(props: Any, size: Any) -> CameraGeometry:
+    values = {
+        name: props[name]
+        for name in CameraGeometry.model_fields
+        if name != "pixels" and props.has_property(name)
+    }
+    if size[0] != size[1]:
+        raise MitsimError(f"{PLUGIN}: film is {size[0]}x{size[1]} pixels; the sensor must be square")
+    return CameraGeometry.checked(PLUGIN, pixels=int(size[0]), **values)
+
+
+def _sensor_class() -> type:
+    """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
+
+    class Lensless(mi.Sensor):  # type: ignore[misc, name-defined]
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.m_needs_sample_3 = True
+            if self.film().rfilter().radius() > 0.5 + 1e-4:
+                raise MitsimError(
+                    f"{PLUGIN}: the film's reconstruction filter spreads light between pixels; use <rfilter type='box'/>"
+                )
+            self.geometry = _geometry(props, self.film().size())
+            terms = self.geometry.build_mask().terms
+            self._weights = [weight for weight, _, _ in terms]
+            self._rows = [mi.Float(rows.astype(np.float32)) for _, rows, _ in terms]
+            self._columns = [mi.Float(columns.astype(np.float32)) for _, _, columns in terms]
+            self._features = len(terms[0][1])
+
+        def sample_ray(
+            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            geometry = self.geometry
+            wavelengths, spectral_weight = self.sample_wavelengths(
+                dr.zeros(mi.SurfaceInteraction3f), sample1, active
+            )
+            u = (1 - 2 * sample2) * geometry.half_width
+            t = (1 - 2 * sample3) * geometry.tan_half_fov
+            squared = 1 + dr.squared_norm(t)
+            passed = self._transmission(u + geometry.mask_distance * t, active)
+            weight = passed * (2 * geometry.tan_half_fov) ** 2 / dr.square(squared)
+            to_world = self.world_transform()
+            ray = mi.Ray3f(
+                to_world @ mi.Point3f(u.x, u.y, 0),
+                to_world @ (mi.Vector3f(t.x, t.y, 1) * dr.rsqrt(squared)),
+                time,
+                wavelengths,
+            )
+            return ray, spectral_weight * weight
+
+        def sample_ray_differential(
+            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def _transmission(self, point: Any, active: Any) -> Any:
+            """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""
+            row = dr.floor(-point.y / self.geometry.mask_feature + 0.5 * self._features)
+            column = dr.floor(-point.x / self.geometry.mask_feature + 0.5 * self._features)
+            inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)
+            inside &= active
+            row, column = mi.UInt32(dr.maximum(row, 0)), mi.UInt32(dr.maximum(column, 0))
+            total = mi.Float(0)
+            for weight, rows, columns in zip(self._weights, self._rows, self._columns, strict=True):
+                left = dr.gather(mi.Float, rows, row, inside)
+                total += weight * left * dr.gather(mi.Float, columns, column, inside)
+            return total
+
+        def bbox(self) -> Any:
+            return mi.ScalarBoundingBox3f()
+
+        def to_string(self) -> str:
+            return f"{PLUGIN}[{self.geometry}]"
+
+    return Lensless
