@@ -1,11 +1,13 @@
 """Frames on disk: named 2-D channels and metadata in, one OpenEXR file out, and back.
 
 Channels are float32 (expected electrons, variances) or uint32 (digital numbers), stored losslessly. Every
-metadata entry is a header attribute `mitsim.<key>` holding JSON text: EXR's own numbers are 32-bit and would cut seeds
-and exposure times short.
+metadata entry is a header attribute `mitsim.<key>` holding JSON text: EXR's own numbers are 32-bit and would
+cut seeds and exposure times short.
 """
 
+import contextlib
 import hashlib
+import io
 import json
 import os
 import threading
@@ -24,6 +26,7 @@ Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
 
 _PREFIX = "mitsim."
 _MAGIC = b"\x76\x2f\x31\x01"
+_stdout_lock = threading.Lock()
 
 
 def write_frame(path: Path | str, channels: Mapping[str, Channel], metadata: Mapping[str, Value]) -> None:
@@ -61,7 +64,7 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
     path = Path(path)
     _check_magic(path)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _open(path) as file:
             header = file.header()
             # Both are emptied when the file closes, so they are copied here.
             metadata = {
@@ -110,6 +113,13 @@ def _scalar(value: Value) -> Value:
             f"write_frame: metadata value {value!r} is {type(value).__name__}; use str, int or float"
         )
     return plain
+
+
+def _open(path: Path) -> Any:
+    # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone; it
+    # raises later on. The lock keeps two threads from restoring each other's stdout.
+    with _stdout_lock, contextlib.redirect_stdout(io.StringIO()):
+        return OpenEXR.File(str(path), separate_channels=True)
 
 
 def _check_magic(path: Path) -> None:

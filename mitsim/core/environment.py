@@ -1,0 +1,166 @@
+"""This machine: a variant's name in, Mitsuba ready to use out; and the checks behind `mitsim doctor`."""
+
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+from mitsim.core import llvm
+from mitsim.core.errors import MitsimError
+from mitsim.core.llvm import candidates, find_llvm, probe, select_llvm
+
+__all__ = ["VARIANTS", "Check", "candidates", "doctor", "find_llvm", "load_variant", "probe", "select_llvm"]
+
+VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral")
+"""Variants mitsim is tested with; `load_variant` takes any that the installed Mitsuba has."""
+
+_CHILD_SECONDS = 120
+
+_RENDER = """
+from mitsim.core.environment import load_variant
+mi = load_variant({name!r})
+scene = mi.load_dict({{"type": "scene", "integrator": {{"type": "direct"}},
+    "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 4, "height": 4}}}},
+    "shape": {{"type": "sphere", "center": [0, 0, 5]}}, "light": {{"type": "constant"}}}})
+import numpy
+image = numpy.array(mi.render(scene, spp=4, seed=0))
+assert numpy.isfinite(image).all() and image.max() > 0, image
+"""
+
+_FIGURE = """
+import io, matplotlib
+matplotlib.use("Agg")
+from matplotlib.figure import Figure
+figure = Figure()
+figure.subplots().plot([0, 1])
+figure.savefig(io.BytesIO(), format="png")
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing the doctor looked at: `ok` or not, what was seen, and the one command that mends it."""
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+
+
+def load_variant(name: str) -> ModuleType:
+    """Mitsuba with the variant `name` set, after choosing an LLVM that works for the llvm_ variants.
+
+    Setting a variant is Mitsuba's own process-wide state; nothing in mitsim does so except by this call.
+    Raises MitsimError for an unknown variant, a Mitsuba that cannot be imported, or a missing LLVM.
+    """
+    if name.startswith("llvm_"):
+        select_llvm()
+    try:
+        import mitsuba
+    except ImportError as error:
+        raise MitsimError(f"mitsuba: cannot be imported ({error}); run: {_reinstall('mitsuba')}") from error
+    known = mitsuba.variants()
+    if name not in known:
+        raise MitsimError(f"variant: got {name!r}; this Mitsuba has {', '.join(known)}; choose one of these")
+    try:
+        mitsuba.set_variant(name)
+    except ImportError as error:
+        raise MitsimError(
+            f"variant {name}: cannot be loaded ({_one_line(error)}); run: mitsim doctor"
+        ) from error
+    module: ModuleType = mitsuba
+    return module
+
+
+def doctor() -> list[Check]:
+    """All checks in order. What can crash or hang runs in child processes; takes some ten seconds."""
+    checks = [_python(), _llvm(), _child("mitsuba", "import mitsuba", "imports", _reinstall("mitsuba"))]
+    mend = _reinstall("mitsuba") if checks[1].ok else checks[1].remedy
+    checks += [
+        _child(f"render {name}", _RENDER.format(name=name), "renders a test image", mend) for name in VARIANTS
+    ]
+    checks += [_openexr(), _kernel_cache()]
+    checks.append(_child("matplotlib", _FIGURE, "draws without a display", _reinstall("matplotlib")))
+    return checks
+
+
+def _python() -> Check:
+    seen = f"Python {platform.python_version()} at {sys.executable}"
+    good = sys.version_info >= (3, 10)
+    return Check("python", good, seen, "" if good else "apt-get install -y python3.11")
+
+
+def _llvm() -> Check:
+    def look() -> str:
+        path = find_llvm()
+        return f"LLVM {llvm.version(path) or 'of unknown version'} at {path} compiles and runs"
+
+    remedy = f"unset {llvm.VARIABLE}" if os.environ.get(llvm.VARIABLE) else llvm.install_command()
+    return _attempt("llvm", look, remedy)
+
+
+def _openexr() -> Check:
+    def look() -> str:
+        # Imported here: a broken OpenEXR must be a finding, not the end of the doctor.
+        import numpy as np
+
+        from mitsim.core.frames import read_frame, write_frame
+
+        values = np.arange(6, dtype=np.uint32).reshape(2, 3)
+        with tempfile.TemporaryDirectory() as folder:
+            write_frame(Path(folder) / "frame.exr", {"DN": values}, {"seed": 2**40})
+            channels, metadata = read_frame(Path(folder) / "frame.exr")
+        if not np.array_equal(channels["DN"], values) or metadata != {"seed": 2**40}:
+            raise MitsimError("a frame read back differs from the one written")
+        return "writes a frame and reads it back"
+
+    return _attempt("openexr", look, _reinstall("OpenEXR"))
+
+
+def _kernel_cache() -> Check:
+    folder = Path.home() / ".drjit"
+
+    def look() -> str:
+        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return f"{folder} is writable: compiled kernels are kept"
+
+    return _attempt("kernel cache", look, "export HOME=$(mktemp -d)")
+
+
+def _attempt(name: str, look: Callable[[], str], remedy: str) -> Check:
+    try:
+        return Check(name, True, look())
+    except (MitsimError, OSError, ImportError) as error:
+        return Check(name, False, _one_line(error), remedy)
+
+
+def _child(name: str, program: str, success: str, remedy: str) -> Check:
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_CHILD_SECONDS,
+        )
+    except subprocess.TimeoutExpired:
+        return Check(name, False, f"gave no answer within {_CHILD_SECONDS} s", remedy)
+    if done.returncode == 0:
+        return Check(name, True, success)
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+    how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit status {done.returncode}"
+    return Check(name, False, f"{how}: {lines[-1]}", remedy)
+
+
+def _reinstall(package: str) -> str:
+    return f"{sys.executable} -m pip install --force-reinstall {package}"
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
