@@ -1,0 +1,1 @@
+"""Experiments composed of capture, calibration and reconstruction; image quality; the HTML report."""

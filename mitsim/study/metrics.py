@@ -1,0 +1,110 @@
+"""A recovered image and the truth in; PSNR, SSIM and line contrast out. The only reader of the truth.
+
+Images are reflectances, 1.0 = the calibration board. Nothing here fits a gain or an offset, and nothing
+clips: a reconstruction of the wrong brightness is a wrong reconstruction.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.core.errors import MitsimError
+
+Image = NDArray[np.floating[Any]]
+
+TRUTH_FILE, TRUTH_CHANNEL = "truth.exr", "reflectance"
+_SSIM_WINDOW = 7  # pixels a side; scikit-image's default
+
+
+def psnr(image: Image, truth: Image) -> float:
+    """Peak signal-to-noise ratio in dB, peak 1: -10 log10(mean((image - truth)^2)); inf when they are equal.
+
+    Both (n_rows, n_columns). Raises MitsimError when the shapes differ or a value is not finite.
+    """
+    image, truth = _pair(image, truth)
+    mean_square = float(np.mean((image - truth) ** 2))
+    return float("inf") if mean_square == 0.0 else float(-10.0 * np.log10(mean_square))
+
+
+def ssim(image: Image, truth: Image) -> float:
+    """Structural similarity (Wang et al. 2004; scikit-image, 7 x 7 uniform window, data range 1), 1 = equal.
+
+    Both (n_rows, n_columns), at least 7 x 7. Raises MitsimError as `psnr` does, and for smaller images.
+    """
+    from skimage.metrics import structural_similarity
+
+    image, truth = _pair(image, truth)
+    if min(image.shape) < _SSIM_WINDOW:
+        raise MitsimError(
+            f"SSIM: image is {_size(image)} pixels; needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW}"
+        )
+    return float(structural_similarity(image, truth, win_size=_SSIM_WINDOW, data_range=1.0))
+
+
+def contrast(
+    region: Image, lines: Literal["vertical", "horizontal"] = "vertical", background: float = 0.0
+) -> float:
+    """Contrast ratio (I_max - I_min) / (I_max + I_min) of one group of lines; the paper's MTF / 100.
+
+    `region` (rows, columns) holds only the group. Its mean along the lines gives the profile, less a fixed
+    `background` (the paper's "DC background", unit of the image). Exceeds 1 when the profile goes negative,
+    as least-squares images may. Raises MitsimError when the region is empty or has no light to compare with.
+    """
+    region = np.asarray(region, dtype=np.float64)
+    if region.ndim != 2 or region.size == 0 or not np.all(np.isfinite(region)):
+        raise MitsimError(
+            f"contrast: region of shape {region.shape}; pass finite rows x columns of one line group"
+        )
+    if lines not in ("vertical", "horizontal"):
+        raise MitsimError(f"contrast: lines is {lines!r}; allowed: 'vertical', 'horizontal'")
+    profile = region.mean(axis=0 if lines == "vertical" else 1) - background
+    low, high = float(profile.min()), float(profile.max())
+    if low + high <= 0.0:
+        raise MitsimError(
+            f"contrast: darkest plus brightest line is {low + high:.3g}; must be above 0; "
+            f"lower the background ({background:g})"
+        )
+    return (high - low) / (high + low)
+
+
+def read_truth(run_folder: Path) -> NDArray[np.float64]:
+    """(n_rows, n_columns) apparent reflectance that `capture` wrote beside its frames as truth.exr.
+
+    Raises MitsimError when the folder holds no truth, as with frames of a real camera.
+    """
+    from mitsim.core.frames import read_frame
+
+    path = Path(run_folder) / TRUTH_FILE
+    if not path.is_file():
+        raise MitsimError(
+            f"{path}: no truth in this run, so no PSNR or SSIM; only `mitsim capture` writes one"
+        )
+    channels, _ = read_frame(path)
+    if TRUTH_CHANNEL not in channels:
+        found = ", ".join(sorted(channels))
+        raise MitsimError(f"{path}: channels are {found}; needs {TRUTH_CHANNEL!r}; capture the scene again")
+    return np.asarray(channels[TRUTH_CHANNEL], dtype=np.float64)
+
+
+def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    a: NDArray[np.float64] = np.asarray(image, dtype=np.float64)
+    b: NDArray[np.float64] = np.asarray(truth, dtype=np.float64)
+    if a.ndim != 2 or a.shape != b.shape:
+        raise MitsimError(
+            f"image quality: image is {_size(a)}, truth {_size(b)}; both must have the same rows x columns"
+        )
+    for name, values in (("image", a), ("truth", b)):
+        bad = int(np.count_nonzero(~np.isfinite(values)))
+        if bad:
+            raise MitsimError(
+                f"image quality: {name} has {bad} values that are not finite; see the solver's status"
+            )
+    return a, b
+
+
+def _size(image: Image) -> str:
+    return " x ".join(str(n) for n in image.shape) or "a single number"

@@ -1,0 +1,292 @@
+"""Results of a study in, one self-contained HTML page out: images inside, no script, no link.
+
+`ReportData` says what a page shows; whatever is None or empty is left out, section by section. The page
+carries no time of writing, so the same data give the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from mitsim.core.errors import MitsimError
+from mitsim.study import plots
+
+Array = NDArray[Any]
+
+_DASH = "\N{EN DASH}"
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """One reconstruction: (n, n) reflectance, PSNR [dB, peak 1, no fit], SSIM, and the lambda it took."""
+
+    image: Array
+    psnr_db: float
+    ssim: float
+    lam: float | None = None
+    status: str = ""
+
+
+@dataclass(frozen=True)
+class FamilyResult:
+    """A pattern family, e.g. name "dots:7", label "49 dots". `patterns`: some (n, n) examples, 0..1 or -1..1.
+
+    `captures` counts frames taken (a signed pattern is two). `idealised` solves the paper's noisy ideal model
+    with its own factors, `rendered` the rendered frames with calibrated factors.
+    """
+
+    name: str
+    label: str
+    captures: int
+    patterns: tuple[Array, ...] = ()
+    singular_values: Array | None = None
+    idealised: Recovery | None = None
+    rendered: Recovery | None = None
+
+
+@dataclass(frozen=True)
+class CapturedFrame:
+    """One frame as the camera gave it: (m, m) DN, with a short label ("49 dots, frame 1 of 49")."""
+
+    label: str
+    dn: Array
+
+
+@dataclass(frozen=True)
+class ExposureRow:
+    """PSNR in dB of one family under the three exposure conventions; None: not computed."""
+
+    family: str
+    equal_peak_db: float | None = None
+    equal_frame_db: float | None = None
+    equal_total_db: float | None = None
+
+
+@dataclass(frozen=True)
+class CalibrationFacts:
+    """What calibration found: scene pixels a side, frames, relative residuals [1], condition of A_L [1]."""
+
+    n: int
+    frames: int
+    separability_residual: float
+    phi_error: float | None
+    condition: float
+    status: str = ""
+
+
+@dataclass(frozen=True)
+class BudgetRow:
+    """One source of error: relative rms of the expected frames [1], and what that number means."""
+
+    name: str
+    value: float
+    meaning: str
+
+
+@dataclass(frozen=True)
+class EffectRow:
+    """One line of the effect plan. `state`: exact, approximate or off; error relative [1], cost in s."""
+
+    name: str
+    state: str
+    reason: str
+    error_if_off: float | None = None
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All that one report shows.
+
+    Images are as seen along +z, row 0 at the top; `truth` (n, n) and `render` (any size) are reflectances,
+    1 = calibration board. `seconds` maps stages to wall time, in order. `exposure_used` says which convention
+    the reconstructions above the table used.
+    """
+
+    title: str
+    verdict: str
+    truth: Array
+    scene: str
+    render: Array | None = None
+    render_caption: str = ""
+    families: tuple[FamilyResult, ...] = ()
+    frames: tuple[CapturedFrame, ...] = ()
+    exposure: tuple[ExposureRow, ...] = ()
+    exposure_used: str = ""
+    calibration: CalibrationFacts | None = None
+    budget: tuple[BudgetRow, ...] = ()
+    accuracy: float | None = None
+    effects: tuple[EffectRow, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    configuration: Mapping[str, object] = field(default_factory=dict)
+    seeds: Mapping[str, int] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def verdict_sentence(best: FamilyResult, baseline: FamilyResult) -> str:
+    """ "49 dots beat uniform by 11.0 dB (rendered light, calibrated factors; idealised model: 12.9 dB)." """
+    if best.rendered is None or baseline.rendered is None:
+        raise MitsimError(f"report: no rendered result of {best.label} and {baseline.label} to compare")
+    gain = best.rendered.psnr_db - baseline.rendered.psnr_db
+    other = baseline.label[:1].lower() + baseline.label[1:]
+    text = f"{best.label} beat {other} by {gain:.1f} dB"
+    if gain < 0:
+        text = f"{best.label}: {-gain:.1f} dB below {other}"
+    detail = "rendered light, calibrated factors"
+    if best.idealised is not None and baseline.idealised is not None:
+        detail += f"; idealised model: {best.idealised.psnr_db - baseline.idealised.psnr_db:+.1f} dB"
+    return f"{text} ({detail})."
+
+
+def build_report(report: ReportData, path: Path) -> Path:
+    """Write the page to `path` (beside it first, then moved into place) and return it.
+
+    Raises MitsimError when an image holds values that are not finite or the place cannot be written.
+    """
+    text = render_html(report)
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise MitsimError(
+            f"{path}: the report cannot be written ({error.strerror}); give another place"
+        ) from error
+    return path
+
+
+def render_html(report: ReportData) -> str:
+    """The page as text; `build_report` writes it."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("mitsim.study"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        sci=_scientific, db=_decibel, seconds=_seconds, reflectance=_reflectance_png, pattern=_pattern_png
+    )
+    page = environment.get_template("report.html")
+    return page.render(report=report, figures=_figures(report), best=_best(report.families))
+
+
+def _figures(report: ReportData) -> dict[str, Any]:
+    """The page's plots as data URIs, by name; only those that have data."""
+    figures: dict[str, Any] = {
+        "frames": [
+            (shot.label, _figure_png(plots.frame(_finite(shot.dn, shot.label)))) for shot in report.frames
+        ]
+    }
+    spectra = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
+    if spectra:
+        figures["spectra"] = _figure_png(plots.singular_values(spectra))
+    both = [
+        (f.label, f.idealised, f.rendered)
+        for f in report.families
+        if f.idealised is not None and f.rendered is not None
+    ]
+    if both:
+        figures["quality"] = _figure_png(
+            plots.quality_bars(
+                [label for label, _, _ in both],
+                [ideal.psnr_db for _, ideal, _ in both],
+                [rendered.psnr_db for _, _, rendered in both],
+            )
+        )
+    positive = {row.name: row.value for row in report.budget if row.value > 0.0}
+    if positive:
+        figures["budget"] = _figure_png(plots.error_bars(positive, report.accuracy))
+    stages = {name: value for name, value in report.seconds.items() if name != "total"}
+    if stages:
+        figures["seconds"] = _figure_png(plots.seconds_by_stage(stages))
+    return figures
+
+
+def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
+    """Name of the family of highest PSNR, for each of the two rows of reconstructions."""
+    best: dict[str, str] = {}
+    for row in ("idealised", "rendered"):
+        found = {f.name: getattr(f, row).psnr_db for f in families if getattr(f, row) is not None}
+        best[row] = max(found, key=lambda name: found[name]) if found else ""
+    return best
+
+
+def _reflectance_png(image: Array, name: str = "image") -> str:
+    """Reflectance as an sRGB grey PNG: clipped to 0..1 for display only, so a screen shows its lightness."""
+    linear = np.clip(_finite(image, name), 0.0, 1.0)
+    encoded = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+    )  # IEC 61966-2-1
+    return _grey_png(encoded)
+
+
+def _pattern_png(pattern: Array) -> str:
+    """Pattern as a grey PNG: 0..1 as it is, -1..1 with -1 black."""
+    values = _finite(pattern, "pattern")
+    return _grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values)
+
+
+def _grey_png(values: Array) -> str:
+    """Values 0..1 as a grey PNG of at least 384 pixels a side, whole copies of each pixel, as a data URI."""
+    from matplotlib.image import imsave
+
+    copies = max(1, math.ceil(384 / max(values.shape)))
+    buffer = BytesIO()
+    large = np.kron(values, np.ones((copies, copies)))
+    imsave(buffer, large, cmap="gray", vmin=0.0, vmax=1.0, format="png")
+    return _data_uri(buffer)
+
+
+def _figure_png(figure: Figure) -> str:
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=160)
+    return _data_uri(buffer)
+
+
+def _data_uri(buffer: BytesIO) -> str:
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _finite(image: Array, name: str) -> NDArray[np.float64]:
+    values = np.asarray(image, dtype=np.float64)
+    if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
+        raise MitsimError(f"report: {name} of shape {values.shape} must be rows x columns of finite numbers")
+    return values
+
+
+def _scientific(value: float | None) -> str:
+    """Three digits, a power of ten as a superscript sign; None as a dash."""
+    if value is None:
+        return _DASH
+    if value == 0.0 or 1e-2 <= abs(value) < 1e4:
+        return f"{value:.3g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}\N{MULTIPLICATION SIGN}10" + str(int(exponent)).translate(_SUPERSCRIPT)
+
+
+def _decibel(value: float | None) -> str:
+    return _DASH if value is None else f"{value:.1f} dB"
+
+
+def _seconds(value: float | None) -> str:
+    return _DASH if value is None else f"{value:.2f} s" if value < 100 else f"{value:.0f} s"

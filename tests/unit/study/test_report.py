@@ -1,0 +1,213 @@
+"""The HTML report from invented data: complete, self-contained, deterministic, and written all or nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.study import report as R
+
+N = 32
+
+
+def example(n: int = N, frame_size: int = 48) -> R.ReportData:
+    """A complete report of invented numbers; `n` scene pixels a side."""
+    rng = np.random.default_rng(7)
+    y, x = np.mgrid[0:n, 0:n] / n
+    truth = 0.15 + 0.6 * ((x - 0.4) ** 2 + (y - 0.5) ** 2 < 0.08) + 0.15 * y + 0.1 * (x > 0.8)
+
+    def recovery(decibel: float) -> R.Recovery:
+        image = truth + 10 ** (-decibel / 20) * rng.standard_normal((n, n))
+        return R.Recovery(image, decibel, 0.98 - 0.6 * 10 ** (-decibel / 20), 3e-6)
+
+    def dots(k: int) -> np.ndarray:
+        row = np.arange(n) % k == 0
+        return np.outer(row, row).astype(float)
+
+    sign = np.where(np.arange(n) // (n // 8) % 2 == 0, 1.0, -1.0)
+    rows = (
+        ("uniform", "Uniform", 1, np.ones((n, n)), 23.5, 18.7),
+        ("dots:4", "16 dots", 16, dots(4), 31.2, 27.9),
+        ("dots:5", "25 dots", 25, dots(5), 33.4, 29.6),
+        ("dots:7", "49 dots", 49, dots(7), 36.4, 31.8),
+        ("hadamard:8", "64 Hadamard", 128, np.outer(sign, sign), 36.1, 30.9),
+    )
+    families = tuple(
+        R.FamilyResult(
+            name,
+            label,
+            captures,
+            (pattern,),
+            10 ** (-np.linspace(0, 6 / captures**0.4, n)),
+            recovery(a),
+            recovery(b),
+        )
+        for name, label, captures, pattern, a, b in rows
+    )
+    frames = tuple(
+        R.CapturedFrame(label, rng.poisson(level * (1 + np.outer(*2 * [np.sin(np.arange(frame_size) / 5)]))))
+        for label, level in (
+            ("Uniform", 2400),
+            ("49 dots, frame 1 of 49", 2100),
+            ("64 Hadamard, frame 3 of 128", 2300),
+        )
+    )
+    return R.ReportData(
+        title="mitsim demo: a printed photograph",
+        verdict=R.verdict_sentence(families[3], families[0]),
+        truth=truth,
+        scene="A printed photograph, 400 mm from the camera; a projector beside it lights 120 x 120 mm.",
+        render=np.kron(truth, np.ones((2, 2))),
+        render_caption="Seen from the camera's place under uniform light.",
+        families=families,
+        frames=frames,
+        exposure=tuple(
+            R.ExposureRow(f.label, f.rendered.psnr_db, 20.0 + i, None if i == 2 else 19.0 + i)  # type: ignore[union-attr]
+            for i, f in enumerate(families)
+        ),
+        exposure_used="equal peak, 80 % of full well",
+        calibration=R.CalibrationFacts(
+            128, 512, 1.2e-3, 4.1e-3, 2.6e5, "Factors agree with the noise-free ones."
+        ),
+        budget=(
+            R.BudgetRow("Monte Carlo noise", 2.1e-4, "Reached; five times below the accuracy asked for."),
+            R.BudgetRow("Sensor noise", 6.3e-3, "Shot and read noise of one frame; limits the result."),
+            R.BudgetRow("Calibration", 4.1e-3, "Error of the calibrated factors."),
+            R.BudgetRow("Discretisation", 3.0e-4, "Cells and depth layers."),
+        ),
+        accuracy=1e-3,
+        effects=(
+            R.EffectRow("anchors", "exact", "Lambertian plane: falloff needs 3 a side", 6e-4, 0.1),
+            R.EffectRow(
+                "mask diffraction", "approximate", "Fresnel number 3.3 at 550 nm; three lines", 0.36, 0.8
+            ),
+            R.EffectRow("interreflection", "off", "one convex sheet: no second bounce", 0.0, 0.0),
+            R.EffectRow("ambient light", "off", "no emitter besides the projector", None, None),
+        ),
+        seconds={
+            "plan": 0.21,
+            "calibrate": 9.4,
+            "transport": 3.1,
+            "optics": 1.4,
+            "sensor": 0.9,
+            "reconstruct": 0.6,
+        },
+        configuration={
+            "scene": "scenes/photograph/scene.xml",
+            "mask": "separable, 511 x 60 um",
+            "pitch": "11.72 um",
+        },
+        seeds={"root": 0, "render": 3735928559},
+        versions={"mitsim": "0.1.0", "mitsuba": "3.9.1", "drjit": "1.5.0"},
+    )
+
+
+class _Outside(HTMLParser):
+    """Collects every attribute value that would make a browser load something, and unbalanced tags."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "data", "srcset")]
+        if tag not in ("meta", "img", "br", "link", "input", "hr"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open.pop() == tag, f"</{tag}> closes nothing"
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return R.render_html(example())
+
+
+def test_nothing_is_loaded_from_elsewhere(page: str) -> None:
+    parser = _Outside()
+    parser.feed(page)
+    assert parser.open == [], "every tag is closed"
+    assert parser.sources and all(source.startswith("data:image/png;base64,") for source in parser.sources)
+    assert "<script" not in page and "@import" not in page and "url(" not in page
+
+
+def test_every_number_that_was_given_is_shown(page: str) -> None:
+    text = re.sub(r"<style>.*?</style>|data:image/png;base64,[A-Za-z0-9+/=]+|<[^>]+>", " ", page, flags=re.S)
+    for wanted in (
+        "49 dots beat uniform by 13.1 dB (rendered light, calibrated factors; idealised model: +12.9 dB).",
+        *("Uniform", "16 dots", "25 dots", "64 Hadamard", "23.5 dB", "36.4 dB", "31.8 dB", "SSIM 0.965"),
+        *("Equal peak", "Equal frame", "Equal total", "equal peak, 80 % of full well"),
+        *("512", "1.2\u00d710⁻³", "2.6\u00d710⁵", "Monte Carlo noise", "2.1\u00d710⁻⁴"),
+        *("mask diffraction", "approximate", "Fresnel number", "9.40 s", "3735928559", "3.9.1"),
+    ):
+        assert wanted in text, wanted
+
+
+def test_each_image_stands_in_its_place(page: str) -> None:
+    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 4 plots.
+    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 4
+    assert page.count('class="picture result best"') == 2
+
+
+def test_an_empty_report_has_no_empty_section() -> None:
+    page = R.render_html(R.ReportData("t", "v", np.ones((4, 4)), "s"))
+    assert re.findall(r"<h2>(.*?)</h2>", page) == ["The scene"]
+
+
+def test_text_cannot_become_markup() -> None:
+    page = R.render_html(replace(example(), verdict="<b>&", configuration={"<i>": "</table>"}))
+    assert "&lt;b&gt;&amp;" in page and "&lt;/table&gt;" in page and "<i>" not in page
+
+
+def test_the_same_data_give_the_same_bytes(page: str) -> None:
+    assert R.render_html(example()) == page
+
+
+def test_display_clips_but_the_numbers_do_not() -> None:
+    bright = np.full((8, 8), 7.0)
+    assert R._reflectance_png(bright) == R._reflectance_png(np.ones((8, 8)))
+    assert R._reflectance_png(bright) != R._reflectance_png(np.full((8, 8), 0.99))
+
+
+def test_signed_patterns_show_minus_one_black() -> None:
+    assert R._pattern_png(np.array([[1.0, -1.0]])) == R._pattern_png(np.array([[1.0, 0.0]]))
+
+
+def test_a_loss_is_called_a_loss() -> None:
+    families = example().families
+    assert R.verdict_sentence(families[0], families[3]).startswith("Uniform: 13.1 dB below 49 dots (")
+
+
+def test_refuses_what_it_cannot_show() -> None:
+    broken = np.ones((4, 4))
+    broken[1, 2] = np.nan
+    with pytest.raises(MitsimError, match=r"truth of shape \(4, 4\)"):
+        R.render_html(R.ReportData("t", "v", broken, "s"))
+    with pytest.raises(MitsimError, match="no rendered result"):
+        R.verdict_sentence(R.FamilyResult("a", "A", 1), R.FamilyResult("b", "B", 1))
+
+
+def test_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = R.ReportData("t", "v", np.ones((4, 4)), "s")
+    target = R.build_report(small, tmp_path / "report.html")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    before = target.read_text(encoding="utf-8")
+
+    def full_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full_disk)
+    with pytest.raises(MitsimError, match="No space left"):
+        R.build_report(replace(small, title="other"), target)
+    assert target.read_text(encoding="utf-8") == before
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    with pytest.raises(MitsimError, match="cannot be written"):
+        R.build_report(small, tmp_path / "missing" / "report.html")
