@@ -25,7 +25,7 @@ _FONT = 11.0  # points
 def frame(values: ArrayLike, unit: str = "DN", width: float = 3.6) -> Figure:
     """A sensor frame (m, m) with its colour bar in `unit`; width in inches. Pixel (0, 0) is top left."""
     image = np.asarray(values, dtype=np.float64)
-    figure, axes = _figure(width, 0.86 * width)
+    figure, axes = _figure(width, 0.76 * width)
     drawn = axes.imshow(image, cmap="viridis", interpolation="none")
     bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
     bar.set_label(f"signal [{unit}]", fontsize=_FONT - 1)

@@ -120,6 +120,7 @@ class ReportData:
     verdict: str
     truth: Array
     scene: str
+    verdict_detail: str = ""
     render: Array | None = None
     render_caption: str = ""
     families: tuple[FamilyResult, ...] = ()
@@ -137,19 +138,25 @@ class ReportData:
     notes: tuple[str, ...] = ()
 
 
-def verdict_sentence(best: FamilyResult, baseline: FamilyResult) -> str:
-    """ "49 dots beat uniform by 11.0 dB (rendered light, calibrated factors; idealised model: 12.9 dB)." """
+def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
+    """Headline and detail from the rendered results: "49 dots beat uniform by 11.0 dB", and both PSNRs.
+
+    Raises MitsimError when one of the two has no rendered result.
+    """
     if best.rendered is None or baseline.rendered is None:
-        raise MitsimError(f"report: no rendered result of {best.label} and {baseline.label} to compare")
+        raise MitsimError(
+            f"report: no rendered result of {best.label} or {baseline.label}; reconstruct both first"
+        )
     gain = best.rendered.psnr_db - baseline.rendered.psnr_db
     other = baseline.label[:1].lower() + baseline.label[1:]
-    text = f"{best.label} beat {other} by {gain:.1f} dB"
-    if gain < 0:
-        text = f"{best.label}: {-gain:.1f} dB below {other}"
-    detail = "rendered light, calibrated factors"
+    beat = f"{best.label} beat {other} by {gain:.1f} dB"
+    headline = beat if gain >= 0 else f"{best.label}: {-gain:.1f} dB below {other}"
+    ours, theirs = best.rendered.psnr_db, baseline.rendered.psnr_db
+    detail = f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors."
     if best.idealised is not None and baseline.idealised is not None:
-        detail += f"; idealised model: {best.idealised.psnr_db - baseline.idealised.psnr_db:+.1f} dB"
-    return f"{text} ({detail})."
+        ideal = best.idealised.psnr_db - baseline.idealised.psnr_db
+        detail += f" The idealised model says {ideal:+.1f} dB."
+    return headline, detail
 
 
 def build_report(report: ReportData, path: Path) -> Path:
@@ -191,12 +198,9 @@ def render_html(report: ReportData) -> str:
 
 
 def _figures(report: ReportData) -> dict[str, Any]:
-    """The page's plots as data URIs, by name; only those that have data."""
-    figures: dict[str, Any] = {
-        "frames": [
-            (shot.label, _figure_png(plots.frame(_finite(shot.dn, shot.label)))) for shot in report.frames
-        ]
-    }
+    """The page's plots as data URIs, by name, where there are data for them; and the total time in s."""
+    figures: dict[str, Any] = {"total": report.seconds.get("total", math.fsum(report.seconds.values()))}
+    figures["frames"] = [(f.label, _figure_png(plots.frame(_finite(f.dn, f.label)))) for f in report.frames]
     spectra = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
     if spectra:
         figures["spectra"] = _figure_png(plots.singular_values(spectra))
@@ -258,8 +262,7 @@ def _grey_png(values: Array) -> str:
 
 
 def _figure_png(figure: Figure) -> str:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=160)
+    figure.savefig(buffer := BytesIO(), format="png", dpi=160)
     return _data_uri(buffer)
 
 
