@@ -1,0 +1,162 @@
+"""The shipped scenes: textures equal their recipe; light and print land where the scene files say."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsim.core.environment import load_variant
+
+SCENES = Path(__file__).parents[1] / "scenes"
+NAMES = ("photograph", "colour_chart", "resolution_target")
+
+
+def _generator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("scenes_generate", SCENES / "generate.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+generate = _generator()
+
+
+def _reflectance(name: str) -> np.ndarray:
+    return np.asarray(Image.open(SCENES / name / "reflectance.png")) / 255.0
+
+
+def _projector_pixels(name: str) -> np.ndarray:
+    """(128, 128) exact mean reflectance over each projector pixel: the sheet's central 120 of 128 mm."""
+    sheet = _reflectance(name)
+    texels = np.arange(sheet.shape[0] + 1) * 128.0 / sheet.shape[0] - 64.0
+    edges = np.linspace(-60.0, 60.0, 129)
+    low, high = np.maximum(edges[:-1, None], texels[:-1]), np.minimum(edges[1:, None], texels[1:])
+    share = np.maximum(high - low, 0.0) / (120.0 / 128.0)
+    assert np.allclose(share.sum(axis=1), 1.0)
+    return share @ sheet @ share.T
+
+
+@pytest.mark.parametrize("name", sorted(generate.TEXTURES))
+def test_shipped_texture_is_what_its_recipe_makes(name: str) -> None:
+    assert generate.difference(SCENES, name) is None
+
+
+def test_every_texture_of_a_scene_has_a_recipe() -> None:
+    shipped = {str(path.relative_to(SCENES)) for path in SCENES.rglob("*.png")}
+    assert shipped == set(generate.TEXTURES)
+    assert {path.parent.name for path in SCENES.glob("*/scene.xml")} == set(NAMES)
+
+
+def test_a_changed_texture_is_noticed(tmp_path: Path) -> None:
+    name = "colour_chart/projector.png"
+    (tmp_path / "colour_chart").mkdir()
+    assert "missing" in str(generate.difference(tmp_path, name))
+    canvas = generate.projector_window()
+    canvas[5, 7] = 1
+    Image.fromarray(canvas).save(tmp_path / name)
+    assert "in 1 pixels" in str(generate.difference(tmp_path, name))
+    generate.write(tmp_path, name)
+    assert generate.difference(tmp_path, name) is None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reflectances_are_physical_and_no_symmetry_hides_a_flip(name: str) -> None:
+    pixels = _projector_pixels(name)
+    assert pixels.min() > 0.02 and pixels.max() < 0.91
+    views = [np.rot90(flipped, turns) for flipped in (pixels, pixels.T) for turns in range(4)][1:]
+    assert min(float(np.sqrt(np.mean((view - pixels) ** 2))) for view in views) > 0.05
+
+
+def test_chart_patches_keep_the_grey_scale_in_order() -> None:
+    # Last row of a ColorChecker: white, four ever darker greys, black. Patches are 74 texels apart.
+    greys = _reflectance("colour_chart")[103 + 10 + 3 * 74 + 32, 29 + 10 + 32 + 74 * np.arange(6)]
+    assert np.all(np.diff(greys) < 0)
+    # N. Ohta's flat greys: 0.89 (white 9.5) and 0.03 (black 2), to 8 bits.
+    assert greys[0] == pytest.approx(0.888, abs=0.003) and greys[-1] == pytest.approx(0.034, abs=0.003)
+
+
+def test_group_5_is_the_last_that_the_projector_grid_resolves() -> None:
+    white, black = np.rint(np.array([0.90, 0.04]) * 255) / 255
+    pixels = _projector_pixels("resolution_target")
+    # Group 5 starts at pixel row 3 + 2 x 31 + 8, column 3; a bar is one pixel: nine white, eight black between.
+    vertical = pixels[73:90, 3:20]
+    assert np.allclose(vertical, np.where(np.arange(17) % 2 == 0, white, black))
+    # Horizontal bars lie right of them, two pixels apart.
+    assert np.allclose(pixels[73:90, 22:39], vertical.T)
+    # Group 2, 0.75 mm a line pair: averaged over pixels of 0.94 mm, less than half the contrast is left.
+    fine = pixels[106:120, 5:18]
+    assert np.ptp(fine) / (fine.max() + fine.min()) < 0.5 * (white - black) / (white + black)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def scene(request: pytest.FixtureRequest) -> tuple[str, Any, Any]:
+    mi = load_variant("llvm_ad_mono")
+    from mitsim.transport.lensless import register
+
+    register()
+    return request.param, mi, mi.load_file(str(SCENES / request.param / "scene.xml"))
+
+
+def _light(mi: Any, scene: Any, x: list[float], y: list[float], z: float) -> tuple[np.ndarray, np.ndarray]:
+    """Projector uv (2, k) at points (x, y, z), and irradiance (k,) on the plane z = const there."""
+    import drjit as dr
+
+    point = dr.zeros(mi.SurfaceInteraction3f, len(x))
+    point.p = mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))
+    sample, weight = scene.emitters()[0].sample_direction(point, mi.Point2f(0.5), True)
+    return np.array(sample.uv), np.array(weight[0] * dr.abs(sample.d.z))
+
+
+def test_window_lands_squarely_on_the_sheet(scene: tuple[str, Any, Any]) -> None:
+    """Pixel (0, 0) at x = y = +60 mm, top left as seen along +z; E = pi scale / z^2 inside, nothing outside."""
+    _, mi, loaded = scene
+    inside = 59.99
+    x, y = [inside, -inside, inside, -inside, 0.0], [inside, inside, -inside, -inside, 0.0]
+    uv, irradiance = _light(mi, loaded, x, y, 400.0)
+    canvas_column, canvas_row = 256 * uv[0], 128 * uv[1]
+    assert np.allclose(canvas_column, 128 + (60 - np.array(x)) / 120 * 128, atol=1e-3)
+    assert np.allclose(canvas_row, (60 - np.array(y)) / 120 * 128, atol=1e-3)
+    assert np.allclose(irradiance, math.pi * 111000 / 400**2, rtol=1e-4)  # float32 geometry
+    outside = _light(mi, loaded, [60.01, -60.01, 0.0, 0.0], [0.0, 0.0, 60.01, -60.01], 400.0)[1]
+    assert np.all(outside == 0.0)
+
+
+def test_print_is_upright_and_not_mirrored(scene: tuple[str, Any, Any]) -> None:
+    """Texel (row, column) of the PNG is met at y = 64 - row pitch, x = 64 - column pitch, face on."""
+    import drjit as dr
+
+    name, mi, loaded = scene
+    sheet = _reflectance(name)
+    size = sheet.shape[0]
+    rng = np.random.default_rng(3)
+    row, column = rng.integers(0, size, (2, 400))
+    x, y = 64 - (column + 0.5) * 128 / size, 64 - (row + 0.5) * 128 / size
+    direction = dr.normalize(mi.Vector3f(mi.Float(x), mi.Float(y), mi.Float(400.0)))
+    hit = loaded.ray_intersect(mi.Ray3f(mi.Point3f(0.0), direction))
+    assert np.allclose(np.array(hit.p)[2], 400.0, atol=1e-3)
+    assert np.all(np.array(hit.wi)[2] > 0), "the sheet's front faces the camera"
+    seen = np.array(hit.bsdf().eval_diffuse_reflectance(hit)[0])
+    assert np.allclose(seen, sheet[row, column], atol=1e-6)
+
+
+def test_camera_is_the_papers(scene: tuple[str, Any, Any]) -> None:
+    geometry = scene[2].sensors()[0].geometry
+    wanted = {
+        "pixels": 512,
+        "pixel_pitch": 0.01172,
+        "mask": "separable",
+        "mask_order": 9,
+        "mask_feature": 0.06,
+        "mask_distance": 2.0,
+        "scene_distance": 400.0,
+        "fov": 20.0,
+    }
+    assert {name: getattr(geometry, name) for name in wanted} == wanted

@@ -1,0 +1,86 @@
+"""Image quality against closed forms, and the one reader of the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.frames import write_frame
+from mitsim.study.metrics import contrast, psnr, read_truth, ssim
+
+RNG = np.random.default_rng(11)
+TRUTH = RNG.uniform(0.05, 0.9, (24, 20))
+
+
+def test_psnr_of_a_constant_error_is_its_decibel() -> None:
+    assert psnr(TRUTH + 0.1, TRUTH) == pytest.approx(20.0)
+    assert psnr(TRUTH, TRUTH) == float("inf")
+
+
+def test_psnr_fits_no_gain_and_no_offset_and_clips_nothing() -> None:
+    """Values far outside 0..1 count in full: mean((3 T - T)^2) = 4 mean(T^2)."""
+    assert psnr(3.0 * TRUTH, TRUTH) == pytest.approx(-10 * np.log10(4 * np.mean(TRUTH**2)))
+
+
+def test_ssim_is_one_for_equal_and_follows_the_formula_for_flat_images() -> None:
+    """Flat images of means a, b have structure term 1: SSIM = (2ab + c1) / (a^2 + b^2 + c1), c1 = 0.01^2."""
+    assert ssim(TRUTH, TRUTH) == pytest.approx(1.0)
+    a, b, c1 = 0.3, 0.6, 1e-4
+    flat = np.full((9, 9), a), np.full((9, 9), b)
+    assert ssim(*flat) == pytest.approx((2 * a * b + c1) / (a * a + b * b + c1))
+
+
+def test_ssim_keeps_the_data_range_of_dark_images() -> None:
+    """Images of range 0.01 must not be stretched: noise below the constants (0.03^2) changes SSIM little."""
+    assert ssim(0.01 * TRUTH, 0.01 * TRUTH[::-1]) > 0.9
+
+
+@pytest.mark.parametrize("lines", ["vertical", "horizontal"])
+def test_contrast_of_known_bars(lines: str) -> None:
+    bars = np.tile(np.repeat([0.8, 0.2], 3), 4)[None, :] * np.ones((10, 1))
+    region = bars if lines == "vertical" else bars.T
+    other = "horizontal" if lines == "vertical" else "vertical"
+    assert contrast(region, lines) == pytest.approx(0.6)  # type: ignore[arg-type]
+    assert contrast(region, other) == pytest.approx(0.0)  # type: ignore[arg-type]
+    assert contrast(region, lines, background=0.1) == pytest.approx(0.6 / 0.8)  # type: ignore[arg-type]
+
+
+def test_contrast_averages_noise_along_the_lines() -> None:
+    """Zero-mean noise of 0.1 along 10000 texels a line leaves 1e-3 a line; 5 sigma over min and max: 0.01."""
+    bars = np.tile([0.8, 0.2], 4)[None, :] + 0.1 * np.random.default_rng(5).standard_normal((10000, 8))
+    assert contrast(bars) == pytest.approx(0.6, abs=0.01)
+
+
+def test_refusals_are_one_line_that_names_the_trouble() -> None:
+    broken = TRUTH.copy()
+    broken[0, :3] = np.nan
+    for call, words in (
+        (lambda: psnr(TRUTH, TRUTH[1:]), "image is 24 x 20, truth 23 x 20"),
+        (lambda: psnr(broken, TRUTH), "image has 3 values that are not finite"),
+        (lambda: ssim(TRUTH, broken), "truth has 3 values"),
+        (lambda: ssim(TRUTH[:6], TRUTH[:6]), "6 x 20 pixels; needs at least 7 x 7"),
+        (lambda: contrast(np.zeros((4, 4))), "must be above 0"),
+        (lambda: contrast(np.zeros((0, 4))), "shape"),
+        (lambda: contrast(TRUTH, "diagonal"), "'diagonal'"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(MitsimError, match=words) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+def test_truth_is_read_as_written(tmp_path: Path) -> None:
+    values = TRUTH.astype(np.float32)
+    write_frame(tmp_path / "truth.exr", {"reflectance": values}, {})
+    read = read_truth(tmp_path)
+    assert read.dtype == np.float64 and np.array_equal(read, values)
+
+
+def test_a_run_without_truth_says_so(tmp_path: Path) -> None:
+    with pytest.raises(MitsimError, match="no truth in this run"):
+        read_truth(tmp_path)
+    write_frame(tmp_path / "truth.exr", {"other": TRUTH.astype(np.float32)}, {})
+    with pytest.raises(MitsimError, match="channels are other"):
+        read_truth(tmp_path)
