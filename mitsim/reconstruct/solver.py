@@ -160,8 +160,8 @@ class Prepared:
         for name, side in (("row", self.left), ("column", self.right)):
             if side.data_rows < side.scene_size:
                 return False, (
-                    f"Under-determined: {side.data_rows} sensor {name}s over all patterns for "
-                    f"{side.scene_size} scene {name}s; use more patterns, more sensor pixels or fewer scene pixels."
+                    f"Under-determined: {side.data_rows} sensor {name}s in all for {side.scene_size} "
+                    f"scene {name}s; use more patterns, more sensor pixels or fewer scene pixels."
                 )
         lost = self.unknowns - self.rank
         if lost and lam == 0:
@@ -171,8 +171,8 @@ class Prepared:
             )
         if lost:
             return True, (
-                f"Solved, but {lost} of {self.unknowns} directions are not measured above rounding and follow "
-                "from lambda alone; use more patterns."
+                f"Solved, but {lost} of {self.unknowns} directions are not measured above rounding and "
+                "follow from lambda alone; use more patterns."
             )
         return True, "Solved: every direction of the image is measured."
 

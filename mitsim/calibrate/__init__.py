@@ -1,0 +1,1 @@
+"""Calibration frames in, sensor factors out. Knows neither Mitsuba nor the scene."""

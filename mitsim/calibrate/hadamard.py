@@ -1,0 +1,243 @@
+"""Responses to horizontal and vertical +-1 stripes on a white board in; the camera's two factors out.
+
+Under X = h_i 1^T a separable camera records Y_i = Phi_L h_i (Phi_R 1)^T = u_i v^T, and under 1 h_i^T it
+records a w_i^T with a = Phi_L 1. The uniform response a v^T gives a and v; projecting on them gives u_i and
+w_i, and H H^T = N I gives Phi_L = U H^T / N (arXiv 2111.12862, section IV-A, after the FlatCam procedure;
+the paper leaves out the 1/N). Factors are known up to (c Phi_L, Phi_R / c) only; they are returned
+balanced, |Phi_L 1| = |Phi_R 1|, and their product reproduces the absolute responses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.errors import MitsimError
+
+FloatArray = npt.NDArray[np.float64]
+
+SEPARABLE_RESIDUAL = 0.05
+"""Separability residual above which the status warns: stray light and falloff stay below a few percent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Estimated factors and how far to trust them.
+
+    Attributes
+    ----------
+    left, right
+        Phi_L (m, n), Phi_R (m', n), in the square root of the frames' unit.
+    separability_residual
+        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses: noise plus what no separable
+        camera explains.
+    condition
+        the larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient.
+    noise
+        root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
+    predicted_error
+        relative error of (left, right), in the Frobenius norm, that independent noise of that size leaves.
+    ok, status
+        False when the responses cannot be trusted, and one sentence.
+    """
+
+    left: FloatArray
+    right: FloatArray
+    separability_residual: float
+    condition: float
+    noise: float
+    predicted_error: tuple[float, float]
+    ok: bool
+    status: str
+
+
+@dataclass
+class _Split:
+    """Running sums of one direction: u_i as columns, misfit and energy."""
+
+    vectors: FloatArray
+    misfit: float = 0.0
+    energy: float = 0.0
+
+
+def estimate_factors(
+    horizontal: Iterable[npt.ArrayLike],
+    vertical: Iterable[npt.ArrayLike],
+    H: npt.ArrayLike,
+    centre: bool = False,
+    uniform: npt.ArrayLike | None = None,
+) -> Calibration:
+    """Factors of a separable camera from its responses to striped light.
+
+    Parameters
+    ----------
+    horizontal, vertical
+        responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, in order i = 0 .. N-1, each the difference of a
+        pattern's positive and negative capture; read one at a time, so generators keep memory small.
+    H
+        (n, N) of +1 and -1 with orthogonal rows. Its column 0 is all +1 unless ``uniform`` is given.
+    centre
+        True takes row and column means out of every response and of the factors: for a FlatCam mask, whose
+        constant term vanishes so.
+    uniform
+        (m, m') response under all light, a better estimate than responses number 0 (for example the mean
+        over pairs of positive + negative captures). Default: the mean of ``horizontal[0]`` and
+        ``vertical[0]``.
+
+    Raises
+    ------
+    MitsimError
+        for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
+    """
+    signs = _checked_signs(H, uniform is not None)
+    rows, columns = iter(horizontal), iter(vertical)
+    first = [_next(rows, "horizontal", 0, None, signs.shape[1], centre)]
+    first.append(_next(columns, "vertical", 0, first[0].shape, signs.shape[1], centre))
+    mean = (first[0] + first[1]) / 2
+    if uniform is not None:
+        mean = _response(uniform, "uniform response", first[0].shape, centre)
+    a, v = _rank_one_split(mean)
+    left = _split(first[0], rows, "horizontal", v, signs.shape[1], centre)
+    right = _split(first[1].T, columns, "vertical", a, signs.shape[1], centre)
+    return _calibration(left, right, a, v, signs)
+
+
+def _split(
+    first: FloatArray, rest: Iterator[npt.ArrayLike], name: str, common: FloatArray, count: int, centre: bool
+) -> _Split:
+    """Project each response on its common vector: least squares for u_i in Y_i = u_i common^T."""
+    unit = common / np.dot(common, common)
+    result = _Split(np.empty((first.shape[0], count)))
+    for index in range(count):
+        response = first
+        if index:
+            shape = first.shape if name == "horizontal" else first.shape[::-1]
+            response = _next(rest, name, index, shape, count, centre)
+            response = response if name == "horizontal" else response.T
+        vector = response @ unit
+        result.vectors[:, index] = vector
+        result.misfit += float(np.sum(np.square(response - np.outer(vector, common))))
+        result.energy += float(np.sum(np.square(response)))
+    if next(rest, None) is not None:
+        raise MitsimError(f"more than {count} {name} responses were given; give one for each column of H")
+    return result
+
+
+def _calibration(left: _Split, right: _Split, a: FloatArray, v: FloatArray, signs: FloatArray) -> Calibration:
+    count = signs.shape[1]
+    phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
+    energy = left.energy + right.energy
+    residual = float(np.sqrt((left.misfit + right.misfit) / energy))
+    # Each response of m m' numbers spends one fitted number a sensor row (or column).
+    spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
+    noise = float(np.sqrt((left.misfit + right.misfit) / spare))
+    condition = max(_squared_condition(phi[0]), _squared_condition(phi[1]))
+    predicted = tuple(
+        predicted_error(factor, noise, float(np.linalg.norm(other)), count)
+        for factor, other in ((phi[0], v), (phi[1], a))
+    )
+    ok, status = _verdict(residual, condition)
+    return Calibration(
+        left=phi[0],
+        right=phi[1],
+        separability_residual=residual,
+        condition=condition,
+        noise=noise,
+        predicted_error=(predicted[0], predicted[1]),
+        ok=ok,
+        status=status,
+    )
+
+
+def predicted_error(factor: FloatArray, noise: float, common_norm: float, count: int) -> float:
+    """Relative Frobenius error of a factor (m, n) when every datum has independent noise of that size.
+
+    u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, and U H^T / N averages N of them with signs,
+    so the factor has variance noise^2 / (N |v|^2). The error of v itself enters at second order and as a
+    common scale of order noise / (|a| |v|), and is left out.
+    """
+    deviation = noise / (np.sqrt(count) * common_norm)
+    return float(deviation * np.sqrt(factor.size) / np.linalg.norm(factor))
+
+
+def _verdict(residual: float, condition: float) -> tuple[bool, str]:
+    if residual > SEPARABLE_RESIDUAL:
+        return False, (
+            f"Responses are not separable: {residual:.1%} of them is left over; for a FlatCam mask centre "
+            "them, otherwise look for ambient light or a rotated part, or raise the exposure."
+        )
+    if not np.isfinite(condition):
+        return False, (
+            "Factors are rank deficient: some scene rows or columns look alike to the sensor; use "
+            "fewer scene pixels or a larger distance from sensor to mask."
+        )
+    return True, "Calibrated: responses are separable."
+
+
+def _squared_condition(phi: FloatArray) -> float:
+    singular = np.linalg.svd(phi, compute_uv=False)
+    cut = singular[0] * max(phi.shape) * np.finfo(np.float64).eps
+    if phi.shape[0] < phi.shape[1] or singular[-1] <= cut:
+        return float("inf")
+    return float((singular[0] / singular[-1]) ** 2)
+
+
+def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """a, v of equal norm with mean = a v^T in the least-squares sense, a with positive sum."""
+    left, singular, right = np.linalg.svd(mean, full_matrices=False)
+    if singular[0] == 0:
+        raise MitsimError("the uniform response is zero everywhere; check exposure and black level")
+    root = np.sqrt(singular[0])
+    sign = 1.0 if left[:, 0].sum() >= 0 else -1.0
+    return sign * root * left[:, 0], sign * root * right[0]
+
+
+def _next(
+    responses: Iterator[npt.ArrayLike],
+    name: str,
+    index: int,
+    shape: tuple[int, ...] | None,
+    count: int,
+    centre: bool,
+) -> FloatArray:
+    response = next(responses, None)
+    if response is None:
+        raise MitsimError(
+            f"only {index} {name} responses were given; H has {count} columns, give one for each"
+        )
+    return _response(response, f"{name} response {index}", shape, centre)
+
+
+def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:
+    values = np.asarray(response, dtype=np.float64)
+    if values.ndim != 2 or values.size == 0 or (shape is not None and values.shape != shape):
+        raise MitsimError(
+            f"{name} has shape {values.shape}; allowed is {shape or 'a 2-D array'}, as the first"
+        )
+    if not np.isfinite(values).all():
+        bad = np.count_nonzero(~np.isfinite(values))
+        raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
+    if centre:
+        values = values - values.mean(axis=1, keepdims=True)
+        values = values - values.mean(axis=0, keepdims=True)
+    return values
+
+
+def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:
+    signs = np.asarray(H, dtype=np.float64)
+    if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
+        raise MitsimError(
+            f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard"
+        )
+    if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
+        raise MitsimError(
+            f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix"
+        )
+    if not has_uniform and not (signs[:, 0] == 1).all():
+        raise MitsimError(
+            "column 0 of H is not all +1 and no uniform response was given; give one of the two"
+        )
+    return signs
