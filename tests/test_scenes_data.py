@@ -86,7 +86,7 @@ def test_chart_patches_keep_the_grey_scale_in_order() -> None:
 def test_group_5_is_the_last_that_the_projector_grid_resolves() -> None:
     white, black = np.rint(np.array([0.90, 0.04]) * 255) / 255
     pixels = _projector_pixels("resolution_target")
-    # Group 5 starts at pixel row 3 + 2 x 31 + 8, column 3; a bar is one pixel: nine white, eight black between.
+    # Group 5 starts at pixel row 3 + 2 x 31 + 8, column 3; a bar is one pixel: nine white, eight black.
     vertical = pixels[73:90, 3:20]
     assert np.allclose(vertical, np.where(np.arange(17) % 2 == 0, white, black))
     # Horizontal bars lie right of them, two pixels apart.
@@ -116,7 +116,7 @@ def _light(mi: Any, scene: Any, x: list[float], y: list[float], z: float) -> tup
 
 
 def test_window_lands_squarely_on_the_sheet(scene: tuple[str, Any, Any]) -> None:
-    """Pixel (0, 0) at x = y = +60 mm, top left as seen along +z; E = pi scale / z^2 inside, nothing outside."""
+    """Pixel (0, 0) at x = y = +60 mm, top left seen along +z; E = pi scale / z^2 inside, none outside."""
     _, mi, loaded = scene
     inside = 59.99
     x, y = [inside, -inside, inside, -inside, 0.0], [inside, inside, -inside, -inside, 0.0]

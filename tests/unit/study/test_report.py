@@ -182,7 +182,7 @@ def test_display_clips_but_the_numbers_do_not() -> None:
 
 
 def test_signed_patterns_show_minus_one_black() -> None:
-    assert R._pattern_png(np.array([[1.0, -1.0]])) == R._pattern_png(np.array([[1.0, 0.0]]))
+    assert R._pattern_png(np.array([[1.0, 0.0, -1.0]])) == R._pattern_png(np.array([[1.0, 0.5, 0.0]]))
 
 
 def test_a_loss_is_called_a_loss() -> None:
