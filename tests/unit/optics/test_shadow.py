@@ -1,0 +1,121 @@
+"""The closed-form shadow against exact rational arithmetic, quadrature, and what must hold for any mask."""
+
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mitsim.core.errors import MitsimError
+from mitsim.optics.mask import mls_mask
+from mitsim.optics.shadow import centred_edges, scene_factor, shadow_factor
+
+ANCHOR = (0.06, centred_edges(512, 0.01172), centred_edges(128, 120 / 128), 2.0, 400.0)
+
+
+def second_sum(bits, s):
+    """Exact second integral of the profile, in features, from its left edge to s (a Fraction)."""
+    total, slope = Fraction(0), Fraction(0)
+    for index, bit in enumerate(bits):
+        step = min(max(s - index, Fraction(0)), Fraction(1))
+        total += slope * step + Fraction(int(bit)) * step * step / 2
+        slope += int(bit) * step
+    return total + slope * max(s - len(bits), Fraction(0))
+
+
+def exact_entry(bits, feature, pixel, cell, distance, depth):
+    """Mean transmission by four corners of the second sum, all in rationals."""
+    feature, distance, depth = (Fraction(v) for v in (feature, distance, depth))
+    shrink = (1 - distance / depth) / feature
+    u = [Fraction(v) * shrink for v in pixel]
+    x = [Fraction(v) / depth * distance / feature for v in cell]
+    half = Fraction(len(bits), 2)
+    corner = [[second_sum(bits, a + b + half) for b in x] for a in u]
+    return (corner[1][1] - corner[0][1] - corner[1][0] + corner[0][0]) / ((u[1] - u[0]) * (x[1] - x[0]))
+
+
+@pytest.mark.parametrize("entry", [(0, 0), (511, 127), (255, 64), (100, 3), (400, 90)])
+def test_entries_equal_rational_arithmetic(entry):
+    # 1e-12: eps times 511 features over a kernel 0.2 features wide.
+    feature, pixels, cells, distance, depth = ANCHOR
+    bits = mls_mask().bits
+    i, j = entry
+    exact = exact_entry(bits, feature, pixels[i : i + 2], cells[j : j + 2], distance, depth)
+    assert scene_factor(bits, *ANCHOR)[i, j] == pytest.approx(float(exact), abs=1e-12)
+
+
+def test_wide_and_far_off_cells_equal_quadrature():
+    # Cells from far outside the mask to many features wide; midpoint rule with 400 x 400 points: error below
+    # (number of edges crossed) / 400.
+    rng = np.random.default_rng(3)
+    bits = rng.integers(0, 2, 31)
+    pixels = np.array([-0.9, -0.2, -0.1, 0.4, 1.6])
+    cells = np.array([-3.0, -0.5, -0.499, 0.0, 0.2, 0.9, 40.0])
+    got = shadow_factor(bits, 0.05, pixels, cells, 1.0, 3.0)
+    middle = (np.arange(400) + 0.5) / 400
+    for i, (u0, u1) in enumerate(pairwise(pixels)):
+        for j, (t0, t1) in enumerate(pairwise(cells)):
+            s = (u0 + (u1 - u0) * middle)[:, None] * (1 - 1 / 3) + (t0 + (t1 - t0) * middle)[None, :]
+            index = np.floor(s / 0.05 + 31 / 2).astype(int)
+            values = np.where((index >= 0) & (index < 31), bits[np.clip(index, 0, 30)], 0)
+            assert got[i, j] == pytest.approx(values.mean(), abs=0.02)
+
+
+def test_flatcam_constant_term_is_exactly_one_inside_the_mask():
+    # The solver's centring relies on it: the weights of the features must sum to 1 to rounding.
+    factor = scene_factor(np.ones(511), *ANCHOR)
+    np.testing.assert_allclose(factor, 1.0, rtol=0, atol=4e-16)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.integers(0, 1), min_size=1, max_size=40),
+    st.floats(0.01, 1.0),
+    st.floats(0.1, 3.0),
+    st.floats(3.5, 1e6),
+)
+def test_energy_and_bounds(bits, feature, distance, depth):
+    # Over pixels that see the whole mask, the mean transmission adds up to the open area's share, whatever
+    # lies between; every entry stays within the profile's values.
+    span = (len(bits) * feature + 4 * distance) / (1 - distance / depth)
+    pixels, cells = centred_edges(50, span / 50), np.array([-0.7, -0.2, 0.01, 0.6])
+    factor = shadow_factor(bits, feature, pixels, cells, distance, depth)
+    assert factor.min() >= -1e-12
+    assert factor.max() <= 1 + 1e-12
+    area = factor.sum(axis=0) * (span / 50) * (1 - distance / depth)
+    np.testing.assert_allclose(area, sum(bits) * feature, rtol=1e-9, atol=1e-9)
+
+
+def test_finer_cells_average_to_coarse_ones():
+    bits = mls_mask(order=5).bits
+    fine = shadow_factor(bits, 0.06, centred_edges(20, 0.02), centred_edges(60, 0.003), 2.0, np.inf)
+    coarse = shadow_factor(bits, 0.06, centred_edges(10, 0.04), centred_edges(12, 0.015), 2.0, np.inf)
+    np.testing.assert_allclose(fine.reshape(10, 2, 12, 5).mean(axis=(1, 3)), coarse, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"depth_mm": 2.0},
+        {"depth_mm": float("nan")},
+        {"mask_distance_mm": -1.0},
+        {"feature_mm": 0.0},
+        {"profile": []},
+        {"profile": [np.nan]},
+        {"pixel_edges_mm": [1.0, 0.0]},
+        {"cell_edges_tan": [0.0]},
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(change):
+    good = {
+        "profile": [1, 0],
+        "feature_mm": 0.1,
+        "pixel_edges_mm": [0.0, 1.0],
+        "cell_edges_tan": [0.0, 1.0],
+        "mask_distance_mm": 2.0,
+        "depth_mm": 10.0,
+    }
+    with pytest.raises(MitsimError, match=r"^[^\n]+$"):
+        shadow_factor(**(good | change))

@@ -1,0 +1,235 @@
+"""The streamed, projected solution equals the dense least-squares one, and says when it cannot."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import hadamard
+
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.factors import pattern_blocks
+from mitsim.reconstruct.solver import prepare
+
+
+def dots(n, k):
+    return (np.arange(n)[:, None] % k == np.arange(k)).astype(float)
+
+
+def families(n):
+    rng = np.random.default_rng(5)
+    return {
+        "uniform": np.ones((n, 1)),
+        "dots": dots(n, 3),
+        "repeated hadamard": np.tile(hadamard(4), (n // 4 + 1, 1))[:n].astype(float),
+        "random": (rng.random((n, 4)) < 0.6).astype(float),
+        "grey": rng.random((n, 3)),
+        "with a dark row": dots(n, 3) * (np.arange(n) != 4)[:, None],
+    }
+
+
+def frames_of(left, right, P_L, P_R, image):
+    return {
+        (i, j): left @ (np.outer(p, q) * image) @ right.T
+        for i, p in enumerate(P_L.T)
+        for j, q in enumerate(P_R.T)
+    }
+
+
+def solve(left, right, P_L, P_R, frames, lam, **options):
+    prepared = prepare(left, right, P_L, P_R, **options)
+    sums = prepared.accumulator()
+    for (i, j), frame in frames.items():
+        sums.add(frame, i, j)
+    return prepared.solve(sums, lam)
+
+
+def dense(left, right, P_L, P_R, frames, lam):
+    """Tikhonov solution by one stacked matrix of the whole image, nothing separable about it."""
+    blocks = [np.kron(left * P_L[:, i], right * P_R[:, j]) for i, j in frames]
+    matrix, data = np.concatenate(blocks), np.concatenate([frame.ravel() for frame in frames.values()])
+    unknowns = matrix.shape[1]
+    stacked = np.concatenate([matrix, np.sqrt(lam) * np.eye(unknowns)])
+    image = np.linalg.lstsq(stacked, np.concatenate([data, np.zeros(unknowns)]), rcond=1e-13)[0]
+    residual = np.linalg.norm(data - matrix @ image) / np.linalg.norm(data)
+    return image.reshape(left.shape[1], right.shape[1]), residual
+
+
+@pytest.mark.parametrize("options", [{}, {"structure": "full"}, {"method": "gram"}], ids=str)
+@pytest.mark.parametrize("family", families(8))
+@pytest.mark.parametrize("lam", [0.0, 0.3])
+def test_equals_the_dense_solution(family, options, lam):
+    # Noisy frames of other row and column sizes, so that transposed sides would show. 1e-7: the Gram path at
+    # lambda = 0 loses eps times the squared condition number, about 1e3 here.
+    rng = np.random.default_rng(1)
+    left, right = rng.random((13, 8)), rng.random((11, 7))
+    P_L, P_R = families(8)[family], families(7)[family]
+    frames = frames_of(left, right, P_L, P_R, rng.random((8, 7)))
+    frames = {key: frame + 0.1 * rng.normal(size=frame.shape) for key, frame in frames.items()}
+    expected, residual = dense(left, right, P_L, P_R, frames, lam)
+    solution = solve(left, right, P_L, P_R, frames, lam, **options)
+    np.testing.assert_allclose(solution.image, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+    assert solution.residual == pytest.approx(residual, rel=1e-6)
+    assert solution.lam == lam
+
+
+@settings(max_examples=30, deadline=None)
+@given(n=st.integers(3, 40), k=st.integers(1, 9), seed=st.integers(0, 99))
+def test_blocks_of_dots_and_full_agree(n, k, seed):
+    # Also k that does not divide n, or exceeds it (then some patterns are dark).
+    rng = np.random.default_rng(seed)
+    factor = rng.random((n + 10, n)) + np.eye(n + 10, n) * n / 2
+    image = rng.random((n, n))
+    frames = frames_of(factor, factor, dots(n, k), dots(n, k), image)
+    results = [
+        solve(factor, factor, dots(n, k), dots(n, k), frames, 0.0, structure=s) for s in ("block", "full")
+    ]
+    np.testing.assert_allclose(results[0].image, image, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(results[1].image, image, rtol=0, atol=1e-10)
+    assert results[0].condition == pytest.approx(results[1].condition, rel=1e-9)
+
+
+def test_block_structure_is_found_and_lit_columns_only_are_touched():
+    k, n = 7, 30
+    blocks = pattern_blocks(dots(n, k))
+    assert [list(b) for b in blocks] == [list(range(r, n, k)) for r in range(k)]
+    side = prepare(np.random.default_rng(0).random((40, n)), np.eye(3), dots(n, k), np.eye(3)).left
+    assert [slab.matrix.shape[1] for slab in side.slabs] == [len(b) for b in blocks]
+    assert len(pattern_blocks(np.tile(hadamard(4), (5, 1)).astype(float))) == 4
+    assert len(pattern_blocks(np.ones((9, 2)))) == 1
+    # 0.1 and 0.3 are not exact: rows orthogonal only up to rounding are not taken apart.
+    assert len(pattern_blocks(np.array([[0.1, 0.3], [0.3, -0.1]]))) == 1
+
+
+def test_condition_covers_all_blocks_and_the_worse_side():
+    left, right = np.diag([8.0, 1.0, 4.0, 1.0]), np.diag([3.0, 1.0])
+    assert prepare(left, right, dots(4, 2), np.ones((2, 1))).condition == pytest.approx(64.0)
+
+
+def test_ill_conditioned_data_recovered_at_lambda_zero():
+    # cond(A) = 1e12 a side and both sides together 1e12 in sigma: the projected form leaves 1e12 eps = 2e-4,
+    # the Gram matrix nothing at all.
+    rng = np.random.default_rng(2)
+    u, _ = np.linalg.qr(rng.normal(size=(24, 12)))
+    v, _ = np.linalg.qr(rng.normal(size=(12, 12)))
+    factor = u * np.logspace(0, -6, 12) @ v.T
+    image = rng.random((12, 12))
+    frames = {(0, 0): factor @ image @ factor.T}
+    one = np.ones((12, 1))
+    assert np.abs(solve(factor, factor, one, one, frames, 0.0).image - image).max() < 1e-2
+    assert np.abs(solve(factor, factor, one, one, frames, 0.0, method="gram").image - image).max() > 0.1
+
+
+def test_status_names_what_is_missing():
+    rng = np.random.default_rng(0)
+    one, image = np.ones((6, 1)), rng.random((6, 6))
+    short, tall = rng.random((4, 6)), rng.random((9, 6))
+    twin = tall.copy()
+    twin[:, 3] = twin[:, 2]
+
+    under = solve(short, tall, one, one, frames_of(short, tall, one, one, image), 0.1)
+    assert not under.ok
+    assert under.status.startswith("Under-determined: 4 sensor rows")
+    assert (under.rank, under.unknowns, under.condition) == (24, 36, np.inf)
+
+    deficient = solve(twin, tall, one, one, frames_of(twin, tall, one, one, image), 0.0)
+    assert not deficient.ok
+    assert deficient.status.startswith("Rank deficient: 6 of 36")
+    # The pseudo-inverse shares what cannot be told apart.
+    np.testing.assert_allclose(deficient.image[2], (image[2] + image[3]) / 2, atol=1e-9)
+
+    assert solve(twin, tall, one, one, frames_of(twin, tall, one, one, image), 0.1).ok
+    good = solve(tall, tall, one, one, frames_of(tall, tall, one, one, image), 0.0)
+    assert good.ok
+    assert good.rank == 36
+
+
+def test_values_are_neither_clipped_nor_normalised():
+    rng = np.random.default_rng(4)
+    factor, one = rng.random((20, 5)), np.ones((5, 1))
+    image = 1e3 * rng.normal(size=(5, 5))
+    frames = frames_of(factor, factor, one, one, image)
+    np.testing.assert_allclose(solve(factor, factor, one, one, frames, 0.0).image, image, rtol=1e-8)
+
+
+def test_single_precision_and_integer_frames_are_summed_in_double():
+    rng = np.random.default_rng(4)
+    factor, P = rng.integers(0, 5, (20, 6)).astype(float), dots(6, 2)
+    exact = frames_of(factor, factor, P, P, rng.integers(0, 9, (6, 6)).astype(float))
+    expected = solve(factor, factor, P, P, exact, 0.0).image
+    for dtype in (np.float32, np.uint32):
+        cast = {key: frame.astype(dtype) for key, frame in exact.items()}
+        np.testing.assert_array_equal(solve(factor, factor, P, P, cast, 0.0).image, expected)
+
+
+def test_solving_changes_nothing_prepared_and_sums_do_not_grow():
+    rng = np.random.default_rng(4)
+    factor, P = rng.random((20, 6)), dots(6, 2)
+    prepared = prepare(factor, factor, P, P)
+    first, second = prepared.accumulator(), prepared.accumulator()
+    for key, frame in frames_of(factor, factor, P, P, rng.random((6, 6))).items():
+        first.add(frame, *key)
+        second.add(frame, *key)
+        assert first.sum.shape == (6, 6)
+    np.testing.assert_array_equal(prepared.solve(first, 0.1).image, prepared.solve(second, 0.1).image)
+    np.testing.assert_array_equal(prepared.solve(first, 0.1).image, prepared.solve(first, 0.1).image)
+    with pytest.raises(ValueError, match="read-only"):
+        prepared.left.singular[0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "row", "column", "words"),
+    [
+        (np.ones((5, 4)), 0, 0, "shape"),
+        (np.full((5, 5), np.nan), 0, 0, "not finite"),
+        (np.full((5, 5), np.inf), 0, 0, "not finite"),
+        (np.ones((5, 5), complex), 0, 0, "complex"),
+        (np.ones((5, 5)), 2, 0, "pattern index"),
+        (np.ones((5, 5)), 0, -1, "pattern index"),
+        (np.ones((5, 5)), 0.0, 0, "pattern index"),
+    ],
+)
+def test_bad_frames_are_refused_and_leave_the_sum_alone(frame, row, column, words):
+    sums = prepare(np.eye(5, 4), np.eye(5, 4), dots(4, 2), dots(4, 2)).accumulator()
+    with pytest.raises(MitsimError, match=words):
+        sums.add(frame, row, column)
+    assert not sums.sum.any()
+    assert len(sums.missing) == 4
+
+
+def test_missing_repeated_and_foreign_frames_are_refused():
+    prepared = prepare(np.eye(5, 4), np.eye(5, 4), dots(4, 2), dots(4, 2))
+    sums = prepared.accumulator()
+    sums.add(np.ones((5, 5)), 0, 1)
+    with pytest.raises(MitsimError, match="added before"):
+        sums.add(np.ones((5, 5)), 0, 1)
+    with pytest.raises(MitsimError, match="3 of 4 frames are missing"):
+        prepared.solve(sums, 0.1)
+    other = prepare(np.eye(5, 4), np.eye(5, 4), dots(4, 2), dots(4, 2))
+    with pytest.raises(MitsimError, match="other factors"):
+        other.solve(sums, 0.1)
+
+
+@pytest.mark.parametrize("lam", [-1.0, float("nan"), float("inf"), "often"])
+def test_bad_lambda_is_refused(lam):
+    prepared = prepare(np.eye(5, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
+    sums = prepared.accumulator()
+    sums.add(np.ones((5, 5)), 0, 0)
+    with pytest.raises(MitsimError, match="lambda"):
+        prepared.solve(sums, lam)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"left": np.ones(4)}, "2-D"),
+        ({"left": np.full((5, 4), np.nan)}, "not finite"),
+        ({"P_L": np.ones((3, 1))}, "same number"),
+        ({"P_R": np.zeros((4, 1))}, "all zero"),
+        ({"method": "lu"}, "svd, gram"),
+        ({"structure": "some"}, "auto, block, full"),
+    ],
+)
+def test_bad_models_are_refused(change, words):
+    good = {"left": np.eye(5, 4), "right": np.eye(5, 4), "P_L": np.ones((4, 1)), "P_R": np.ones((4, 1))}
+    with pytest.raises(MitsimError, match=words):
+        prepare(**(good | change))
