@@ -26,10 +26,15 @@ _PROBES = 8
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Expected irradiance (pixels, pixels) [W m^-2] of one capture, and its Monte Carlo variance, mean over pixels."""
+    """Expected irradiance (pixels, pixels) [W m^-2] of one capture, and its Monte Carlo variance, mean over pixels.
+
+    Interpolation between anchors can leave specks below zero where a pixel sees almost no light; they are set to zero,
+    and ``removed`` is their sum over the sum of the frame, so that nothing is hidden.
+    """
 
     irradiance: FloatArray
     variance: float
+    removed: float
 
 
 class FrameOptics:
@@ -60,13 +65,24 @@ class FrameOptics:
     def frame(self, flat: npt.NDArray[np.int64], light: FloatArray) -> FloatArray:
         """(pixels, pixels) irradiance of sparse light: distinct flat indices into ``shape``, values [W m^-2]."""
         rows, columns, block = self._block(flat, light)
-        return np.asarray(sum(left[rows].T @ block @ right[columns] for left, right in self._terms))
+        factors = [(left[rows].T, right[columns]) for left, right in self._terms]
+        # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the long sensor side.
+        if len(rows) < len(columns):
+            return np.asarray(sum(left @ (block @ right) for left, right in factors))
+        return np.asarray(sum((left @ block) @ right for left, right in factors))
 
-    def probe(self, flat: npt.NDArray[np.int64], light: FloatArray, vectors: FloatArray) -> FloatArray:
-        """(pixels, probes): the frame of that light times ``vectors`` (pixels, probes), without forming the frame."""
+    def seen_by(self, vectors: FloatArray) -> list[FloatArray]:
+        """Sensor columns combined into ``vectors`` (pixels, probes), for :meth:`probe`."""
+        return [right @ vectors for _, right in self._terms]
+
+    def probe(self, flat: npt.NDArray[np.int64], light: FloatArray, seen: list[FloatArray]) -> FloatArray:
+        """(pixels, probes): the frame of that light times the vectors of ``seen``, without forming the frame."""
         rows, columns, block = self._block(flat, light)
         return np.asarray(
-            sum(left[rows].T @ (block @ (right[columns] @ vectors)) for left, right in self._terms)
+            sum(
+                left[rows].T @ (block @ right[columns])
+                for (left, _), right in zip(self._terms, seen, strict=True)
+            )
         )
 
     def total(self, light: sparse.csr_array) -> FloatArray:
@@ -118,7 +134,7 @@ class ExpectedFrames:
         self._mean = sum(self._groups[1:], self._groups[0]) / len(self._groups)
         classes, pixels = weights.shape[1], labels.size
         indicator = sparse.csr_array((np.ones(pixels), (labels, np.arange(pixels))), shape=(classes, pixels))
-        self._mixed = classes <= _LARGEST_BASIS
+        self._mixed = classes <= min(_LARGEST_BASIS, len(weights))
         self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(weights) @ indicator)
         self._weights = weights
         self._formed: tuple[FloatArray, FloatArray] | None = None
@@ -149,10 +165,11 @@ class ExpectedFrames:
         chosen = self._basis[start:stop]
         light, parts = chosen @ self._mean, [chosen @ group for group in self._groups]
         signs = stream(self._seed, "probe").choice((-1.0, 1.0), size=(self._optics.pixels, _PROBES))
+        seen = self._optics.seen_by(signs)
         frames, deviations = [], []
         for row in range(stop - start):
             frame = self._optics.frame(*_row(light, row))
-            probed = [self._optics.probe(*_row(part, row), signs) for part in parts]
+            probed = [self._optics.probe(*_row(part, row), seen) for part in parts]
             frames.append(frame)
             deviations.append((np.stack(probed) - frame @ signs).ravel())
         return np.stack(frames), np.stack(deviations)
@@ -162,7 +179,10 @@ class ExpectedFrames:
         pairs = count * (count - 1)
         for frame, one in zip(irradiance, deviation, strict=True):
             squared = float(one @ one) / _PROBES
-            yield Frame(frame, squared / pairs / frame.size if pairs else float("nan"))
+            variance = squared / pairs / frame.size if pairs else float("nan")
+            light = np.maximum(frame, 0)
+            total = float(light.sum())
+            yield Frame(light, variance, (total - float(frame.sum())) / total if total else 0.0)
 
 
 def relative_error(frames: Sequence[Frame] | ExpectedFrames) -> float:

@@ -54,7 +54,9 @@ def check_file(path: Path, defines: Mapping[str, str]) -> None:
             f"{path}:{line}: not well-formed XML (column {column}: {error.msg.split(':')[0]}); mend the file"
         ) from None
     except DefusedXmlException as error:
-        raise MitsimError(f"{path}: DTDs and entities are not allowed in a scene ({error}); remove them") from None
+        raise MitsimError(
+            f"{path}: DTDs and entities are not allowed in a scene ({error}); remove them"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise MitsimError(f"{path}: cannot be read ({error}); check the file") from None
     if root.tag != "scene":

@@ -67,7 +67,9 @@ def locate_projector(where: str, projector: Any, camera: Any) -> ProjectorGrid:
     lit = texels.reshape(texels.shape[0], texels.shape[1], -1).max(axis=-1) > 0
     rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
     if not rows.size:
-        raise MitsimError(f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels")
+        raise MitsimError(
+            f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels"
+        )
     height, width = int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1
     if height != width or not lit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
         raise MitsimError(
@@ -110,7 +112,9 @@ def _window_corners(
     mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T
     points = mapped[:, :2] / mapped[:, 2:]
     if not np.isfinite(points).all():
-        raise MitsimError(f"{where}: the projector does not light the plane at scene_distance {z} mm; aim it at the scene")
+        raise MitsimError(
+            f"{where}: the projector does not light the plane at scene_distance {z} mm; aim it at the scene"
+        )
     return np.stack([-points[:, 1] / z, -points[:, 0] / z], axis=1)
 
 

@@ -1,0 +1,1 @@
+"""The composer: scene -> plan -> transport -> optics -> sensor -> frames. It alone sees all stages."""

@@ -1,0 +1,167 @@
+"""An optical bench ready to be used: from a scene file and camera and projector files to one object that holds them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mitsim.core.configuration import load_model, shipped
+from mitsim.core.environment import load_variant
+from mitsim.core.errors import MitsimError
+from mitsim.core.frames import checksum
+from mitsim.optics.camera import CameraGeometry
+from mitsim.scene.load import LoadedScene, load_scene
+from mitsim.sensor.model import SensorModel, load_sensor
+from mitsim.transport import lensless
+from mitsim.transport.factored import Projector
+
+DEFAULT_VARIANT = "llvm_ad_mono"
+_PITCH_TOLERANCE = 1e-3
+
+
+class ProjectorModel(BaseModel):
+    """What mitsim uses of a projector file; the rest of the file documents its sources."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    name: str = Field(description="what the projector is called in reports")
+    effective_wavelength_nm: float = Field(
+        gt=0, allow_inf_nan=False, description="one wavelength that carries as many photons per watt [nm]"
+    )
+
+
+class SessionRecipe(BaseModel):
+    """How a calibration session is run."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    board_reflectance: float = Field(gt=0, le=1, description="diffuse reflectance of the white board")
+    exposure_fraction: float = Field(gt=0, le=1, description="brightest pixel's mean, as a part of the full well")
+    signed_capture: str = Field(pattern="^(pair|uniform)$", description="how a +-1 pattern is captured")
+    source: str = Field(description="where the numbers come from")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A loaded scene with the camera's electronics and the projector's light.
+
+    ``defines`` are the ``-D`` parameters that the scene was loaded with.
+    """
+
+    loaded: LoadedScene
+    sensor: SensorModel
+    projector: ProjectorModel
+    variant: str
+    defines: dict[str, str]
+
+    @property
+    def geometry(self) -> CameraGeometry:
+        """The camera's geometry, as the scene states it."""
+        geometry: CameraGeometry = self.loaded.camera.geometry
+        return geometry
+
+    @property
+    def n(self) -> int:
+        """Projector pixels a side."""
+        return self.loaded.pixels.n
+
+    @property
+    def source(self) -> Projector:
+        """The projector as the tracer wants it."""
+        grid = self.loaded.pixels
+        return Projector(self.loaded.projector, grid.n, grid.first_row, grid.first_column, grid.canvas)
+
+    @property
+    def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Row and column tan-angles of the projector's window on the aligned plane."""
+        return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
+
+    def identity(self) -> dict[str, Any]:
+        """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid."""
+        grid = self.loaded.pixels
+        return {
+            "geometry": self.geometry.model_dump(),
+            "sensor": self.sensor.model_dump(exclude={"source"}),
+            "projector": {
+                "name": self.projector.name,
+                "n": grid.n,
+                "row_tan": [round(value, 7) for value in grid.row_tan],
+                "column_tan": [round(value, 7) for value in grid.column_tan],
+            },
+        }
+
+    def provenance(self) -> dict[str, Any]:
+        """Where the scene came from: path, checksum of the XML, parameters, variant."""
+        return {
+            "scene": str(self.loaded.path),
+            "scene_sha256": checksum(self.loaded.path),
+            "defines": self.defines,
+            "variant": self.variant,
+        }
+
+    def with_board(self, reflectance: float) -> Bench:
+        """The same rig in front of a diffuse board on the aligned plane, larger than the field stop's view."""
+        import mitsuba as mi
+
+        z = self.geometry.scene_distance
+        half = 1.1 * (self.geometry.tan_half_fov * z + self.geometry.half_width)
+        place = mi.ScalarAffineTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180).scale([half, half, 1])
+        board = {
+            "type": "rectangle",
+            "to_world": _scalar_transform(self.loaded.camera) @ place,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}},
+        }
+        scene = mi.load_dict(
+            {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
+        )
+        return replace(self, loaded=replace(self.loaded, scene=scene, other_emitters=0))
+
+
+def open_bench(
+    scene: Path | str,
+    variant: str = DEFAULT_VARIANT,
+    camera: Path | str | None = None,
+    projector: Path | str | None = None,
+    defines: Mapping[str, str] | None = None,
+) -> Bench:
+    """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
+
+    ``camera`` and ``projector`` are TOML files; the shipped IMX249 and MP-CL1 are used without them.
+
+    Raises
+    ------
+    MitsimError
+        for anything wrong with the files, or a camera file whose pixel pitch is not the scene's.
+    """
+    mi = load_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    lensless.register()
+    sensor_path = Path(camera) if camera is not None else shipped("calibration", "imx249.toml")
+    sensor = load_sensor(sensor_path)
+    projector_path = Path(projector) if projector is not None else shipped("calibration", "mp_cl1.toml")
+    light = load_model(projector_path, ProjectorModel)
+    loaded = load_scene(Path(scene), defines)
+    pitch, stated = sensor.superpixel_pitch_um * 1e-3, loaded.camera.geometry.pixel_pitch
+    if abs(pitch - stated) > _PITCH_TOLERANCE * stated:
+        raise MitsimError(
+            f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
+            "use the camera of that scene, or change pixel_pitch, or binning"
+        )
+    return Bench(loaded, sensor, light, variant, dict(defines or {}))
+
+
+def load_recipe(path: Path | str | None = None) -> SessionRecipe:
+    """The calibration session's recipe, the shipped one without ``path``."""
+    return load_model(Path(path) if path is not None else shipped("calibration", "session.toml"), SessionRecipe)
+
+
+def _scalar_transform(camera: Any) -> Any:
+    import mitsuba as mi
+    import numpy as np
+
+    matrix = np.array(camera.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
+    return mi.ScalarAffineTransform4f(matrix.tolist())

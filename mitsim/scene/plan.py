@@ -1,0 +1,180 @@
+"""The effect plan: from measured evidence and an accuracy to what is simulated, why, and what it costs.
+
+Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels. The
+discretisations (anchors, cells, depth) may use most of that budget and sampling gets the rest; the cheapest combination
+that fits is taken. Effects that this version cannot simulate are listed too, so that no one takes their absence for a
+finding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+from mitsim.core.errors import MitsimError
+
+State = Literal["exact", "approximate", "off"]
+LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
+_SYSTEMATIC_SHARE = 0.8
+_SAMPLING_MARGIN = 0.95
+_SECONDS_PER_FRAME = 2.5e-3
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One row of the plan; ``error_if_off`` is None where no prediction was made, ``seconds`` is the extra cost."""
+
+    name: str
+    state: State
+    reason: str
+    error_if_off: float | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Settings of the factored estimator for one capture, with their reasons.
+
+    ``anchors`` a side of the sensor, ``subdivision`` cells a side of a projector pixel, ``depth`` [mm] of the light,
+    ``sampling_target`` relative Monte Carlo error at which sampling stops, ``systematic_error`` what the discretisations
+    are predicted to leave. ``warnings`` say why a result will be flagged.
+    """
+
+    accuracy: float
+    effects: tuple[Effect, ...]
+    predicted_seconds: float
+    anchors: int
+    subdivision: int
+    depth: float
+    sampling_target: float
+    systematic_error: float
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What the plan must know of a scene besides the pilot's evidence."""
+
+    other_emitters: int
+    fresnel_number: float
+    wavelength_nm: float
+    keystone: float
+
+
+def check_accuracy(accuracy: float) -> float:
+    """The accuracy, or MitsimError when it is outside what the estimator can promise."""
+    if not LOWEST_ACCURACY <= accuracy <= HIGHEST_ACCURACY:
+        raise MitsimError(
+            f"--accuracy {accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
+        )
+    return accuracy
+
+
+def decide(
+    accuracy: float,
+    anchor_error: Mapping[int, float],
+    cell_error: Mapping[int, float],
+    sampling_error: Mapping[int, float],
+    cells: Mapping[int, int],
+    paths_per_second: float,
+    depth: float,
+    depth_error: float,
+    captures: int,
+    facts: SceneFacts,
+) -> Plan:
+    """Choose anchors and cells for ``accuracy``.
+
+    ``anchor_error`` by anchors a side; ``cell_error``, ``sampling_error`` (one path a cell) and ``cells`` (number in the
+    grid) by cells a side of a projector pixel; ``captures`` is the number of frames.
+    """
+    check_accuracy(accuracy)
+
+    def systematic(anchors: int, subdivision: int) -> float:
+        return math.hypot(anchor_error[anchors], cell_error[subdivision])
+
+    def seconds(anchors: int, subdivision: int) -> float:
+        target = max(accuracy**2 - systematic(anchors, subdivision) ** 2, (0.2 * accuracy) ** 2)
+        passes = max(8.0, sampling_error[subdivision] ** 2 / target)
+        paths = passes * anchors**2 * cells[subdivision]
+        return paths / paths_per_second + captures * anchors * _SECONDS_PER_FRAME
+
+    choices = sorted(product(anchor_error, cell_error), key=lambda choice: seconds(*choice))
+    fitting = [choice for choice in choices if systematic(*choice) <= _SYSTEMATIC_SHARE * accuracy]
+    anchors, subdivision = fitting[0] if fitting else min(choices, key=lambda choice: systematic(*choice))
+    left = systematic(anchors, subdivision)
+    room = max(accuracy**2 - left**2, (0.2 * accuracy) ** 2)
+    warnings = _warnings(accuracy, left, depth_error, facts)
+    effects = (
+        _anchor_effect(anchors, anchor_error, accuracy, seconds(anchors, subdivision) - seconds(1, subdivision)),
+        Effect(
+            "tan-angle cells",
+            "approximate",
+            f"{subdivision}x{subdivision} cells a projector pixel leave {cell_error[subdivision]:.1e}",
+            cell_error[min(cell_error)],
+            0.0,
+        ),
+        _depth_effect(depth, depth_error, accuracy),
+        *_fixed_effects(facts),
+    )
+    return Plan(
+        accuracy=accuracy,
+        effects=effects,
+        predicted_seconds=seconds(anchors, subdivision),
+        anchors=anchors,
+        subdivision=subdivision,
+        depth=depth,
+        sampling_target=_SAMPLING_MARGIN * math.sqrt(room),
+        systematic_error=math.hypot(left, depth_error),
+        warnings=warnings,
+    )
+
+
+def _anchor_effect(anchors: int, errors: Mapping[int, float], accuracy: float, seconds: float) -> Effect:
+    if anchors == 1:
+        reason = f"one anchor leaves {errors[1]:.1e}, within {accuracy:g}"
+        return Effect("anchors (falloff, gloss, parallax)", "off", reason, errors[1], 0.0)
+    reason = f"{anchors}x{anchors} anchors leave {errors[anchors]:.1e}; one would leave {errors[1]:.1e}"
+    return Effect("anchors (falloff, gloss, parallax)", "approximate", reason, errors[1], max(seconds, 0.0))
+
+
+def _depth_effect(depth: float, error: float, accuracy: float) -> Effect:
+    if error <= _SYSTEMATIC_SHARE * accuracy:
+        reason = f"the lit surface lies at {depth:.2f} mm; one layer leaves {error:.1e}"
+    else:
+        reason = f"the lit depth varies about {depth:.1f} mm and this version has one layer: about {error:.1e} wrong"
+    return Effect("depth layers", "off", reason, error, 0.0)
+
+
+def _fixed_effects(facts: SceneFacts) -> Sequence[Effect]:
+    ambient = (
+        f"{facts.other_emitters} other emitter(s) in the scene are left out: not in this version"
+        if facts.other_emitters
+        else "the projector is the only emitter"
+    )
+    fresnel = (
+        f"not in this version; a mask feature's Fresnel number is {facts.fresnel_number:.1f} "
+        f"at {facts.wavelength_nm:.0f} nm, so the real shadow differs"
+    )
+    missing = "not in this version"
+    return (
+        Effect("ambient light", "off", ambient, None if facts.other_emitters else 0.0, 0.0),
+        Effect("interreflection", "off", "not in this version: light is followed over one reflection", None, 0.0),
+        Effect("mask diffraction", "off", fresnel, None, 0.0),
+        Effect("projector aperture, blur, black level", "off", missing, None, 0.0),
+        Effect("mask thickness, pixel angular response", "off", missing, None, 0.0),
+        Effect("sensor noise", "exact", "Poisson, full well, read noise, quantisation drawn for each frame", None, 0.0),
+    )
+
+
+def _warnings(accuracy: float, left: float, depth_error: float, facts: SceneFacts) -> tuple[str, ...]:
+    found = []
+    if left > accuracy:
+        found.append(f"anchors and cells leave {left:.1e}, more than the accuracy {accuracy:g} asked for")
+    if depth_error > _SYSTEMATIC_SHARE * accuracy:
+        found.append(f"the scene has depth: one layer leaves about {depth_error:.1e}; layers are not in this version")
+    if facts.other_emitters:
+        found.append(f"{facts.other_emitters} emitter(s) beside the projector are left out; ambient light is not in this version")
+    return tuple(found)

@@ -1,0 +1,187 @@
+"""A short look at a scene before the real work: how much error each discretisation would leave, measured, and at what pace.
+
+Numbers in, numbers out: the effect plan (:mod:`mitsim.scene.plan`) reads them and decides. All errors are relative,
+``||a - b|| / ||b||``.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
+from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.frames import ExpectedFrames, FrameOptics, relative_error
+from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.transport.factored import LightSample, Projector, Tracer
+
+FloatArray = npt.NDArray[np.float64]
+ANCHOR_CHOICES = (1, 2, 3)
+CELL_CHOICES = (1, 2, 4)
+_JUDGE_ANCHORS = 5
+_COARSE = 4
+_PILOT_CAPTURES = 4
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the pilot measured.
+
+    Attributes
+    ----------
+    anchor_error
+        by anchors a side: error of interpolating the light between them, against 5 a side.
+    cell_error
+        by cells a side of a projector pixel: error of frames whose light is spread evenly over each cell.
+    depth, depth_spread_error
+        depth of the light, 1 / mean(1/z) [mm], and the error of putting all of it at that depth.
+    sampling_error
+        by cells a side of a projector pixel: Monte Carlo error of the frames at one path a cell.
+    paths_per_second, seconds
+        pace of the tracer once compiled, and the time that this pilot took.
+    """
+
+    anchor_error: dict[int, float]
+    cell_error: dict[int, float]
+    depth: float
+    depth_spread_error: float
+    sampling_error: dict[int, float]
+    paths_per_second: float
+    seconds: float
+
+
+def measure(
+    scene: Any,
+    camera: Any,
+    projector: Projector,
+    windows: tuple[tuple[float, float], tuple[float, float]],
+    labels: npt.NDArray[np.int64],
+    weights: FloatArray,
+    seed: int,
+) -> Evidence:
+    """Trace a few small batches and compare discretisations on a handful of the family's captures.
+
+    ``windows`` are the row and column tan-angles of the projector's window; ``labels`` and ``weights`` describe the
+    family as in :class:`mitsim.optics.frames.ExpectedFrames`.
+
+    Raises
+    ------
+    MitsimError
+        when no light of the projector reaches the camera.
+    """
+    started = time.perf_counter()
+    geometry: CameraGeometry = camera.geometry
+    chosen = np.unique(np.linspace(0, len(weights) - 1, min(len(weights), _PILOT_CAPTURES)).astype(int))
+    weights = weights[chosen]
+    anchor_error = _anchor_errors(scene, camera, projector, windows, labels, weights, seed)
+    finest = CELL_CHOICES[-1]
+    grid = aligned_grid(*windows, projector.n, finest, geometry.tan_half_fov, multiple=finest)
+    tracer = Tracer(scene, camera, projector, grid, anchors=1)
+    samples = [tracer.batch(integer(seed, "pilot", "cells", 0))]
+    warm = time.perf_counter()
+    samples.append(tracer.batch(integer(seed, "pilot", "cells", 1)))
+    pace = tracer.lanes / (time.perf_counter() - warm)
+    if not any(sample.light.nnz for sample in samples):
+        raise MitsimError(
+            "no light of the projector reaches the camera; check the scene, the window and the field stop"
+        )
+    depth = 1 / float(np.mean([sample.depth_mean for sample in samples if sample.light.nnz]))
+    spread = float(np.mean([sample.depth_spread for sample in samples]))
+    cell_error, sampling_error = _cell_errors(geometry, grid, depth, samples, labels, weights, seed)
+    return Evidence(
+        anchor_error=anchor_error,
+        cell_error=cell_error,
+        depth=depth,
+        depth_spread_error=_depth_error(geometry, grid, depth, spread),
+        sampling_error=sampling_error,
+        paths_per_second=pace,
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _anchor_errors(
+    scene: Any,
+    camera: Any,
+    projector: Projector,
+    windows: tuple[tuple[float, float], tuple[float, float]],
+    labels: npt.NDArray[np.int64],
+    weights: FloatArray,
+    seed: int,
+) -> dict[int, float]:
+    """Error of the frames with fewer anchors, on coarse cells, with the same random paths from every anchor.
+
+    Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame.
+    """
+    geometry = camera.geometry
+    grid = aligned_grid(*windows, max(projector.n // _COARSE, 1), 1, geometry.tan_half_fov)
+
+    def frames(anchors: int) -> FloatArray:
+        tracer = Tracer(scene, camera, projector, grid, anchors, common=True)
+        light = tracer.batch(integer(seed, "pilot", "anchors")).light
+        optics = FrameOptics(geometry, grid.rows.edges, grid.columns.edges, geometry.scene_distance, anchors)
+        return np.stack(
+            [frame.irradiance for frame in ExpectedFrames(optics, [light], labels, weights, seed)]
+        )
+
+    judge = frames(_JUDGE_ANCHORS)
+    scale = float(np.linalg.norm(judge))
+    return {
+        anchors: float(np.linalg.norm(frames(anchors) - judge)) / scale if scale else 0.0
+        for anchors in ANCHOR_CHOICES
+    }
+
+
+def _cell_errors(
+    geometry: CameraGeometry,
+    grid: CellGrid,
+    depth: float,
+    samples: list[LightSample],
+    labels: npt.NDArray[np.int64],
+    weights: FloatArray,
+    seed: int,
+) -> tuple[dict[int, float], dict[int, float]]:
+    """Error of the frames when fine cells are merged, and of their sampling; the finest cells are judged by
+    extrapolation, the error falls with the square of a cell's size."""
+    finest = CELL_CHOICES[-1]
+    frames, sampling = {}, {}
+    for choice in CELL_CHOICES:
+        merge = finest // choice
+        edges = grid.rows.edges[::merge], grid.columns.edges[::merge]
+        groups = [_merge(sample.light, grid.shape, merge) for sample in samples]
+        expected = ExpectedFrames(FrameOptics(geometry, *edges, depth, 1), groups, labels, weights, seed)
+        found = list(expected)
+        frames[choice] = np.stack([frame.irradiance for frame in found])
+        # Two samples of the pilot: their mean has merge^2 * 2 paths in each merged cell.
+        sampling[choice] = relative_error(found) * merge * 2**0.5
+    judge = frames[finest]
+    scale = float(np.linalg.norm(judge))
+    errors = {choice: float(np.linalg.norm(frames[choice] - judge)) / scale for choice in CELL_CHOICES[:-1]}
+    errors[finest] = errors[CELL_CHOICES[-2]] / 3
+    return {choice: errors[choice] * (1 if choice == finest else 4 / 3) for choice in CELL_CHOICES}, sampling
+
+
+def _merge(light: sparse.csr_array, shape: tuple[int, int], merge: int) -> sparse.csr_array:
+    """The light on cells ``merge`` times as large."""
+    coo = light.tocoo()
+    row, column = np.divmod(coo.col, shape[1])
+    width = shape[1] // merge
+    flat = (row // merge) * width + column // merge
+    size = (shape[0] // merge) * width
+    return sparse.coo_array((coo.data, (coo.row, flat)), shape=(light.shape[0], size)).tocsr()
+
+
+def _depth_error(geometry: CameraGeometry, grid: CellGrid, depth: float, spread: float) -> float:
+    """Change of the mask's shadow between the mean depth and one standard deviation of 1/z from it, both axes."""
+    if spread * depth < 1e-6:
+        return 0.0
+    nearer = 1 / (1 / depth + spread)
+    middle = geometry.shadow_terms(grid.rows.edges, grid.columns.edges, depth)
+    moved = geometry.shadow_terms(grid.rows.edges, grid.columns.edges, nearer)
+    change = sum(float(np.square(a[0] - b[0]).sum()) for a, b in zip(middle, moved, strict=True))
+    return float((2 * change / sum(float(np.square(a[0]).sum()) for a in middle)) ** 0.5)
