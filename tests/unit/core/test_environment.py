@@ -1,0 +1,72 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mitsim.core import environment, llvm
+from mitsim.core.errors import MitsimError
+
+
+def in_child(program: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """Setting a variant is for the whole process, so it is done in another one."""
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, **env}
+    )
+
+
+def test_load_variant_gives_mitsuba_with_the_variant_set() -> None:
+    done = in_child(
+        "from mitsim.core.environment import load_variant\n"
+        "mi = load_variant('llvm_ad_mono')\n"
+        "assert mi.variant() == 'llvm_ad_mono'\n"
+        "assert float((mi.Float(1) + 1)[0]) == 2"
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_unknown_variant_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(MitsimError, match=r"variant: got 'llvm_mono'; this Mitsuba has .*llvm_ad_mono"):
+        environment.load_variant("llvm_mono")
+
+
+def test_an_old_llvm_never_reaches_mitsuba() -> None:
+    old = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
+    if not old.exists():
+        pytest.skip("LLVM 15 is not installed here")
+    done = in_child(
+        "from mitsim.core.environment import load_variant\n"
+        "from mitsim.core.errors import MitsimError\n"
+        "try: load_variant('llvm_ad_mono')\n"
+        "except MitsimError as error: print(error)",
+        **{llvm.VARIABLE: str(old)},
+    )
+    assert done.returncode == 0 and "LLVM 15, but Dr.Jit needs 17 or newer" in done.stdout
+
+
+def test_the_doctor_names_one_command_for_all_that_fails(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / ".drjit").touch()  # a file where the cache folder should be
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so.19.1")
+    monkeypatch.setattr(environment, "_RENDER", "import sys; sys.exit('{name} is broken')")
+    monkeypatch.setattr(environment, "_FIGURE", "import os; os.abort()")
+    checks = {check.name: check for check in environment.doctor()}
+    assert checks["python"].ok and checks["openexr"].ok and checks["mitsuba"].ok
+    broken = ["llvm", "kernel cache", "matplotlib", *(f"render {name}" for name in environment.VARIANTS)]
+    for name in broken:
+        assert not checks[name].ok, name
+        assert checks[name].remedy and "\n" not in checks[name].remedy + checks[name].detail
+    assert checks["llvm"].remedy == f"unset {llvm.VARIABLE}"
+    assert "llvm_ad_rgb is broken" in checks["render llvm_ad_rgb"].detail
+    assert "signal 6" in checks["matplotlib"].detail
+    assert set(broken) | {"python", "openexr", "mitsuba"} == set(checks)
+
+
+@pytest.mark.slow
+def test_the_doctor_finds_this_machine_well() -> None:
+    checks = environment.doctor()
+    assert len(checks) == 9
+    assert not [check for check in checks if not check.ok]

@@ -1,0 +1,18 @@
+import pytest
+
+from mitsim.core import units
+
+
+def test_photon_energy_of_green_light() -> None:
+    # E[eV] = 1239.841984 / lambda[nm] (CODATA 2018), and 1 eV = 1.602176634e-19 J.
+    assert units.photon_energy(550.0) == pytest.approx(1239.841984 / 550 * 1.602176634e-19, rel=1e-9)
+
+
+@pytest.mark.parametrize("wavelength", [0.0, -1.0, float("nan")])
+def test_a_wavelength_must_be_positive(wavelength: float) -> None:
+    with pytest.raises(ValueError, match="wavelength_nm"):
+        units.photon_energy(wavelength)
+
+
+def test_lengths_are_millimetres() -> None:
+    assert units.MM == 1000 * units.UM == pytest.approx(1e6 * units.NM)

@@ -1,0 +1,205 @@
+"""Each stage of the chain against its closed form; statistics of whole frames are in tests/physics."""
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
+from mitsim.sensor import chain
+from mitsim.sensor.model import SensorModel, paper_sensor
+
+
+def sensor(**changes: object) -> SensorModel:
+    values: dict[str, object] = {
+        "name": "test",
+        "pixel_pitch_um": 5.86,
+        "full_well_e": 1000.0,
+        "read_noise_e": 0.0,
+        "quantum_efficiency": 1.0,
+        "gain_dn_per_e": 1.0,
+        "source": "invented for this test",
+    }
+    return SensorModel(**{**values, **changes})
+
+
+def exposed(model: SensorModel, mean: float, size: int, seed: int = 0, exposure_s: float = 0.0) -> np.ndarray:
+    expected = np.full((size, size), mean)
+    return chain.expose(expected, exposure_s, model, stream(seed, "shot"), stream(seed, "read"))
+
+
+def test_photons_from_irradiance_as_emva_counts_them() -> None:
+    # EMVA 1288 gives mu_p = 50.34 A[um^2] t[ms] lambda[um] E[uW/cm^2]: an independent, rounded constant.
+    light = 3.0  # uW/cm^2 = 1e-2 W/m^2
+    electrons = chain.electrons_from_irradiance(light * 1e-2, 10e-3, sensor(binning=2), 525.0)
+    assert electrons == pytest.approx(50.34 * (2 * 5.86) ** 2 * 10 * 0.525 * light, rel=1e-4)
+
+
+def test_electrons_scale_with_efficiency_and_keep_their_shape() -> None:
+    light = np.array([[0.0, 1e-6, 2e-6]], dtype=np.float32)
+    full = chain.electrons_from_irradiance(light, 0.1, sensor(), 550.0)
+    half = chain.electrons_from_irradiance(light, 0.1, sensor(quantum_efficiency=0.5), 550.0)
+    assert full.shape == (1, 3) and full.dtype == np.float64
+    np.testing.assert_allclose(half, full / 2, rtol=1e-15)
+    assert full[0, 2] == 2 * full[0, 1]
+
+
+def test_the_exposure_fills_the_fraction_asked_for() -> None:
+    model = sensor(binning=2, dark_current_e_per_s=50.0, quantum_efficiency=0.6)
+    seconds = chain.exposure_for_peak(2e-6, 0.8, model, 550.0)
+    light = chain.electrons_from_irradiance(2e-6, seconds, model, 550.0)
+    assert chain.add_dark_current(light, seconds, model) == pytest.approx(0.8 * 4000.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("peak", "fraction", "message"),
+    [
+        (0.0, 0.5, "light reaches"),
+        (math.nan, 0.5, "light reaches"),
+        (math.inf, 0.5, "light reaches"),
+        (1.0, 0.0, "fraction 0"),
+        (1.0, 1.5, "fraction 1.5"),
+    ],
+)
+def test_an_impossible_exposure_is_refused(peak: float, fraction: float, message: str) -> None:
+    with pytest.raises(MitsimError, match=message):
+        chain.exposure_for_peak(peak, fraction, sensor(), 550.0)
+
+
+def test_an_exposure_needs_a_full_well() -> None:
+    with pytest.raises(MitsimError, match="no full well"):
+        chain.exposure_for_peak(1.0, 0.5, paper_sensor(1e4, 1.0, 73.0), 550.0)
+
+
+@pytest.mark.parametrize("bad", [-1e-9, math.nan, math.inf])
+def test_light_that_cannot_be_is_refused_not_clipped(bad: float) -> None:
+    light = np.array([1.0, bad])
+    with pytest.raises(ValueError, match="irradiance"):
+        chain.electrons_from_irradiance(light, 1.0, sensor(), 550.0)
+    with pytest.raises(ValueError, match="expected_electrons"):
+        chain.expose(light, 1.0, sensor(), stream(0, "a"), stream(0, "b"))
+
+
+def exact_moments(mean: float, well: float) -> tuple[float, float]:
+    """Moments of min(N, F) summed term by term with 50 digits: an independent path to the same numbers."""
+    with mpmath.workdps(50):
+        mu, full = mpmath.mpf(mean), mpmath.mpf(well)
+        top = int(mean + 40 * math.sqrt(mean) + 200)
+        weight = mpmath.exp(-mu)
+        first = second = mpmath.mpf(0)
+        for count in range(top):
+            value = min(mpmath.mpf(count), full)
+            first += weight * value
+            second += weight * value**2
+            weight *= mu / (count + 1)
+        return float(first), float(second - first**2)
+
+
+@settings(max_examples=60, deadline=None)
+@given(mean=st.floats(0.01, 300), well=st.floats(0.5, 400))
+def test_clipped_moments_equal_the_sum_over_the_distribution(mean: float, well: float) -> None:
+    first, variance = chain.clipped_moments(mean, well)
+    exact = exact_moments(mean, well)
+    # Rounding: differences of terms of size mean^2 + well^2 in double precision (about 1e-16 each, 1e3
+    # headroom).
+    scale = mean**2 + well**2
+    assert first == pytest.approx(exact[0], rel=1e-11, abs=1e-13 * scale)
+    assert variance == pytest.approx(exact[1], rel=1e-11, abs=1e-13 * scale)
+
+
+def test_without_a_full_well_the_moments_are_poisson_s() -> None:
+    first, variance = chain.clipped_moments([3.0, 0.0], math.inf)
+    assert first.tolist() == [3.0, 0.0] and variance.tolist() == [3.0, 0.0]
+
+
+def test_dark_electrons_follow_time_and_binning() -> None:
+    model = sensor(binning=2, dark_current_e_per_s=10.0)
+    assert chain.add_dark_current([[1.0]], 3.0, model).tolist() == [[1.0 + 4 * 10.0 * 3.0]]
+
+
+def test_zero_noise_is_a_pass_through() -> None:
+    # No light, no read noise: every pixel is exactly the black level, in DN and back in electrons.
+    model = sensor(black_level_dn=40.0, bits=12, binning=2)
+    frame = exposed(model, 0.0, 8)
+    assert frame.dtype == np.uint32 and (frame == 160).all()
+    assert (chain.dn_to_electrons(frame, model) == 0.0).all()
+
+
+def test_the_full_well_is_clipped_before_read_noise_is_added() -> None:
+    # Deep saturation: every pixel holds exactly F electrons, so the frame shows read noise alone, on both
+    # sides of F. Were the noise added first, half of the pixels would be cut to F.
+    model = sensor(full_well_e=1000.0, read_noise_e=20.0, gain_dn_per_e=0.5, black_level_dn=7.0)
+    frame = exposed(model, 1e5, 100)
+    electrons = (frame - 7.0) / 0.5
+    assert (electrons > 1000.0).mean() == pytest.approx(0.5, abs=0.03)  # 6 sd of 10 000 fair coins
+    assert electrons.std() == pytest.approx(20.0, rel=0.05)  # 7 sd: relative sd 1/sqrt(2 x 10 000)
+
+
+def test_dark_current_is_drawn_with_the_light_and_fills_the_well() -> None:
+    model = sensor(full_well_e=1000.0, dark_current_e_per_s=100.0)
+    frame = exposed(model, 0.0, 100, exposure_s=4.0)
+    assert frame.var() == pytest.approx(400.0, rel=0.085)  # 6 sd: shot noise, relative sd sqrt(2/10 000)
+    assert (exposed(model, 0.0, 10, exposure_s=1000.0) == 1000.0).all()
+
+
+def test_gain_comes_after_read_noise_and_black_level_after_gain() -> None:
+    # The same draws at gain 1 and gain 3, black level 50: DN_3 - 50 must be 3 (DN_1 - 50) for every pixel.
+    one = exposed(sensor(read_noise_e=5.0, black_level_dn=50.0), 100.0, 20)
+    three = exposed(sensor(read_noise_e=5.0, black_level_dn=50.0, gain_dn_per_e=3.0), 100.0, 20)
+    np.testing.assert_allclose(three - 50.0, 3 * (one - 50.0), rtol=1e-12, atol=1e-9)
+
+
+def test_quantising_is_last_and_rounds_to_the_nearest_code_once() -> None:
+    # The same draws with and without an ADC: each code is the real value rounded, so no error exceeds half a
+    # code, and nothing was rounded before (a second rounding, of electrons, would move codes by up to 1.5).
+    real = sensor(read_noise_e=0.7, gain_dn_per_e=3.0, black_level_dn=100.0)
+    digital = real.model_copy(update={"bits": 12})
+    fine, coarse = exposed(real, 20.0, 60), exposed(digital, 20.0, 60)
+    assert coarse.dtype == np.uint32
+    assert np.abs(coarse - fine).max() <= 0.5
+    # All three residues of the code modulo the gain occur alike (1200 each, sd 28): electrons stayed real.
+    residues = np.bincount(coarse.ravel() % 3, minlength=3)
+    assert np.abs(residues - 1200).max() < 6 * 28.3
+
+
+def test_the_adc_saturates_at_both_ends() -> None:
+    model = sensor(bits=8, gain_dn_per_e=1.0)
+    assert chain.quantise(np.array([-3.0, 0.49, 0.51, 254.6, 1e6]), model).tolist() == [0, 0, 1, 255, 255]
+
+
+def test_read_noise_comes_from_its_own_stream() -> None:
+    # In the dark the shot stream draws nothing that shows: the frame must follow the read stream alone.
+    model = sensor(read_noise_e=5.0)
+    dark = np.zeros((30, 30))
+    first, second = (
+        chain.expose(dark, 0.0, model, stream(seed, "shot"), stream(1, "read")) for seed in (1, 2)
+    )
+    assert np.array_equal(first, second)
+
+
+def test_noise_streams_are_separate() -> None:
+    # Another read stream leaves the electrons as they were; with no read noise the stream does not matter.
+    model = sensor()
+    expected = np.full((30, 30), 50.0)
+    frames = [
+        chain.expose(expected, 0.0, model, stream(1, "shot"), stream(1, "read", index)) for index in (0, 1)
+    ]
+    assert np.array_equal(frames[0], frames[1])
+    other = chain.expose(expected, 0.0, model, stream(2, "shot"), stream(1, "read", 0))
+    assert not np.array_equal(frames[0], other)
+
+
+def test_electrons_come_back_from_dn_and_may_be_negative() -> None:
+    model = sensor(binning=2, gain_dn_per_e=0.125, black_level_dn=40.0, bits=12)
+    back = chain.dn_to_electrons(np.array([0, 160, 285], dtype=np.uint32), model)
+    assert back.tolist() == [-1280.0, 0.0, 1000.0]
+
+
+def test_inputs_are_left_as_they_were() -> None:
+    expected = np.full((4, 4), 10.0)
+    chain.expose(expected, 1.0, sensor(dark_current_e_per_s=5.0), stream(0, "a"), stream(0, "b"))
+    assert (expected == 10.0).all()
