@@ -15,12 +15,12 @@ from skimage.restoration import denoise_tv_chambolle
 
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.accumulator import Accumulator
-from mitsim.reconstruct.regularisation import Spectrum, noise_variance
+from mitsim.reconstruct.regularisation import Spectrum, automatic_lambda, noise_variance
 from mitsim.reconstruct.solver import Prepared
 
 FloatArray = npt.NDArray[np.float64]
 
-AUTO_WEIGHT = 0.08
+AUTO_WEIGHT = 0.12
 """Automatic weight in units of the noise that the data term's gradient carries to one scene pixel."""
 
 
@@ -70,9 +70,7 @@ def solve_tv(
     if iterations < 1:
         raise MitsimError(f"TV iterations are {iterations}; give at least 1")
     squared = np.square(spectrum.sigma)
-    # The penalty of ADMM sets the speed only: the geometric mean of the measured spectrum balances both
-    # steps.
-    rho = float(np.exp(np.mean(np.log(squared[squared > 0]))))
+    rho = _penalty(spectrum)
     data = spectrum.sigma * spectrum.projected
     smooth = prepared.image(data / (squared + rho))
     dual = np.zeros_like(smooth)
@@ -89,6 +87,16 @@ def solve_tv(
         change = float(np.linalg.norm(updated - image)) / max(float(np.linalg.norm(updated)), 1e-300)
         image = updated
     return _solution(prepared, spectrum, smooth, float(weight), spent, change, change < tolerance)
+
+
+def _penalty(spectrum: Spectrum) -> float:
+    """ADMM penalty; it sets the speed only. The Tikhonov lambda splits measured from unmeasured directions."""
+    measured = np.square(spectrum.sigma[spectrum.sigma > 0])
+    if spectrum.data_count > measured.size:
+        lam = automatic_lambda(spectrum)
+        if lam > spectrum.scale * np.finfo(np.float64).eps:
+            return lam
+    return float(np.exp(np.mean(np.log(measured))))
 
 
 def _solution(

@@ -1,0 +1,180 @@
+"""Factors come back from striped light: exactly without noise, with the predicted error under noise."""
+
+import numpy as np
+import pytest
+from scipy.linalg import hadamard
+
+from mitsim.calibrate.hadamard import estimate_factors, predicted_error
+from mitsim.core.errors import MitsimError
+from mitsim.optics.mask import mls_mask
+from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.reconstruct.solver import prepare
+
+N, M = 16, 40
+H = hadamard(N).astype(float)
+DARK = np.zeros((M, M + 5))
+
+
+def factors(seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.random((M, N)), 3 * rng.random((M + 5, N))
+
+
+def responses(left, right, signs=H):
+    ones = np.ones(len(signs))
+    horizontal = [np.outer(left @ h, right @ ones) for h in signs.T]
+    vertical = [np.outer(left @ ones, right @ h) for h in signs.T]
+    return horizontal, vertical
+
+
+def relative(a, b):
+    return np.linalg.norm(a - b) / np.linalg.norm(b)
+
+
+def balanced(left, right):
+    scale = np.sqrt(np.linalg.norm(right.sum(axis=1)) / np.linalg.norm(left.sum(axis=1)))
+    return left * scale, right / scale
+
+
+@pytest.mark.parametrize("with_uniform", [False, True])
+@pytest.mark.parametrize("scene", [N, 11])
+def test_noise_free_factors_are_exact_and_reproduce_absolute_responses(with_uniform, scene):
+    left, right = (factor[:, :scene] for factor in factors())
+    horizontal, vertical = responses(left, right, H[:scene])
+    uniform = np.outer(left.sum(axis=1), right.sum(axis=1)) if with_uniform else None
+    got = estimate_factors(iter(horizontal), iter(vertical), H[:scene], uniform=uniform)
+    for estimate, truth in zip((got.left, got.right), balanced(left, right), strict=True):
+        assert relative(estimate, truth) < 1e-12
+    assert relative(np.outer(got.left, got.right), np.outer(left, right)) < 1e-12
+    assert got.separability_residual < 1e-12
+    assert got.condition == pytest.approx(max(np.linalg.cond(left), np.linalg.cond(right)) ** 2, rel=1e-9)
+    assert got.ok
+
+
+def test_error_under_noise_is_the_predicted_one():
+    # 40 repetitions: the mean squared error of 40 x 640 independent numbers is known to 1 %; tolerance 5 %.
+    left, right = balanced(*factors())
+    horizontal, vertical = responses(left, right)
+    noise, errors, claims, estimates = 1.0, [], [], []
+    for seed in range(40):
+        rng = np.random.default_rng([7, seed])
+        got = estimate_factors(
+            (y + noise * rng.normal(size=y.shape) for y in horizontal),
+            (y + noise * rng.normal(size=y.shape) for y in vertical),
+            H,
+            uniform=horizontal[0],
+        )
+        errors.append((relative(got.left, left) ** 2, relative(got.right, right) ** 2))
+        claims.append(got.predicted_error)
+        estimates.append(got.noise)
+    measured = np.sqrt(np.mean(errors, axis=0))
+    a, v = np.linalg.norm(left.sum(axis=1)), np.linalg.norm(right.sum(axis=1))
+    predicted = predicted_error(left, noise, v, N), predicted_error(right, noise, a, N)
+    np.testing.assert_allclose(measured, predicted, rtol=0.05)
+    np.testing.assert_allclose(np.mean(claims, axis=0), predicted, rtol=0.02)
+    assert np.mean(estimates) == pytest.approx(noise, rel=0.01)
+
+
+def test_residual_rises_when_responses_are_not_separable():
+    left, right = factors()
+    horizontal, vertical = responses(left, right)
+    seen = []
+    for stray in (0.0, 0.01, 0.1, 1.0):
+        shadow = 1 + stray * np.outer(np.linspace(-1, 1, M), np.linspace(-1, 1, M + 5))
+        got = estimate_factors([y * shadow for y in horizontal], [y * shadow for y in vertical], H)
+        seen.append(got.separability_residual)
+    assert (np.diff(seen) > 0).all()
+    # x y over the square has mean square 1/9: a tilt of 0.01 leaves about 0.01 / 3 of a response.
+    assert seen[1] == pytest.approx(0.01 / 3, rel=0.3)
+    assert not got.ok
+    assert got.status.startswith("Responses are not separable")
+
+
+def test_twin_pixels_are_reported_as_rank_deficient():
+    left, right = factors()
+    left[:, 1] = left[:, 0]
+    got = estimate_factors(*responses(left, right), H)
+    assert got.condition == np.inf
+    assert got.status.startswith("Factors are rank deficient")
+
+
+def flatcam(pixel_mm, order=9):
+    """Left and right factors of both terms of a FlatCam mask at 2 mm, N scene pixels over 120 mm at 400 mm."""
+    mask = mls_mask("flatcam", order=order)
+    pixels, scene = centred_edges(64, pixel_mm), centred_edges(N, 120 / N)
+    return [
+        (weight, scene_factor(profile, mask.feature_mm, pixels, scene, 2.0, 400.0))
+        for weight, profile, _ in mask.terms
+    ]
+
+
+def flatcam_frame(terms, image):
+    return sum(weight * factor @ image @ factor.T for weight, factor in terms)
+
+
+def flatcam_round_trip(terms, image):
+    ones = np.ones(N)
+    got = estimate_factors(
+        [flatcam_frame(terms, np.outer(h, ones)) for h in H.T],
+        [flatcam_frame(terms, np.outer(ones, h)) for h in H.T],
+        H,
+        centre=True,
+    )
+    prepared = prepare(got.left, got.right, np.ones((N, 1)), np.ones((N, 1)), centre=True)
+    sums = prepared.accumulator()
+    sums.add(flatcam_frame(terms, image), 0, 0)
+    return got, prepared.solve(sums, 0.0)
+
+
+def test_centred_flatcam_is_separable_and_recovers_the_image():
+    # The mask (30.7 mm) covers the sensor's view (7 mm): its constant term has equal rows, centring removes it.
+    image = np.random.default_rng(3).random((N, N))
+    got, solution = flatcam_round_trip(flatcam(0.1), image)
+    assert got.separability_residual < 1e-12
+    np.testing.assert_allclose(solution.image, image, atol=1e-8)
+    plain = estimate_factors(
+        [flatcam_frame(flatcam(0.1), np.outer(h, np.ones(N))) for h in H.T],
+        [flatcam_frame(flatcam(0.1), np.outer(np.ones(N), h)) for h in H.T],
+        H,
+    )
+    assert not plain.ok
+
+
+def test_flatcam_leak_where_the_mask_does_not_cover_the_view():
+    # 127 features of 60 um are 7.6 mm; a sensor of 9.6 mm sees past the edge. What centring leaves of the
+    # constant term is then (C Phi_1) X (C Phi_1)^T / 2, and calibration reports it as a residual.
+    terms = flatcam(0.15, order=7)
+    image = np.random.default_rng(3).random((N, N))
+    centre = np.eye(64) - 1 / 64
+    outline, code = (centre @ factor for _, factor in terms)
+    leak = outline @ image @ outline.T / 2
+    whole = centre @ flatcam_frame(terms, image) @ centre
+    np.testing.assert_allclose(whole, code @ image @ code.T / 2 + leak, atol=1e-12)
+    assert np.linalg.norm(leak) > 0.05 * np.linalg.norm(whole)
+    got, _ = flatcam_round_trip(terms, image)
+    assert got.separability_residual > 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"horizontal": responses(*factors())[0][:-1]}, "only 15 horizontal"),
+        ({"vertical": responses(*factors())[1] * 2}, "more than 16 vertical"),
+        ({"horizontal": []}, "only 0 horizontal"),
+        ({"vertical": [np.ones((3, 3))] * N}, "shape"),
+        ({"horizontal": [np.full((M, M + 5), np.nan)] * N}, "not finite"),
+        (
+            {"horizontal": [np.zeros((M, M + 5))] * N, "vertical": [np.zeros((M, M + 5))] * N},
+            "zero everywhere",
+        ),
+        ({"H": np.ones((N, N))}, "not orthogonal"),
+        ({"H": 0.5 * H}, r"\+1 and -1"),
+        ({"H": H[:, ::-1]}, "column 0"),
+        ({"uniform": np.ones((3, 3))}, "uniform response"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(change, words):
+    horizontal, vertical = responses(*factors())
+    with pytest.raises(MitsimError, match=words) as caught:
+        estimate_factors(**({"horizontal": horizontal, "vertical": vertical, "H": H} | change))
+    assert "\n" not in str(caught.value)
