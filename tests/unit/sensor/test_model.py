@@ -22,7 +22,7 @@ BASE = {
 def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
     model = SensorModel(**BASE, binning=3, dark_current_e_per_s=2.0, black_level_dn=10.0, bits=12)
     assert model.superpixel_pitch_um == 15.0
-    assert model.superpixel_area_m2 == pytest.approx(225e-12, rel=1e-12)
+    assert model.superpixel_area_m2 * 1e12 == pytest.approx(225.0, rel=1e-12)
     assert model.superpixel_full_well_e == 9000.0
     assert model.superpixel_read_noise_e == 9.0  # sqrt(9) x 3: nine independent readings
     assert model.superpixel_dark_current_e_per_s == 18.0
