@@ -129,5 +129,27 @@ def collect(
         wanted = min(max(done + 1, math.ceil(done * growth)), most)
 
 
+def uniform_light(n: int) -> tuple[Labels, FloatArray]:
+    """Labels and weights of one capture with every projector pixel fully lit."""
+    return np.zeros(n * n, dtype=np.int64), np.ones((1, 1))
+
+
+def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:
+    """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
+
+    One path a cell, four cells a side of a projector pixel; 0 where the projector does not light the board.
+    """
+    grid = grid_for(bench, 4)
+    one = [
+        np.asarray(
+            Tracer(b.loaded.scene, b.loaded.camera, b.source, grid, anchors=1)
+            .batch(integer(seed, "view"))
+            .light.sum(axis=0)
+        ).reshape(grid.shape)
+        for b in (bench, bench.with_board(board_reflectance))
+    ]
+    return np.divide(one[0], one[1], out=np.zeros(grid.shape), where=one[1] > 0)
+
+
 def _add(total: sparse.csr_array | None, sample: LightSample) -> sparse.csr_array:
     return sample.light if total is None else total + sample.light

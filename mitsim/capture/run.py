@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from itertools import islice
@@ -16,38 +15,19 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.capture.bench import Bench, load_recipe
-from mitsim.capture.light import Light, Progress, collect, make_plan, silent
+from mitsim.capture.clock import Clock
+from mitsim.capture.exposer import WORKERS, Exposer, Exposure
+from mitsim.capture.light import Light, Progress, collect, make_plan, silent, uniform_light
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame, write_frame
 from mitsim.core.manifest import prepare_output, read_json, versions, write_json
-from mitsim.core.seeds import stream
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import Capture, PatternFamily, parse_patterns
 from mitsim.scene.plan import Plan
-from mitsim.sensor.chain import electrons_from_irradiance, exposure_for_peak, expose, frame_moments
+from mitsim.sensor.chain import Digital
 
 FloatArray = npt.NDArray[np.float64]
 _AT_ONCE = 16
-_WORKERS = 2
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One exposure for a whole session: ``seconds`` by hand, or the brightest pixel at ``fraction`` of full well."""
-
-    seconds: float | None = None
-    fraction: float = 0.8
-
-    def __post_init__(self) -> None:
-        if self.seconds is not None and not 0 < self.seconds < np.inf:
-            raise MitsimError(f"exposure {self.seconds} s: give a finite time above 0, or auto")
-
-    def choose(self, bench: Bench, peak_irradiance: float) -> float:
-        """Exposure time [s] for frames whose brightest expected pixel has this irradiance [W m^-2]."""
-        if self.seconds is not None:
-            return self.seconds
-        wavelength = bench.projector.effective_wavelength_nm
-        return exposure_for_peak(peak_irradiance, self.fraction, bench.sensor, wavelength)
 
 
 @dataclass(frozen=True)
@@ -63,6 +43,7 @@ class CaptureResult:
     output: str
     exposure_s: float
     mc_to_sensor_noise: float
+    sensor_noise: float
     plan: Plan
     warnings: tuple[str, ...] = field(default=())
 
@@ -117,7 +98,7 @@ def capture(
             energy += float(np.square(frame.irradiance).sum())
             variance += frame.variance * frame.irradiance.size
     exposure_s = exposure.choose(bench, peak)
-    writer = _Writer(bench, family, folder, digest, exposure_s, seed)
+    writer = _Writer(family, folder, digest, Exposer(bench, exposure_s, seed))
     writer.write_all(expected, clock, progress)
     mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
     warnings = plan.warnings
@@ -137,6 +118,7 @@ def capture(
         output=str(folder),
         exposure_s=exposure_s,
         mc_to_sensor_noise=writer.noise_ratio,
+        sensor_noise=writer.sensor_noise,
         plan=plan,
         warnings=warnings,
     )
@@ -144,46 +126,23 @@ def capture(
     return result
 
 
-class Clock:
-    """Seconds by stage, in the order of first use."""
-
-    def __init__(self) -> None:
-        self._started = time.perf_counter()
-        self._stages: dict[str, float] = {}
-        self._running: list[tuple[str, float]] = []
-
-    def stage(self, name: str) -> Clock:
-        """Use as a context: adds the time spent inside to ``name``."""
-        self._running.append((name, 0.0))
-        return self
-
-    def __enter__(self) -> None:
-        name, _ = self._running[-1]
-        self._running[-1] = (name, time.perf_counter())
-
-    def __exit__(self, *_: object) -> None:
-        name, started = self._running.pop()
-        self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - started
-
-    def seconds(self) -> dict[str, float]:
-        """Stages and ``total`` since the clock was made."""
-        return {**self._stages, "total": time.perf_counter() - self._started}
-
-
 class _Writer:
     """Turns expected frames into noisy ones and writes them; frames already there from the same run are kept."""
 
-    def __init__(
-        self, bench: Bench, family: PatternFamily, folder: Path, digest: str, exposure_s: float, seed: int
-    ) -> None:
-        self.bench, self.family, self.folder, self.digest = bench, family, folder, digest
-        self.exposure_s, self.seed = exposure_s, seed
+    def __init__(self, family: PatternFamily, folder: Path, digest: str, exposer: Exposer) -> None:
+        self.family, self.folder, self.digest, self.exposer = family, folder, digest, exposer
         self.saturated, self.noise_ratio = 0, 0.0
+        self._noise_energy = self._energy = 0.0
+
+    @property
+    def sensor_noise(self) -> float:
+        """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, from its closed form."""
+        return float(np.sqrt(self._noise_energy / self._energy)) if self._energy else 0.0
 
     def write_all(self, expected: ExpectedFrames, clock: Clock, progress: Progress) -> None:
         """Expose and write in chunks, two threads each; stages are timed on the wall clock."""
         total = len(expected)
-        with ThreadPoolExecutor(_WORKERS) as pool:
+        with ThreadPoolExecutor(WORKERS) as pool:
             numbered = enumerate(zip(self.family.captures, expected, strict=True))
             while True:
                 with clock.stage("optics"):
@@ -194,29 +153,24 @@ class _Writer:
                     exposed = list(pool.map(self._expose, chunk))
                 with clock.stage("write"):
                     list(pool.map(self._write, exposed))
+                for _, _, electrons, _, rendering, noise, full in exposed:
+                    self.noise_ratio = max(self.noise_ratio, rendering / noise)
+                    self.saturated += full
+                    self._noise_energy += noise**2 * electrons.size
+                    self._energy += float(np.square(electrons).sum())
                 progress("frames", (chunk[-1][0] + 1) / total)
 
-    def _expose(self, item: tuple[int, tuple[Capture, Frame]]) -> tuple[int, Capture, Frame, FloatArray, Any]:
+    def _expose(
+        self, item: tuple[int, tuple[Capture, Frame]]
+    ) -> tuple[int, Capture, FloatArray, Digital, float, float, bool]:
         index, (shown, frame) = item
-        sensor, wavelength = self.bench.sensor, self.bench.projector.effective_wavelength_nm
-        electrons = electrons_from_irradiance(frame.irradiance, self.exposure_s, sensor, wavelength)
-        name = f"{shown.row}/{shown.column}/{shown.sign}"
-        dn = expose(
-            electrons, self.exposure_s, sensor, stream(self.seed, "shot", name), stream(self.seed, "read", name)
-        )
-        return index, shown, frame, electrons, dn
+        electrons = self.exposer.electrons(frame)
+        digital = self.exposer.digital(electrons, *shown.names)
+        noise = self.exposer.rendering_noise(frame), self.exposer.sensor_noise(electrons)
+        return index, shown, electrons, digital, *noise, self.exposer.saturated(digital)
 
-    def _write(self, item: tuple[int, Capture, Frame, FloatArray, Any]) -> None:
-        index, shown, frame, electrons, dn = item
-        sensor = self.bench.sensor
-        ceiling = sensor.largest_dn
-        full = sensor.superpixel_full_well_e * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn
-        limit = full if ceiling is None else min(full, ceiling)
-        self.saturated += int(dn.max() >= np.floor(limit))
-        scale = electrons_from_irradiance(1.0, self.exposure_s, sensor, self.bench.projector.effective_wavelength_nm)
-        rendering = np.sqrt(frame.variance) * float(scale)
-        sensor_noise = np.sqrt(frame_moments(electrons, self.exposure_s, sensor)[1].mean()) / sensor.gain_dn_per_e
-        self.noise_ratio = max(self.noise_ratio, float(rendering / sensor_noise))
+    def _write(self, item: tuple[int, Capture, FloatArray, Digital, float, float, bool]) -> None:
+        index, shown, electrons, digital, rendering, _, _ = item
         path = self.folder / frame_name(index)
         if _is_kept(path, self.digest, index):
             return
@@ -226,12 +180,12 @@ class _Writer:
             "row": shown.row,
             "column": shown.column,
             "sign": shown.sign,
-            "exposure_s": self.exposure_s,
-            "rendering_noise_e": float(rendering),
-            "seed": self.seed,
+            "exposure_s": self.exposer.exposure_s,
+            "rendering_noise_e": rendering,
+            "seed": self.exposer.seed,
         }
-        digital = dn if dn.dtype == np.uint32 else dn.astype(np.float32)
-        write_frame(path, {"DN": digital, "electrons": electrons.astype(np.float32)}, metadata)
+        dn = digital if digital.dtype == np.uint32 else digital.astype(np.float32)
+        write_frame(path, {"DN": dn, "electrons": electrons.astype(np.float32)}, metadata)
 
 
 def frame_name(index: int) -> str:
@@ -280,8 +234,7 @@ def truth(bench: Bench, plan: Plan, light: Light, seed: int) -> FloatArray:
 
     The board is the session's, so a board of reflectance 0.99 counts as 1 (DESIGN section 5).
     """
-    uniform = np.zeros(bench.n**2, dtype=np.int64), np.ones((1, 1))
-    board = collect(bench.with_board(load_recipe().board_reflectance), plan, *uniform, seed)
+    board = collect(bench.with_board(load_recipe().board_reflectance), plan, *uniform_light(bench.n), seed)
     reference = board.flux()
     ratio = np.divide(light.flux(), reference, out=np.zeros_like(reference), where=reference > 0)
     return ratio.reshape(bench.n, bench.n)
@@ -342,11 +295,3 @@ def _write_manifest(
             "versions": versions(),
         },
     )
-
-
-def expected_electrons(bench: Bench, expected: ExpectedFrames, exposure_s: float) -> Iterator[FloatArray]:
-    """Noise-free photoelectrons of each capture."""
-    for frame in expected:
-        yield electrons_from_irradiance(
-            frame.irradiance, exposure_s, bench.sensor, bench.projector.effective_wavelength_nm
-        )

@@ -18,19 +18,18 @@ import numpy.typing as npt
 
 from mitsim.calibrate.hadamard import Calibration, estimate_factors
 from mitsim.capture.bench import Bench, SessionRecipe, load_recipe
-from mitsim.capture.light import Light, Progress, collect, make_plan, silent
-from mitsim.capture.run import Clock, Exposure, digital_block
+from mitsim.capture.clock import Clock
+from mitsim.capture.exposer import WORKERS, Exposer, Exposure
+from mitsim.capture.light import Light, Progress, collect, make_plan, silent, uniform_light
+from mitsim.capture.run import digital_block
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, write_frame
 from mitsim.core.manifest import prepare_output, versions, write_json
-from mitsim.core.seeds import stream
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import hadamard_matrix
 from mitsim.scene.plan import Plan
-from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose
 
 FloatArray = npt.NDArray[np.float64]
-_WORKERS = 2
 SIDES = ("horizontal", "vertical")
 
 
@@ -128,7 +127,7 @@ class Session:
             if self.pairs
             else np.concatenate([np.ones((1, n)), positive])
         )
-        uniform = np.zeros(n * n, dtype=np.int64), np.ones((1, 1))
+        uniform = uniform_light(n)
         with clock.stage("plan"):
             self.plan: Plan = make_plan(self.board, *uniform, accuracy, seed)
         with clock.stage("transport"):
@@ -170,7 +169,8 @@ class Session:
 
     def _noise_free(self, side: str) -> Iterator[FloatArray]:
         """Expected responses to the +-1 patterns: 2 Y((1 + P)/2) - Y(1), electrons a second."""
-        rates = (self._electrons(frame, 1.0) for frame in self._expected(side, (1.0 + self.signs.T) / 2))
+        second = Exposer(self.bench, 1.0, self.seed)
+        rates = (second.electrons(frame) for frame in self._expected(side, (1.0 + self.signs.T) / 2))
         uniform = next(rates)
         yield uniform
         for positive in rates:
@@ -178,29 +178,25 @@ class Session:
 
     def _noisy(self, side: str) -> Iterator[FloatArray]:
         """Electrons a second that a user computes from the noisy frame of each capture."""
+        exposer = Exposer(self.bench, self.exposure_s, self.seed)
         numbered = enumerate(self._expected(side, self.weights))
+
+        def shoot(item: tuple[int, Frame]) -> FloatArray:
+            index, frame = item
+            return exposer.rate(exposer.digital(exposer.electrons(frame), "calibration", side, index))
+
         done = 0
-        with ThreadPoolExecutor(_WORKERS) as pool:
+        with ThreadPoolExecutor(WORKERS) as pool:
             while True:
                 with self.clock.stage("optics"):
-                    chunk = list(islice(numbered, 2 * _WORKERS))
+                    chunk = list(islice(numbered, 2 * WORKERS))
                 if not chunk:
                     return
                 with self.clock.stage("sensor"):
-                    rates = list(pool.map(lambda item: self._exposed(side, *item), chunk))
+                    rates = list(pool.map(shoot, chunk))
                 done += len(chunk)
                 self.progress(f"{side} stripes", done / len(self.weights))
                 yield from rates
-
-    def _exposed(self, side: str, index: int, frame: Frame) -> FloatArray:
-        sensor, time = self.bench.sensor, self.exposure_s
-        streams = [stream(self.seed, "calibration", noise, side, index) for noise in ("shot", "read")]
-        dn = expose(self._electrons(frame, time), time, sensor, streams[0], streams[1])
-        return dn_to_electrons(dn, sensor) / time - sensor.superpixel_dark_current_e_per_s
-
-    def _electrons(self, frame: Frame, exposure_s: float) -> FloatArray:
-        wavelength = self.bench.projector.effective_wavelength_nm
-        return electrons_from_irradiance(frame.irradiance, exposure_s, self.bench.sensor, wavelength)
 
 
 def _signs(n: int) -> FloatArray:

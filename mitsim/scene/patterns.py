@@ -28,6 +28,11 @@ class Capture:
     column: int
     sign: int = 0
 
+    @property
+    def names(self) -> tuple[str, int, int, int]:
+        """Names of the capture's random streams."""
+        return ("capture", self.row, self.column, self.sign)
+
 
 @dataclass(frozen=True, eq=False)
 class PatternFamily:

@@ -1,0 +1,111 @@
+"""One exposure setting of a bench's camera: from expected irradiance to noisy digital numbers, and back to electrons a second."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.capture.bench import Bench
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
+from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.scene.patterns import PatternFamily
+from mitsim.sensor.chain import (
+    Digital,
+    dn_to_electrons,
+    electrons_from_irradiance,
+    expose,
+    exposure_for_peak,
+    frame_moments,
+)
+
+FloatArray = npt.NDArray[np.float64]
+WORKERS = 2
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure for a whole session: ``seconds`` by hand, or the brightest pixel at ``fraction`` of full well."""
+
+    seconds: float | None = None
+    fraction: float = 0.8
+
+    def __post_init__(self) -> None:
+        if self.seconds is not None and not 0 < self.seconds < np.inf:
+            raise MitsimError(f"exposure {self.seconds} s: give a finite time above 0, or auto")
+        if not 0 < self.fraction <= 1:
+            raise MitsimError(f"exposure fraction {self.fraction} of full well: give a number above 0, up to 1")
+
+    def choose(self, bench: Bench, peak_irradiance: float) -> float:
+        """Exposure time [s] for frames whose brightest expected pixel has this irradiance [W m^-2]."""
+        if self.seconds is not None:
+            return self.seconds
+        wavelength = bench.projector.effective_wavelength_nm
+        return exposure_for_peak(peak_irradiance, self.fraction, bench.sensor, wavelength)
+
+
+@dataclass(frozen=True)
+class Exposer:
+    """A bench's camera at one exposure time; every frame's noise has streams of its own, found by its names."""
+
+    bench: Bench
+    exposure_s: float
+    seed: int
+
+    def electrons(self, frame: Frame) -> FloatArray:
+        """Expected photoelectrons (pixels, pixels), without dark current."""
+        return electrons_from_irradiance(
+            frame.irradiance, self.exposure_s, self.bench.sensor, self.bench.projector.effective_wavelength_nm
+        )
+
+    def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
+        """Noisy digital numbers of the frame ``names``."""
+        shot, read = (stream(self.seed, noise, *names) for noise in ("shot", "read"))
+        return expose(electrons, self.exposure_s, self.bench.sensor, shot, read)
+
+    def rate(self, digital: Digital) -> FloatArray:
+        """What a user of frames computes: photoelectrons a second, dark current taken off."""
+        sensor = self.bench.sensor
+        return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
+
+    def rendering_noise(self, frame: Frame) -> float:
+        """Root mean square Monte Carlo error of a frame [electrons]."""
+        unit = electrons_from_irradiance(
+            1.0, self.exposure_s, self.bench.sensor, self.bench.projector.effective_wavelength_nm
+        )
+        return float(np.sqrt(frame.variance) * unit)
+
+    def sensor_noise(self, electrons: FloatArray) -> float:
+        """Root mean square noise of the sensor in a frame, from its closed form [electrons]."""
+        _, variance = frame_moments(electrons, self.exposure_s, self.bench.sensor)
+        return float(np.sqrt(variance.mean()) / self.bench.sensor.gain_dn_per_e)
+
+    def saturated(self, digital: Digital) -> bool:
+        """Whether any pixel reached the full well or the end of the ADC."""
+        sensor = self.bench.sensor
+        full = sensor.superpixel_full_well_e * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn
+        limit = full if sensor.largest_dn is None else min(full, sensor.largest_dn)
+        return bool(digital.max() >= np.floor(limit)) if np.isfinite(limit) else False
+
+    def measurements(
+        self, family: PatternFamily, expected: ExpectedFrames
+    ) -> Iterator[tuple[FloatArray, int, int]]:
+        """Noisy measurement [electrons / s] of every pattern (i, j); a signed pattern is a difference of two frames."""
+        numbered = zip(family.captures, expected, strict=True)
+        half: FloatArray | None = None
+        with ThreadPoolExecutor(WORKERS) as pool:
+            while chunk := list(islice(numbered, 4 * WORKERS)):
+                rates = pool.map(
+                    lambda item: self.rate(self.digital(self.electrons(item[1]), *item[0].names)), chunk
+                )
+                for (shown, _), rate in zip(chunk, rates, strict=True):
+                    if shown.sign == 1:
+                        half = rate
+                        continue
+                    yield rate if half is None else half - rate, shown.row, shown.column
+                    half = None

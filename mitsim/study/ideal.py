@@ -1,0 +1,41 @@
+"""The paper's idealised camera: from a reflectance image to the frames that Y = Phi_L (P o X) Phi_R^T promises.
+
+A planar scene lit evenly, a geometric shadow, no falloff: the yardstick beside rendered measurements. It takes the
+reflectance and the mean flux of the rendered bench, so exposure and noise are the same and only the model differs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.light import Light
+from mitsim.optics.frames import FrameOptics
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Light:
+    """Light of the ideal model: pixel p of the projector puts reflectance[p] * board_flux [W m^-2] into its own cell.
+
+    ``reflectance`` is (n, n) relative to the calibration board, ``board_flux`` the board's mean flux a projector pixel.
+    """
+    pixels = np.arange(bench.n**2)
+    light = sparse.csr_array((reflectance.ravel() * board_flux, (pixels, pixels)))
+    rows, columns = (np.linspace(*window, bench.n + 1) for window in bench.windows)
+    optics = FrameOptics(bench.geometry, rows, columns, bench.geometry.scene_distance, anchors=1)
+    return Light((light,), optics, paths=0, sampling_error=0.0, reached=True)
+
+
+def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -> tuple[FloatArray, FloatArray]:
+    """Phi_L, Phi_R (pixels, n) of the ideal model [sqrt(electrons / s)], for a board of reflectance 1.
+
+    For a FlatCam mask these are the factors of the coded term; the constant one vanishes when frames are centred.
+    ``electrons_per_joule`` turns W m^-2 into electrons a second.
+    """
+    rows, columns = (np.linspace(*window, bench.n + 1) for window in bench.windows)
+    left, right = bench.geometry.shadow_terms(rows, columns, bench.geometry.scene_distance)[-1]
+    scale = np.sqrt(board_flux * electrons_per_joule)
+    return left * scale, right * scale
