@@ -102,7 +102,7 @@ def speed(factor: np.ndarray, repeat: int, rng: np.random.Generator) -> dict[str
 
 
 def recovery(factor: np.ndarray, rng: np.random.Generator) -> dict[str, float]:
-    """Largest error of an image in 0..1 recovered from noise-free frames at lambda = 0, by family and form."""
+    """Largest error of an image in 0..1 from noise-free frames at lambda = 0, by family and form."""
     image = rng.random((N, N))
     result = {}
     for name, patterns in (("uniform", np.ones((N, 1))), ("dots:7", dots(N, K))):
@@ -135,7 +135,7 @@ def exact_solution(factor: np.ndarray, frame: np.ndarray, lam: float) -> np.ndar
 
 
 def rounding(rng: np.random.Generator) -> list[dict[str, float]]:
-    """Relative error of three forms against 50 digits: n = 12, m = 24, cond(Phi) = 1e4, so sigma spans 1e8."""
+    """Relative error of three forms against 50 digits: n = 12, m = 24, cond(Phi) = 1e4."""
     u, _ = np.linalg.qr(rng.normal(size=(24, 12)))
     v, _ = np.linalg.qr(rng.normal(size=(12, 12)))
     factor = (u * np.logspace(0, -4, 12)) @ v.T

@@ -1,8 +1,9 @@
-"""Tikhonov weight from the data alone, by generalised cross-validation on the accumulated projections.
+"""Tikhonov weight from the data alone, by an unbiased estimate of the risk on the accumulated projections.
 
 In the basis of the factors the fit is diagonal: coefficient W_ij is kept by the share
-sigma_ij^2 / (sigma_ij^2 + lambda), so residual and degrees of freedom cost n^2 operations for any lambda,
-whatever the number of frames (Golub, Heath and Wahba, Technometrics 21 (1979), eq. 1.4).
+sigma_ij^2 / (sigma_ij^2 + lambda), and the energy of the frames outside the model's range tells the noise, so
+any lambda costs n^2 operations, whatever the number of frames. Why not generalised cross-validation:
+docs/decisions/0002-automatic-lambda.md.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ from scipy.optimize import minimize_scalar
 from mitsim.core.errors import MitsimError
 
 FloatArray = npt.NDArray[np.float64]
+
+RISK_POWER = 0.5
+"""Errors are weighted by sigma to this power: 0 is the image's error, 2 that of predicted frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +59,18 @@ class Spectrum:
         return float(np.square(self.sigma.max()))
 
 
-def gcv_score(spectrum: Spectrum, lam: float) -> float:
-    """N ||residual||^2 / (N - trace)^2: the estimated mean squared error of predicting one left-out datum."""
-    free = spectrum.data_count - float(spectrum.kept(lam).sum())
-    return spectrum.data_count * spectrum.residual_energy(lam) / free**2
+def risk_score(spectrum: Spectrum, lam: float, noise: float) -> float:
+    """Unbiased estimate of the weighted squared error of the image, up to a constant.
+
+    With kept shares k, coefficient (k W / sigma) has expected squared error (1 - k)^2 x^2 + k^2 noise /
+    sigma^2; (W^2 - noise) / sigma^2 estimates x^2 without bias, and what does not depend on lambda is left
+    out, so that small sigma do no harm. ``noise`` is the variance of one datum.
+    """
+    measured = spectrum.sigma > 0
+    sigma, data = spectrum.sigma[measured], np.square(spectrum.projected[measured])
+    kept = spectrum.kept(lam)[measured]
+    errors = ((kept - 2) * (data - noise) + kept * noise) / (np.square(sigma) + lam)
+    return float(np.sum(sigma**RISK_POWER * errors))
 
 
 def noise_variance(spectrum: Spectrum) -> float:
@@ -73,22 +85,21 @@ def noise_variance(spectrum: Spectrum) -> float:
 
 
 def automatic_lambda(spectrum: Spectrum) -> float:
-    """Lambda that minimises :func:`gcv_score`: a grid over 16 decades, refined between its best neighbours.
+    """Lambda that minimises :func:`risk_score`: a grid over 16 decades, refined between its best neighbours.
 
-    Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when
-    there are no more data than unknowns (the score then has no minimum) or no signal.
+    Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there
+    are no more data than unknowns (the noise is then unknown) or no signal.
     """
-    noise_variance(spectrum)
+    noise = noise_variance(spectrum)
     if spectrum.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
-    floor = np.finfo(np.float64).eps
-    grid = np.arange(np.log10(floor), 1.01, 0.25)
+    grid = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
 
     def score(exponent: float) -> float:
-        return gcv_score(spectrum, spectrum.scale * 10.0**exponent)
+        return risk_score(spectrum, spectrum.scale * 10.0**exponent, noise)
 
     best = int(np.argmin([score(exponent) for exponent in grid]))
-    if best == 0 and gcv_score(spectrum, 0.0) <= score(grid[0]):
+    if best == 0 and risk_score(spectrum, 0.0, noise) <= score(grid[0]):
         return 0.0
     lower, upper = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     refined = minimize_scalar(score, bounds=(lower, upper), method="bounded", options={"xatol": 1e-3})

@@ -127,7 +127,8 @@ class Prepared:
 
         ``lam`` is lambda >= 0 in the unit of (Phi_L Phi_R)^2; 0 gives the pseudo-inverse, in which singular
         values below max(rows, columns) eps of the largest of their side count as zero. ``"auto"`` chooses
-        it by generalised cross-validation. MitsimError for missing frames or another lambda.
+        it by an unbiased
+        risk estimate. MitsimError for missing frames or another lambda.
         """
         spectrum = self.spectrum(frames)
         if isinstance(lam, str):

@@ -90,7 +90,7 @@ def solve_tv(
 
 
 def _penalty(spectrum: Spectrum) -> float:
-    """ADMM penalty; it sets the speed only. The Tikhonov lambda splits measured from unmeasured directions."""
+    """ADMM penalty, which sets the speed only: the Tikhonov lambda balances both of its steps."""
     measured = np.square(spectrum.sigma[spectrum.sigma > 0])
     if spectrum.data_count > measured.size:
         lam = automatic_lambda(spectrum)

@@ -99,7 +99,7 @@ def test_twin_pixels_are_reported_as_rank_deficient():
 
 
 def flatcam(pixel_mm, order=9):
-    """Left and right factors of both terms of a FlatCam mask at 2 mm, N scene pixels over 120 mm at 400 mm."""
+    """Weights and factors of both terms of a FlatCam mask at 2 mm, scene 120 mm wide at 400 mm."""
     mask = mls_mask("flatcam", order=order)
     pixels, scene = centred_edges(64, pixel_mm), centred_edges(N, 120 / N)
     return [
@@ -127,7 +127,7 @@ def flatcam_round_trip(terms, image):
 
 
 def test_centred_flatcam_is_separable_and_recovers_the_image():
-    # The mask (30.7 mm) covers the sensor's view (7 mm): its constant term has equal rows, centring removes it.
+    # The mask (30.7 mm) covers the sensor's view (7 mm): the constant term has equal rows.
     image = np.random.default_rng(3).random((N, N))
     got, solution = flatcam_round_trip(flatcam(0.1), image)
     assert got.separability_residual < 1e-12
