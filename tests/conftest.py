@@ -1,0 +1,150 @@
+"""Shared by all tests: shipped scenes loaded once, and small scenes written from one template.
+
+Everything here uses the variant ``llvm_ad_mono``. Another variant is tested in a child process, because objects of one
+variant must not be used after switching.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.configuration import shipped
+
+SMALL_SCENE = """<scene version="3.0.0">
+    <default name="albedo" value="0.5"/>
+    <integrator type="{integrator}">{integrator_options}</integrator>
+    <sensor type="mitsim_lensless">
+        <transform name="to_world"><matrix value="{rig}"/></transform>
+        <float name="pixel_pitch" value="{pitch}"/>
+        <string name="mask" value="{mask}"/>
+        <integer name="mask_order" value="{mask_order}"/>
+        <float name="mask_feature" value="{mask_feature}"/>
+        <float name="mask_distance" value="{mask_distance}"/>
+        <float name="scene_distance" value="{scene_distance}"/>
+        <float name="fov" value="{fov}"/>
+        <film type="hdrfilm">
+            <integer name="width" value="{pixels}"/> <integer name="height" value="{pixels}"/>
+            <rfilter type="box"/>
+            <string name="pixel_format" value="luminance"/> <string name="component_format" value="float32"/>
+        </film>
+        <sampler type="independent"/>
+    </sensor>
+    <emitter type="projector">
+        <transform name="to_world">
+            {projector_turn} <translate x="60"/> <matrix value="{rig}"/>
+        </transform>
+        <string name="fov_axis" value="x"/> <float name="fov" value="33.398488"/>
+        <float name="scale" value="111000"/>
+        <texture name="irradiance" type="bitmap">
+            <string name="filename" value="{name}_projector.png"/> <boolean name="raw" value="true"/>
+            <string name="filter_type" value="nearest"/> <string name="wrap_mode" value="clamp"/>
+        </texture>
+    </emitter>
+    <shape type="rectangle">
+        <transform name="to_world">
+            <rotate z="1" angle="180"/> <scale x="64" y="64"/> <translate z="{sheet_z}"/> <matrix value="{rig}"/>
+        </transform>
+        <boolean name="flip_normals" value="true"/>
+        <bsdf type="diffuse">{reflectance}</bsdf>
+    </shape>
+    {extra}
+</scene>
+"""
+PRINT = """<texture name="reflectance" type="bitmap">
+    <string name="filename" value="{name}_reflectance.png"/> <boolean name="raw" value="true"/>
+    <string name="filter_type" value="nearest"/> <string name="wrap_mode" value="clamp"/></texture>"""
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+NUMBERS = {
+    "pixels": 64,
+    "pitch": 0.01172,
+    "mask": "separable",
+    "mask_order": 9,
+    "mask_feature": 0.06,
+    "mask_distance": 2,
+    "scene_distance": 400,
+    "sheet_z": 400,
+    "fov": 20,
+    "integrator": "path",
+    "integrator_options": '<integer name="max_depth" value="2"/>',
+    "projector_turn": "",
+    "rig": IDENTITY,
+    "extra": "",
+}
+
+
+def write_png(path: Path, values: np.ndarray) -> None:
+    from skimage.io import imsave
+
+    imsave(path, np.asarray(values, dtype=np.uint8), check_contrast=False)
+
+
+def write_small_scene(
+    folder: Path,
+    name: str = "small",
+    n: int = 16,
+    reflectance: np.ndarray | None = None,
+    canvas: np.ndarray | None = None,
+    **numbers: object,
+) -> Path:
+    """A photograph-like scene with an n x n projector (60 mm to the side, lens-shifted) and a 64 x 64 sensor.
+
+    ``reflectance``: 8-bit print on the 128 mm sheet, row 0 on top, column 0 left; a grey of ``albedo`` without it.
+    ``canvas``: 8-bit texels of the projector, (n, 2 n) with the window in its right half; white window without it.
+    """
+    folder.mkdir(exist_ok=True)
+    if canvas is None:
+        canvas = np.zeros((n, 2 * n))
+        canvas[:, n:] = 255
+    write_png(folder / f"{name}_projector.png", canvas)
+    surface = '<spectrum name="reflectance" value="$albedo"/>'
+    if reflectance is not None:
+        write_png(folder / f"{name}_reflectance.png", reflectance)
+        surface = PRINT.format(name=name)
+    text = SMALL_SCENE.format(**{**NUMBERS, **numbers}, name=name, reflectance=surface)
+    path = folder / f"{name}.xml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def small_scene(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a small scene: ``small_scene(n=16, mask="open", ...)`` gives its path."""
+
+    def write(name: str = "small", **numbers: object) -> Path:
+        return write_small_scene(tmp_path / "scenes", name, **numbers)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def shared_scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """The same, for fixtures that live longer than one test; give each its own name."""
+    folder = tmp_path_factory.mktemp("scenes")
+    return lambda name, **numbers: write_small_scene(folder, name, **numbers)
+
+
+@pytest.fixture(scope="session")
+def variant() -> str:
+    """``llvm_ad_mono`` selected and the plugin registered, for tests that use Mitsuba themselves."""
+    from mitsim.core.environment import load_variant
+    from mitsim.transport import lensless
+
+    mi = load_variant("llvm_ad_mono")
+    mi.set_log_level(mi.LogLevel.Error)
+    lensless.register()
+    return "llvm_ad_mono"
+
+
+@pytest.fixture(scope="session")
+def shipped_bench(variant: str) -> Callable[..., object]:
+    """Benches of the shipped scenes, each opened once: ``shipped_bench("photograph", mask="flatcam")``."""
+    from mitsim.capture.bench import open_bench
+
+    @cache
+    def load(name: str, **defines: str) -> object:
+        return open_bench(shipped("scenes", name, "scene.xml"), variant, defines=defines)
+
+    return load
