@@ -132,6 +132,7 @@ def test_centred_flatcam_is_separable_and_recovers_the_image():
     got, solution = flatcam_round_trip(flatcam(0.1), image)
     assert got.separability_residual < 1e-12
     np.testing.assert_allclose(solution.image, image, atol=1e-8)
+    assert solution.residual < 1e-6
     plain = estimate_factors(
         [flatcam_frame(flatcam(0.1), np.outer(h, np.ones(N))) for h in H.T],
         [flatcam_frame(flatcam(0.1), np.outer(np.ones(N), h)) for h in H.T],
