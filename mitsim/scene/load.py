@@ -51,7 +51,7 @@ def check_file(path: Path, defines: Mapping[str, str]) -> None:
     except ElementTree.ParseError as error:
         line, column = error.position
         raise MitsimError(
-            f"{path}:{line}: not well-formed XML (column {column}: {error.msg.split(':')[0]}); mend the file"
+            f"{path}:{line}: not well-formed XML (column {column}: {str(error).split(':')[0]}); mend the file"
         ) from None
     except DefusedXmlException as error:
         raise MitsimError(
@@ -110,4 +110,6 @@ def _one_line(error: BaseException) -> str:
     text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
     lines = [re.sub(r"\s+", " ", line).strip(" -*│╰╭─") for line in text.splitlines()]
     lines = [re.sub(r"^\d{4}-\d\d-\d\d [\d:]+ \w+ +\w* *\[[^\]]*\] *", "", line) for line in lines if line]
+    if "Traceback" in text:  # raised by our own plugin: the last line says what, the rest is Python's stack
+        lines = [re.sub(r" Traceback .*", "", lines[0]), re.sub(r"^[\w.]*Error: ", "", lines[-1])]
     return " ".join(lines)[:400] if lines else type(error).__name__
