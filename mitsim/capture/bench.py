@@ -15,9 +15,12 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum
 from mitsim.optics.camera import CameraGeometry
 from mitsim.scene.load import LoadedScene, load_scene
+from mitsim.scene.patterns import PatternFamily, parse_patterns
 from mitsim.sensor.model import SensorModel, load_sensor
 from mitsim.transport import lensless
 from mitsim.transport.factored import Projector
+
+__all__ = ["DEFAULT_VARIANT", "Bench", "PatternFamily", "ProjectorModel", "SessionRecipe", "load_recipe", "open_bench"]
 
 DEFAULT_VARIANT = "llvm_ad_mono"
 _PITCH_TOLERANCE = 1e-3
@@ -80,6 +83,10 @@ class Bench:
         """Row and column tan-angles of the projector's window on the aligned plane."""
         return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
 
+    def family(self, patterns: str, seed: int = 0) -> PatternFamily:
+        """The pattern family of that name on this projector; MitsimError when it does not fit."""
+        return parse_patterns(patterns, self.n, seed)
+
     def identity(self) -> dict[str, Any]:
         """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid."""
         grid = self.loaded.pixels
@@ -127,10 +134,12 @@ def open_bench(
     camera: Path | str | None = None,
     projector: Path | str | None = None,
     defines: Mapping[str, str] | None = None,
+    check_camera: bool = True,
 ) -> Bench:
     """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
 
     ``camera`` and ``projector`` are TOML files; the shipped IMX249 and MP-CL1 are used without them.
+    ``check_camera`` is off where only light matters and the electronics are not used.
 
     Raises
     ------
@@ -146,7 +155,7 @@ def open_bench(
     light = load_model(projector_path, ProjectorModel)
     loaded = load_scene(Path(scene), defines)
     pitch, stated = sensor.superpixel_pitch_um * 1e-3, loaded.camera.geometry.pixel_pitch
-    if abs(pitch - stated) > _PITCH_TOLERANCE * stated:
+    if check_camera and abs(pitch - stated) > _PITCH_TOLERANCE * stated:
         raise MitsimError(
             f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
             "use the camera of that scene, or change pixel_pitch, or binning"

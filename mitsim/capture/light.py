@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +56,10 @@ class Light:
     def frames(self, labels: Labels, weights: FloatArray, seed: int) -> ExpectedFrames:
         """Expected frames of the captures that ``labels`` (n^2,) and ``weights`` (captures, classes) describe."""
         return ExpectedFrames(self.optics, self.groups, labels, weights, seed)
+
+    def merged(self) -> Light:
+        """The same light as one group: frames come without a variance, and faster."""
+        return replace(self, groups=(sum(self.groups[1:], self.groups[0]) / len(self.groups),))
 
     def flux(self) -> FloatArray:
         """(projector pixels,) irradiance that each pixel's light casts toward the camera, without the mask."""

@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame, write_frame
 from mitsim.core.manifest import prepare_output, read_json, versions, write_json
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.scene.patterns import Capture, PatternFamily, parse_patterns
+from mitsim.scene.patterns import Capture, PatternFamily
 from mitsim.scene.plan import Plan
 from mitsim.sensor.chain import Digital
 
@@ -69,7 +69,7 @@ def capture(
         for patterns that do not fit, an output that cannot be written or holds something else.
     """
     exposure = exposure or Exposure()
-    family = parse_patterns(patterns, bench.n, seed)
+    family = bench.family(patterns, seed)
     configuration = {
         **bench.provenance(),
         **bench.identity(),

@@ -1,4 +1,4 @@
-"""`mitsim calibrate`: a rendered Hadamard session on a white board, from a bench to the camera's estimated factors.
+"""A rendered Hadamard calibration session on a white board: from a bench to the camera's responses to striped light.
 
 The paper's procedure (section IV-A): every column h_i of a Hadamard matrix is shown as horizontal stripes h_i 1^T and as
 vertical ones 1 h_i^T, each +-1 pattern as two captures (or one and a uniform frame), all at one exposure, with sensor
@@ -9,104 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.calibrate.hadamard import Calibration, estimate_factors
-from mitsim.capture.bench import Bench, SessionRecipe, load_recipe
+from mitsim.capture.bench import Bench, SessionRecipe
 from mitsim.capture.clock import Clock
 from mitsim.capture.exposer import WORKERS, Exposer, Exposure
-from mitsim.capture.light import Light, Progress, collect, make_plan, silent, uniform_light
-from mitsim.capture.run import digital_block
+from mitsim.capture.light import Light, Progress, collect, make_plan, uniform_light
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import checksum, write_frame
-from mitsim.core.manifest import prepare_output, versions, write_json
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import hadamard_matrix
 from mitsim.scene.plan import Plan
 
 FloatArray = npt.NDArray[np.float64]
 SIDES = ("horizontal", "vertical")
-
-
-@dataclass(frozen=True)
-class CalibrationResult:
-    """What `mitsim calibrate` reports.
-
-    ``phi_error`` is the relative error of the factors, both sides in quadrature, against those that the same procedure
-    finds in noise-free frames; ``noise_free_residual`` is what those frames leave unexplained.
-    """
-
-    n: int
-    frames: int
-    separability_residual: float
-    noise_free_residual: float
-    phi_error: float
-    condition: float
-    exposure_s: float
-    seconds: dict[str, float]
-    output: str
-    warnings: tuple[str, ...]
-
-
-def calibrate(
-    bench: Bench,
-    output: Path | str,
-    accuracy: float = 1e-3,
-    seed: int = 0,
-    recipe: SessionRecipe | None = None,
-    progress: Progress = silent,
-) -> tuple[CalibrationResult, Calibration]:
-    """Run a session and write its factors to a CAL folder; returns the report and the factors.
-
-    Raises
-    ------
-    MitsimError
-        for an output that cannot be written, or a recipe that cannot be used.
-    """
-    recipe = recipe or load_recipe()
-    clock = Clock()
-    folder = prepare_output(output)
-    session = Session(bench, recipe, accuracy, seed, clock, progress)
-    noisy, clean = session.factors()
-    warnings = session.plan.warnings + (() if noisy.ok else (noisy.status,))
-    for name, factor in (("left", noisy.left), ("right", noisy.right)):
-        write_frame(
-            folder / f"{name}.exr",
-            {"factor": factor.astype(np.float32)},
-            {"unit": "sqrt(e-/s)", "reflectance": recipe.board_reflectance},
-        )
-    result = CalibrationResult(
-        n=bench.n,
-        frames=session.captures,
-        separability_residual=noisy.separability_residual,
-        noise_free_residual=clean.separability_residual,
-        phi_error=float(np.hypot(_relative(noisy.left, clean.left), _relative(noisy.right, clean.right))),
-        condition=noisy.condition,
-        exposure_s=session.exposure_s,
-        seconds=clock.seconds(),
-        output=str(folder),
-        warnings=warnings,
-    )
-    write_json(
-        folder / "manifest.json",
-        {
-            "kind": "calibration",
-            "status": "complete",
-            "configuration": {**bench.provenance(), "accuracy": accuracy, "seed": seed, "recipe": recipe},
-            "camera": bench.identity(),
-            "centre": session.centre,
-            "digital": digital_block(bench, session.exposure_s),
-            "checksums": {name: checksum(folder / name) for name in ("left.exr", "right.exr")},
-            "result": {key: value for key, value in vars(result).items() if key != "output"},
-            "versions": versions(),
-        },
-    )
-    return result, noisy
 
 
 class Session:
@@ -131,7 +49,7 @@ class Session:
         with clock.stage("plan"):
             self.plan: Plan = make_plan(self.board, *uniform, accuracy, seed)
         with clock.stage("transport"):
-            self.light: Light = collect(self.board, self.plan, *uniform, seed, progress)
+            self.light: Light = collect(self.board, self.plan, *uniform, seed, progress).merged()
         with clock.stage("optics"):
             white = next(iter(self.light.frames(*uniform, seed)))
             self.exposure_s = Exposure(None, recipe.exposure_fraction).choose(bench, float(white.irradiance.max()))
@@ -141,16 +59,15 @@ class Session:
         """Frames of the whole session."""
         return 2 * len(self.weights)
 
-    def factors(self) -> tuple[Calibration, Calibration]:
-        """Factors [sqrt(electrons / s)] from noisy frames, and from the expected ones."""
-        noisy = estimate_factors(
-            *(self._signed(self._noisy(side)) for side in SIDES), self.signs, centre=self.centre
-        )
-        with self.clock.stage("noise-free check"):
-            clean = estimate_factors(
-                *(self._noise_free(side) for side in SIDES), self.signs, centre=self.centre
-            )
-        return noisy, clean
+    def noisy(self) -> tuple[Iterator[FloatArray], Iterator[FloatArray]]:
+        """Responses [electrons / s] to horizontal and to vertical +-1 stripes, from noisy frames, read one at a time."""
+        horizontal, vertical = (self._signed(self._noisy(side)) for side in SIDES)
+        return horizontal, vertical
+
+    def noise_free(self) -> tuple[Iterator[FloatArray], Iterator[FloatArray]]:
+        """The same responses from expected frames."""
+        horizontal, vertical = (self._noise_free(side) for side in SIDES)
+        return horizontal, vertical
 
     def _expected(self, side: str, weights: FloatArray) -> ExpectedFrames:
         n = self.bench.n
@@ -207,7 +124,3 @@ def _signs(n: int) -> FloatArray:
         except MitsimError:
             continue
     raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
-
-
-def _relative(a: FloatArray, b: FloatArray) -> float:
-    return float(np.linalg.norm(a - b) / np.linalg.norm(b))

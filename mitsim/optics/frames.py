@@ -71,19 +71,18 @@ class FrameOptics:
             return np.asarray(sum(left @ (block @ right) for left, right in factors))
         return np.asarray(sum((left @ block) @ right for left, right in factors))
 
-    def seen_by(self, vectors: FloatArray) -> list[FloatArray]:
-        """Sensor columns combined into ``vectors`` (pixels, probes), for :meth:`probe`."""
-        return [right @ vectors for _, right in self._terms]
+    def probe(self, flat: npt.NDArray[np.int64], lights: FloatArray, vectors: FloatArray) -> FloatArray:
+        """(pixels, groups * probes): the frames of ``lights`` (groups, len(flat)) times ``vectors`` (pixels, probes).
 
-    def probe(self, flat: npt.NDArray[np.int64], light: FloatArray, seen: list[FloatArray]) -> FloatArray:
-        """(pixels, probes): the frame of that light times the vectors of ``seen``, without forming the frame."""
-        rows, columns, block = self._block(flat, light)
-        return np.asarray(
-            sum(
-                left[rows].T @ (block @ right[columns])
-                for (left, _), right in zip(self._terms, seen, strict=True)
-            )
-        )
+        The frames themselves, which would cost far more, are never formed.
+        """
+        parts = [self._block(flat, light) for light in lights]
+        rows, columns, _ = parts[0]
+        total = 0.0
+        for left, right in self._terms:
+            seen = right[columns] @ vectors
+            total = total + left[rows].T @ np.concatenate([block @ seen for _, _, block in parts], axis=1)
+        return np.asarray(total)
 
     def total(self, light: sparse.csr_array) -> FloatArray:
         """(len(light),) irradiance without the mask, mean over the sensor, of each row of ``light`` [W m^-2]."""
@@ -112,7 +111,7 @@ class ExpectedFrames:
     projector pixels that a family always lights together. A family with too many classes is formed capture by capture
     and never held in memory as a whole.
 
-    The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``. Squared norms are estimated
+    With one group there is no variance to tell, and it is 0. Otherwise it is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``. Squared norms are estimated
     without bias from products with random signs (Hutchinson's estimator), because forming G times as many frames would
     cost more than the frames themselves.
     """
@@ -161,25 +160,27 @@ class ExpectedFrames:
                 )
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        """(b, pixels, pixels) frames of basis lights, (b, groups * pixels * probes) deviations of their groups."""
+        """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) deviations of their groups."""
         chosen = self._basis[start:stop]
         light, parts = chosen @ self._mean, [chosen @ group for group in self._groups]
-        signs = stream(self._seed, "probe").choice((-1.0, 1.0), size=(self._optics.pixels, _PROBES))
-        seen = self._optics.seen_by(signs)
-        frames, deviations = [], []
+        pixels, groups = self._optics.pixels, len(self._groups)
+        signs = stream(self._seed, "probe").choice((-1.0, 1.0), size=(pixels, _PROBES))
+        frames = np.empty((stop - start, pixels, pixels))
+        deviations = np.zeros((stop - start, pixels * groups * _PROBES if groups > 1 else 1))
         for row in range(stop - start):
-            frame = self._optics.frame(*_row(light, row))
-            probed = [self._optics.probe(*_row(part, row), seen) for part in parts]
-            frames.append(frame)
-            deviations.append((np.stack(probed) - frame @ signs).ravel())
-        return np.stack(frames), np.stack(deviations)
+            flat, mean = _row(light, row)
+            frames[row] = self._optics.frame(flat, mean)
+            if groups > 1:
+                probed = self._optics.probe(flat, _aligned(flat, [_row(part, row) for part in parts]), signs)
+                deviations[row] = (probed - np.tile(frames[row] @ signs, groups)).ravel()
+        return frames, deviations
 
     def _frames(self, irradiance: FloatArray, deviation: FloatArray) -> Iterator[Frame]:
         count = len(self._groups)
         pairs = count * (count - 1)
         for frame, one in zip(irradiance, deviation, strict=True):
             squared = float(one @ one) / _PROBES
-            variance = squared / pairs / frame.size if pairs else float("nan")
+            variance = squared / pairs / frame.size if pairs else 0.0
             light = np.maximum(frame, 0)
             total = float(light.sum())
             yield Frame(light, variance, (total - float(frame.sum())) / total if total else 0.0)
@@ -197,6 +198,17 @@ def relative_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
 def _row(matrix: sparse.csr_array, row: int) -> tuple[npt.NDArray[np.int64], FloatArray]:
     inside = slice(matrix.indptr[row], matrix.indptr[row + 1])
     return matrix.indices[inside].astype(np.int64), matrix.data[inside]
+
+
+def _aligned(
+    flat: npt.NDArray[np.int64], parts: Sequence[tuple[npt.NDArray[np.int64], FloatArray]]
+) -> FloatArray:
+    """(groups, len(flat)) values of each group at the places of their mean, which holds every place of each."""
+    order = np.argsort(flat)
+    values = np.zeros((len(parts), len(flat)))
+    for line, (places, light) in zip(values, parts, strict=True):
+        line[order[np.searchsorted(flat[order], places)]] = light
+    return values
 
 
 def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:

@@ -25,7 +25,16 @@ import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.accumulator import Accumulator, centred_columns
-from mitsim.reconstruct.factors import FloatArray, Method, Side, Structure, check_choices, factorise
+from mitsim.reconstruct.factors import (
+    FloatArray,
+    IndexArray,
+    Method,
+    Side,
+    Structure,
+    check_choices,
+    factorise,
+    pattern_blocks,
+)
 from mitsim.reconstruct.regularisation import Spectrum, automatic_lambda
 
 
@@ -224,9 +233,19 @@ def prepare(
     same = np.array_equal(factors[0], factors[1]) and np.array_equal(patterns[0], patterns[1])
     if centre:
         factors = [centred_columns(factor) for factor in factors]
-    first = factorise(factors[0], patterns[0], method, structure, centre)
-    second = first if same else factorise(factors[1], patterns[1], method, structure, centre)
-    return Prepared(first, second, method, centre)
+    blocks = [_blocks(patterns[0], structure)]
+    blocks.append(blocks[0] if np.array_equal(*patterns) else _blocks(patterns[1], structure))
+
+    def side(index: int) -> Side:
+        return factorise(factors[index], patterns[index], blocks[index], method, structure, centre)
+
+    first = side(0)
+    return Prepared(first, first if same else side(1), method, centre)
+
+
+def _blocks(patterns: FloatArray, structure: Structure) -> tuple[IndexArray, ...]:
+    """Groups of scene pixels to factorise alone; one group for ``full``."""
+    return (np.arange(len(patterns)),) if structure == "full" else pattern_blocks(patterns)
 
 
 def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:

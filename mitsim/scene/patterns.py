@@ -84,12 +84,15 @@ class PatternFamily:
         _, row = np.unique(self.left, axis=0, return_inverse=True)
         _, column = np.unique(self.right, axis=0, return_inverse=True)
         label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
-        _, first, labels = np.unique(label, return_index=True, return_inverse=True)
+        _, first, found = np.unique(label, return_index=True, return_inverse=True)
+        # Numbered by first appearance, so that shifting dots have one class a capture, in the same order.
+        order = np.argsort(first)
+        first, labels = first[order], np.argsort(order)[found.ravel()]
         captures = self.captures
         i, j = np.array([c.row for c in captures]), np.array([c.column for c in captures])
         sign = np.array([c.sign for c in captures])[:, None]
         pattern = self.left[first // self.n][:, i].T * self.right[first % self.n][:, j].T.astype(np.float64)
-        return labels.ravel(), np.where(sign == 0, pattern, (1 + sign * pattern) / 2)
+        return labels, np.where(sign == 0, pattern, (1 + sign * pattern) / 2)
 
 
 def shifting_dots(n: int, k: int) -> IntArray:

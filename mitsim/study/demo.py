@@ -16,19 +16,18 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.calibrate.hadamard import Calibration
-from mitsim.capture.bench import Bench, load_recipe, open_bench
+from mitsim.capture.bench import Bench, PatternFamily, load_recipe, open_bench
 from mitsim.capture.clock import Clock
 from mitsim.capture.exposer import Exposer, Exposure
 from mitsim.capture.light import Light, Progress, collect, pinhole_view, silent, uniform_light
 from mitsim.capture.run import CaptureResult, capture, frame_name
-from mitsim.capture.session import CalibrationResult, calibrate
 from mitsim.core.configuration import shipped
 from mitsim.core.frames import read_frame
 from mitsim.core.manifest import prepare_output, read_json, versions, write_json
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
-from mitsim.scene.patterns import PatternFamily, parse_patterns
 from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.study.calibration import CalibrationResult, calibrate
 from mitsim.study.ideal import ideal_factors, ideal_light
 from mitsim.study.metrics import psnr, read_truth, ssim
 from mitsim.study.report import (
@@ -127,7 +126,7 @@ class _Comparison:
         self.bench, self.seed, self.clock, self.progress = bench, seed, clock, progress
         self.captured, self.factors = captured, factors
         self.truth = read_truth(folder / "run")
-        main = parse_patterns(MAIN, bench.n, seed)
+        main = bench.family(MAIN, seed)
         with clock.stage("transport"):
             self.light = collect(bench, captured.plan, *main.classes(), seed)
             board = bench.with_board(load_recipe().board_reflectance)
@@ -139,10 +138,10 @@ class _Comparison:
 
     def family(self, name: str) -> FamilyResult:
         """Both reconstructions at equal peak, with singular values and two example patterns."""
-        family = parse_patterns(name, self.bench.n, self.seed)
+        family = self.bench.family(name, self.seed)
         prepared = self._prepared(family, rendered=True)
         singular = np.sort(prepared.left.singular**2)[::-1]
-        shown = family.captures[0], family.captures[len(family.captures) // 2]
+        shown = family.captures[0], family.captures[2 * len(family.captures) // 5 + 2 if len(family.captures) > 4 else 0]
         return FamilyResult(
             name=name,
             label=FAMILIES[name],
@@ -155,13 +154,13 @@ class _Comparison:
 
     def exposures(self, name: str) -> tuple[dict[str, float], ExposureRow]:
         """PSNR of the rendered reconstruction under the three exposure conventions."""
-        captures = len(parse_patterns(name, self.bench.n, self.seed).captures)
+        captures = len(self.bench.family(name, self.seed).captures)
         times = (self._peak_time(self.light, name), self.uniform_s, self.uniform_s / captures)
         found = [self._recovery(name, time, rendered=True).psnr_db for time in times]
         return dict(zip(CONVENTIONS, found, strict=True)), ExposureRow(FAMILIES[name], *found)
 
     def _recovery(self, name: str, exposure_s: float, rendered: bool) -> Recovery:
-        family = parse_patterns(name, self.bench.n, self.seed)
+        family = self.bench.family(name, self.seed)
         light = self.light if rendered else self.ideal
         exposer = Exposer(self.bench, exposure_s, self.seed if rendered else self.seed + 1)
         prepared = self._prepared(family, rendered)
@@ -184,7 +183,7 @@ class _Comparison:
         return light.frames(*family.classes(), self.seed)
 
     def _peak_time(self, light: Light, name: str) -> float:
-        family = parse_patterns(name, self.bench.n, self.seed)
+        family = self.bench.family(name, self.seed)
         with self.clock.stage("compare families"):
             peak = max(float(frame.irradiance.max()) for frame in self._expected(light, family))
         return Exposure().choose(self.bench, peak)
@@ -226,7 +225,7 @@ def _report(
 ) -> ReportData:
     best = next(f for f in families if f.name == MAIN)
     headline, detail = verdict(best, families[0])
-    main = parse_patterns(MAIN, bench.n, seed)
+    main = bench.family(MAIN, seed)
     return ReportData(
         title=f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
         verdict=headline,

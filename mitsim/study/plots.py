@@ -116,6 +116,19 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None, width: f
     return figure
 
 
+def error_against_time(series: Mapping[str, Sequence[tuple[float, float]]], width: float = 8.6) -> Figure:
+    """Relative error over wall seconds for all frames, log-log; {estimator: [(seconds, error), ...]}."""
+    figure, axes = _figure(width, 0.55 * width)
+    for index, (name, points) in enumerate(series.items()):
+        seconds, error = zip(*sorted(points), strict=True)
+        axes.loglog(seconds, error, "o-", color=(BLUE, VERMILION)[index % 2], linewidth=2.0, label=name)
+    axes.set_xlabel("wall time for all frames [s]", fontsize=_FONT)
+    axes.set_ylabel("relative error of the frames [1]", fontsize=_FONT)
+    axes.grid(True, which="major", color="#e5e7eb")
+    axes.legend(fontsize=_FONT, frameon=False)
+    return figure
+
+
 def seconds_by_stage(seconds: Mapping[str, float], width: float = 8.6) -> Figure:
     """Wall time {stage: seconds} as horizontal bars in the order given."""
     figure, axes = _figure(width, 0.7 + 0.34 * len(seconds))

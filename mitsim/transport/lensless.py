@@ -71,7 +71,7 @@ def _geometry(props: Any, size: Any) -> CameraGeometry:
     values = {
         name: props[name]
         for name in CameraGeometry.model_fields
-        if name != "pixels" and props.has_property(name)
+        if name != "pixels" and name in props
     }
     if size[0] != size[1]:
         raise MitsimError(f"{PLUGIN}: film is {size[0]}x{size[1]} pixels; the sensor must be square")

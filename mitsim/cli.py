@@ -1,0 +1,392 @@
+"""The command line: parse, dispatch, print. No physics; heavy imports happen inside the verb that needs them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+import mitsim
+from mitsim.core.errors import MitsimError
+
+app = typer.Typer(
+    name="mitsim",
+    help="A physically based simulator of coded-illumination lensless imaging.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Scene = Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
+Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
+Variant = Annotated[str, typer.Option(help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral")]
+Seed = Annotated[int, typer.Option(help="root of every random stream")]
+Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
+Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", metavar="FILE.toml")]
+ProjectorFile = Annotated[
+    Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")
+]
+Defines = Annotated[
+    list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")
+]
+Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
+
+
+def main() -> None:
+    """Entry point: exit 0 done, 1 done but flagged, 2 refused before work."""
+    try:
+        code = app(standalone_mode=False)
+    except MitsimError as error:
+        _fail(str(error))
+    except (typer.Abort, KeyboardInterrupt):
+        print("mitsim: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        # Usage errors of click (wherever typer keeps it) carry their own one-line message.
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+            _fail(error.format_message())
+        raise
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str) -> None:
+    print(f"mitsim: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(2)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False,
+) -> None:
+    if version:
+        print(mitsim.__version__)
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder of the demo")] = Path("demo-output"),
+    scene: Annotated[Path | None, typer.Option(help="another scene than scenes/photograph")] = None,
+    accuracy: Accuracy = 1e-3,
+    seed: Seed = 0,
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """The main job on a shipped scene: plan, capture, calibrate, reconstruct, report.html."""
+    from mitsim.study.demo import FAMILIES
+    from mitsim.study.demo import demo as run_demo
+
+    with _progress(quiet or as_json) as progress:
+        path = _scene(scene) if scene is not None else None
+        result = run_demo(output, path, variant, accuracy, seed, progress)
+    lines = [
+        f"{FAMILIES[name]:>14}: {value:5.1f} dB rendered and calibrated, {result.psnr_ideal[name]:5.1f} dB idealised"
+        for name, value in result.psnr.items()
+    ]
+    lines += [f"49 dots beat uniform by {result.gain_db:.1f} dB.", f"Report: {result.report}"]
+    return _finish(as_json, asdict(result), lines, result.warnings)
+
+
+@app.command()
+def plan(
+    scene: Scene,
+    patterns: Patterns = "dots:7",
+    accuracy: Accuracy = 1e-3,
+    seed: Seed = 0,
+    camera: Camera = None,
+    projector: ProjectorFile = None,
+    define: Defines = None,
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """What will be simulated, why, and what it costs, before any long work."""
+    from mitsim.capture.light import make_plan
+
+    bench = _bench(scene, variant, camera, projector, define)
+    made = make_plan(bench, *bench.family(patterns, seed).classes(), accuracy, seed)
+    payload = {
+        "effects": [asdict(effect) for effect in made.effects],
+        "accuracy": made.accuracy,
+        "predicted_seconds": made.predicted_seconds,
+        "settings": {
+            "anchors": made.anchors,
+            "subdivision": made.subdivision,
+            "depth": made.depth,
+            "sampling_target": made.sampling_target,
+            "systematic_error": made.systematic_error,
+        },
+        "warnings": made.warnings,
+    }
+    if not as_json:
+        _print_plan(made)
+    return _finish(as_json, payload, [], made.warnings)
+
+
+@app.command()
+def capture(
+    scene: Scene,
+    output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
+    patterns: Patterns,
+    accuracy: Accuracy = 1e-3,
+    camera: Camera = None,
+    projector: ProjectorFile = None,
+    exposure: Annotated[str, typer.Option(help="seconds a frame, or auto", metavar="auto|SECONDS")] = "auto",
+    exposure_fraction: Annotated[float, typer.Option(help="brightest pixel, as a part of full well")] = 0.8,
+    seed: Seed = 0,
+    define: Defines = None,
+    resume: Annotated[bool, typer.Option("--resume", help="finish an interrupted run")] = False,
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Render, expose and write one frame for each pattern."""
+    from mitsim.capture.exposer import Exposure
+    from mitsim.capture.run import capture as run_capture
+
+    chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
+    with _progress(quiet or as_json) as progress:
+        bench = _bench(scene, variant, camera, projector, define)
+        result = run_capture(bench, patterns, output, accuracy, seed, chosen, resume, progress)
+    payload = {key: value for key, value in asdict(result).items() if key != "plan"}
+    seconds = result.seconds
+    lines = [
+        f"{result.frames} frames of {result.shape[0]}x{result.shape[1]} in {seconds['total']:.1f} s "
+        f"(transport {seconds['transport']:.2f}, optics {seconds['optics']:.2f}, sensor {seconds['sensor']:.2f}, "
+        f"write {seconds['write']:.2f}): {result.output}",
+        f"Monte Carlo error {result.mc_error:.1e}, {result.mc_to_sensor_noise:.0%} of the sensor's noise; "
+        f"exposure {result.exposure_s:.3g} s a frame",
+    ]
+    return _finish(as_json, payload, lines, result.warnings)
+
+
+@app.command()
+def calibrate(
+    scene: Scene,
+    output: Annotated[Path, typer.Option("-o", "--output", help="calibration folder to make", metavar="CAL")],
+    accuracy: Accuracy = 1e-3,
+    camera: Camera = None,
+    projector: ProjectorFile = None,
+    recipe: Annotated[Path | None, typer.Option(help="session recipe, TOML", metavar="FILE.toml")] = None,
+    seed: Seed = 0,
+    define: Defines = None,
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Render a Hadamard session on a white board and estimate the camera's factors."""
+    from mitsim.capture.bench import load_recipe
+    from mitsim.study.calibration import calibrate as run_calibration
+
+    with _progress(quiet or as_json) as progress:
+        bench = _bench(scene, variant, camera, projector, define)
+        result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress)
+    lines = [
+        f"{result.frames} frames of {result.n} x {result.n} stripes in {result.seconds['total']:.1f} s: {result.output}",
+        f"separability residual {result.separability_residual:.2%} ({result.noise_free_residual:.1e} without noise), "
+        f"factor error {result.phi_error:.1e}, condition {result.condition:.2e}",
+    ]
+    return _finish(as_json, asdict(result), lines, result.warnings)
+
+
+@app.command()
+def reconstruct(
+    run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
+    calibration: Annotated[Path, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="folder for the image [RUN/reconstruction]")
+    ] = None,
+    lam: Annotated[
+        str, typer.Option("--lambda", help="regularisation, or auto", metavar="auto|VALUE")
+    ] = "auto",
+    method: Annotated[str, typer.Option(help="tikhonov or tv")] = "tikhonov",
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Recover the image from frames and a calibration alone."""
+    from mitsim.study.quality import reconstruct as run_reconstruct
+    from mitsim.study.quality import summary
+
+    value: float | Literal["auto"] = _number("--lambda", lam, "auto", least=0.0) if lam != "auto" else "auto"  # type: ignore[assignment]
+    result = run_reconstruct(run, calibration, output or run / "reconstruction", value, method)
+    lines = [result.status]
+    if result.psnr is not None and result.ssim is not None:
+        lines.append(f"PSNR {result.psnr:.2f} dB, SSIM {result.ssim:.3f}")
+    lines.append(
+        f"lambda {result.lam:.3g}, rank {result.rank}, condition {result.condition:.3g}, "
+        f"residual {result.residual:.1e}: {result.output}"
+    )
+    return _finish(as_json, summary(result), lines, () if result.ok else (result.status,))
+
+
+@app.command()
+def render(
+    scene: Scene,
+    output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
+    estimator: Annotated[str, typer.Option(help="reference or factored")] = "reference",
+    spp: Annotated[int, typer.Option(help="samples a pixel of the reference")] = 64,
+    accuracy: Accuracy = 1e-3,
+    seed: Seed = 0,
+    define: Defines = None,
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Expected irradiance under the scene's own light, by either estimator."""
+    from mitsim.capture.render import render as run_render
+
+    with _progress(quiet or as_json) as progress:
+        result = run_render(_scene(scene), output, estimator, spp, accuracy, seed, variant, _defines(define), progress)
+    lines = [
+        f"{result.estimator}: mean irradiance {result.mean:.4e} W/m^2, relative noise {result.mc_error:.1e}, "
+        f"{result.seconds:.2f} s: {result.output}"
+    ]
+    return _finish(as_json, asdict(result), lines, result.warnings)
+
+
+@app.command()
+def study(
+    name: Annotated[str, typer.Argument(help="accuracy", metavar="NAME")],
+    scene: Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene")] = Path("photograph"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder of the study")] = Path("study-output"),
+    patterns: Patterns = "dots:7",
+    seed: Seed = 0,
+    define: Defines = None,
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """An experiment with a plot and JSON; `accuracy` shows what accuracy costs in time."""
+    from mitsim.study import STUDIES
+
+    if name not in STUDIES:
+        raise MitsimError(f"study {name!r}: this version has {', '.join(STUDIES)}")
+    with _progress(quiet or as_json) as progress:
+        module, function = STUDIES[name].split(":")
+        run_study = getattr(importlib.import_module(module), function)
+        result = run_study(_bench(scene, variant, None, None, define), output, patterns, seed, progress)
+    return _finish(as_json, result.payload(), result.lines(), ())
+
+
+@app.command()
+def doctor(
+    variant: Variant = "llvm_ad_mono",
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """What works on this machine, and the one command that mends what does not."""
+    from mitsim.core.environment import doctor as run_doctor
+
+    checks = run_doctor()
+    lines = [
+        f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.detail}"
+        + (f"\n     mend with: {check.remedy}" if check.remedy and not check.ok else "")
+        for check in checks
+    ]
+    bad = tuple(f"{check.name}: {check.detail}" for check in checks if not check.ok)
+    return _finish(as_json, {"checks": [asdict(check) for check in checks], "ok": not bad}, lines, bad)
+
+
+# ---- helpers ---------------------------------------------------------------------------------------------------------
+
+
+def _scene(scene: Path) -> Path:
+    """The path as given, or the shipped scene of that name."""
+    if scene.suffix or scene.exists() or len(scene.parts) > 1:
+        return scene / "scene.xml" if scene.is_dir() else scene
+    from mitsim.core.configuration import shipped
+
+    folder = shipped("scenes")
+    if (folder / scene / "scene.xml").is_file():
+        return folder / scene / "scene.xml"
+    known = ", ".join(sorted(path.parent.name for path in folder.glob("*/scene.xml")))
+    raise MitsimError(f"{scene}: no such scene file, and no shipped scene of that name; shipped are {known}")
+
+
+def _bench(
+    scene: Path, variant: str, camera: Path | None, projector: Path | None, define: Sequence[str] | None
+) -> Any:
+    from mitsim.capture.bench import open_bench
+
+    return open_bench(_scene(scene), variant, camera, projector, _defines(define))
+
+
+def _defines(define: Sequence[str] | None) -> dict[str, str]:
+    pairs = {}
+    for text in define or ():
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise MitsimError(f"-D {text!r}: give NAME=VALUE")
+        pairs[name] = value
+    return pairs
+
+
+def _number(option: str, text: str, word: str, least: float | None = None) -> float | None:
+    """The number in ``text``, or None for ``word``."""
+    if text == word:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        raise MitsimError(f"{option} {text!r}: give a number or {word}") from None
+    if least is not None and not least <= value < float("inf"):
+        raise MitsimError(f"{option} {text}: give a finite number of at least {least:g}, or {word}")
+    return value
+
+
+@contextmanager
+def _progress(silent: bool) -> Iterator[Callable[[str, float], None]]:
+    """A progress bar on stderr; nothing when asked to be quiet."""
+    if silent:
+        yield lambda stage, fraction: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+
+
+def _print_plan(made: Any) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"Effect plan at accuracy {made.accuracy:g}")
+    for heading in ("effect", "state", "reason", "error if off", "seconds"):
+        table.add_column(heading, justify="right" if heading in ("error if off", "seconds") else "left")
+    for effect in made.effects:
+        error = "-" if effect.error_if_off is None else f"{effect.error_if_off:.1e}"
+        table.add_row(effect.name, effect.state, effect.reason, error, f"{effect.seconds:.2f}")
+    console = Console()
+    console.print(table)
+    console.print(f"Predicted time for transport and optics: {made.predicted_seconds:.2f} s")
+
+
+def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
+    """Print the result; exit status 1 when there are warnings."""
+    if as_json:
+        from mitsim.core.manifest import plain
+
+        print(json.dumps(plain(payload), allow_nan=False))
+    else:
+        for line in lines:
+            print(line)
+    for warning in warnings:
+        print(f"mitsim: warning: {warning}", file=sys.stderr)
+    return 1 if warnings else 0
+
+
+if __name__ == "__main__":
+    main()
