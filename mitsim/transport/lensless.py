@@ -68,11 +68,7 @@ def register() -> None:
 
 
 def _geometry(props: Any, size: Any) -> CameraGeometry:
-    values = {
-        name: props[name]
-        for name in CameraGeometry.model_fields
-        if name != "pixels" and name in props
-    }
+    values = {name: props[name] for name in CameraGeometry.model_fields if name != "pixels" and name in props}
     if size[0] != size[1]:
         raise MitsimError(f"{PLUGIN}: film is {size[0]}x{size[1]} pixels; the sensor must be square")
     return CameraGeometry.checked(PLUGIN, pixels=int(size[0]), **values)
@@ -100,9 +96,7 @@ def _sensor_class() -> type:
             self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
         ) -> tuple[Any, Any]:
             geometry = self.geometry
-            wavelengths, spectral_weight = self.sample_wavelengths(
-                dr.zeros(mi.SurfaceInteraction3f), sample1, active
-            )
+            wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             u = (1 - 2 * sample2) * geometry.half_width
             t = (1 - 2 * sample3) * geometry.tan_half_fov
             squared = 1 + dr.squared_norm(t)

@@ -9,7 +9,17 @@ from mitsim.core.errors import MitsimError
 from mitsim.scene import patterns
 from mitsim.scene.patterns import hadamard_matrix, hadamard_orders, parse_patterns
 
-FAMILIES = ["uniform", "dots:1", "dots:3", "dots:5", "dots:16", "hadamard:1", "hadamard:4", "hadamard:12", "random:5"]
+FAMILIES = [
+    "uniform",
+    "dots:1",
+    "dots:3",
+    "dots:5",
+    "dots:16",
+    "hadamard:1",
+    "hadamard:4",
+    "hadamard:12",
+    "random:5",
+]
 
 
 @pytest.mark.parametrize("n", [16, 23])
@@ -70,7 +80,9 @@ def test_dots_are_the_papers_grid_of_every_kth_pixel() -> None:
 def test_hadamard_repeats_its_matrix_and_the_halves_complement() -> None:
     family = parse_patterns("hadamard:4", 10)
     assert family.signed
-    assert np.array_equal(family.left[4:8], family.left[:4]) and np.array_equal(family.left[8:], family.left[:2])
+    assert np.array_equal(family.left[4:8], family.left[:4]) and np.array_equal(
+        family.left[8:], family.left[:2]
+    )
     first, second = family.captures[6:8]
     assert (first.row, first.column) == (second.row, second.column) and (first.sign, second.sign) == (1, -1)
     assert np.array_equal(family.light(first) + family.light(second), np.ones((10, 10)))

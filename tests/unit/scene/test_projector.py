@@ -1,0 +1,120 @@
+"""The projector's window and where it lands, against a pinhole projector written out by hand."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.scene.load import load_scene
+from mitsim.scene.projector import ProjectorGrid
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, Z = 16, 400.0
+# uv comes back from Mitsuba in float32: 6e-8 of a canvas that spans 0.6 in tan-angle, a few roundings.
+FLOAT32 = 5e-7
+
+
+def by_hand(axis: str, degrees: float) -> np.ndarray:
+    """(2, 2, 2) tan-angles (row, column) of the window's corners for a projector turned about its own axis."""
+    angle = np.radians(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    turn = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}[axis]
+    reach = np.tan(np.radians(33.398488) / 2)
+    corners = np.empty((2, 2, 2))
+    for i, v in enumerate((0.0, 1.0)):
+        for j, u in enumerate((0.5, 1.0)):  # the window is the right half of a canvas twice as wide as high
+            ray = np.array(turn) @ [(1 - 2 * u) * reach, (1 - 2 * v) * reach / 2, 1.0]
+            x, y, _ = [60.0, 0.0, 0.0] + ray * Z / ray[2]
+            corners[i, j] = -y / Z, -x / Z
+    return corners
+
+
+def grid_of(path: Path) -> ProjectorGrid:
+    return load_scene(path).pixels
+
+
+def test_a_shifted_lens_casts_its_window_squarely(small_scene: Callable[..., Path]) -> None:
+    grid = grid_of(small_scene())
+    assert (grid.n, grid.first_row, grid.first_column, grid.canvas) == (N, 0, N, (N, 2 * N))
+    assert grid.row_tan == pytest.approx((-0.15, 0.15), abs=FLOAT32)
+    assert grid.column_tan == pytest.approx((-0.15, 0.15), abs=FLOAT32)
+    assert grid.keystone == 0
+
+
+def test_a_window_inside_its_canvas_is_found_with_its_offset(small_scene: Callable[..., Path]) -> None:
+    canvas = np.zeros((N, 2 * N))
+    canvas[3:11, 20:28] = 255
+    grid = grid_of(small_scene(canvas=canvas))
+    assert (grid.n, grid.first_row, grid.first_column) == (8, 3, 20)
+    # Canvas texel r spans tan-angles -0.15 + 0.3 r / 16; column 16 of the canvas is the left edge of the plain window.
+    assert grid.row_tan == pytest.approx((-0.15 + 0.3 * 3 / 16, -0.15 + 0.3 * 11 / 16), abs=FLOAT32)
+    assert grid.column_tan == pytest.approx((-0.15 + 0.3 * 4 / 16, -0.15 + 0.3 * 12 / 16), abs=FLOAT32)
+
+
+@pytest.mark.parametrize(("axis", "degrees"), [("y", 5.0), ("y", -3.0), ("x", -5.0), ("x", 2.0)])
+def test_a_turned_projector_casts_a_keystone(
+    small_scene: Callable[..., Path], axis: str, degrees: float
+) -> None:
+    grid = grid_of(small_scene(projector_turn=f'<rotate {axis}="1" angle="{degrees}"/>'))
+    corners = by_hand(axis, degrees)
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    assert grid.row_tan == pytest.approx((low[0], high[0]), abs=FLOAT32)
+    assert grid.column_tan == pytest.approx((low[1], high[1]), abs=FLOAT32)
+    box = np.stack(np.meshgrid([low[0], high[0]], [low[1], high[1]], indexing="ij"), axis=-1)
+    assert grid.keystone == pytest.approx(np.abs((corners - box) / (high - low)).max() * N, abs=1e-3)
+    assert grid.keystone > 0.05
+
+
+def test_the_hand_written_projector_is_the_plain_one_when_not_turned() -> None:
+    corners = by_hand("y", 0.0)
+    assert np.allclose(corners[0, 0], [-0.15, -0.15]) and np.allclose(corners[1, 1], [0.15, 0.15])
+
+
+def test_the_grid_moves_with_the_rig(small_scene: Callable[..., Path]) -> None:
+    # A quarter turn about y and a shift, of camera, projector and sheet together.
+    grid = grid_of(small_scene(rig="0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"))
+    assert grid.row_tan == pytest.approx((-0.15, 0.15), abs=4 * FLOAT32)
+    assert grid.column_tan == pytest.approx((-0.15, 0.15), abs=4 * FLOAT32)
+    assert grid.keystone == 0
+
+
+def test_no_bitmap(small_scene: Callable[..., Path]) -> None:
+    path = small_scene()
+    text = path.read_text()
+    start, end = text.index('<texture name="irradiance"'), text.index("</texture>") + len("</texture>")
+    path.write_text(text[:start] + '<spectrum name="irradiance" value="1"/>' + text[end:])
+    with pytest.raises(MitsimError, match=f"{path}: .*not a bitmap"):
+        grid_of(path)
+
+
+def hollow() -> np.ndarray:
+    canvas = np.zeros((N, 2 * N))
+    canvas[:, N:] = 255
+    canvas[5, 20] = 0
+    return canvas
+
+
+def oblong() -> np.ndarray:
+    canvas = np.zeros((N, 2 * N))
+    canvas[:8, N:] = 255
+    return canvas
+
+
+@pytest.mark.parametrize(
+    ("canvas", "fragment"),
+    [
+        (np.zeros((N, 2 * N)), "all black"),
+        (oblong(), "8x16 and must fill a square"),
+        (hollow(), "must fill a square"),
+    ],
+    ids=["black", "oblong", "hollow"],
+)
+def test_a_window_that_is_no_filled_square_is_refused(
+    small_scene: Callable[..., Path], canvas: np.ndarray, fragment: str
+) -> None:
+    path = small_scene(canvas=canvas)
+    with pytest.raises(MitsimError, match=fragment) as caught:
+        grid_of(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
