@@ -31,12 +31,8 @@ Variant = Annotated[str, typer.Option(help="Mitsuba variant: llvm_ad_mono, llvm_
 Seed = Annotated[int, typer.Option(help="root of every random stream")]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
 Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", metavar="FILE.toml")]
-ProjectorFile = Annotated[
-    Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")
-]
-Defines = Annotated[
-    list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")
-]
+ProjectorFile = Annotated[Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")]
+Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
 Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
 
 
@@ -113,7 +109,8 @@ def plan(
     from mitsim.capture.light import make_plan
 
     bench = _bench(scene, variant, camera, projector, define)
-    made = make_plan(bench, *bench.family(patterns, seed).classes(), accuracy, seed)
+    labels, weights = bench.family(patterns, seed).classes()
+    made = make_plan(bench, labels, weights, accuracy, seed)
     payload = {
         "effects": [asdict(effect) for effect in made.effects],
         "accuracy": made.accuracy,
@@ -191,7 +188,7 @@ def calibrate(
         bench = _bench(scene, variant, camera, projector, define)
         result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress)
     lines = [
-        f"{result.frames} frames of {result.n} x {result.n} stripes in {result.seconds['total']:.1f} s: {result.output}",
+        f"{result.frames} frames of {result.n} stripes in {result.seconds['total']:.1f} s: {result.output}",
         f"separability residual {result.separability_residual:.2%} ({result.noise_free_residual:.1e} without noise), "
         f"factor error {result.phi_error:.1e}, condition {result.condition:.2e}",
     ]
@@ -205,9 +202,7 @@ def reconstruct(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="folder for the image [RUN/reconstruction]")
     ] = None,
-    lam: Annotated[
-        str, typer.Option("--lambda", help="regularisation, or auto", metavar="auto|VALUE")
-    ] = "auto",
+    lam: Annotated[str, typer.Option("--lambda", help="regularisation, or auto", metavar="auto|VALUE")] = "auto",
     method: Annotated[str, typer.Option(help="tikhonov or tv")] = "tikhonov",
     variant: Variant = "llvm_ad_mono",
     as_json: Json = False,
@@ -313,9 +308,7 @@ def _scene(scene: Path) -> Path:
     raise MitsimError(f"{scene}: no such scene file, and no shipped scene of that name; shipped are {known}")
 
 
-def _bench(
-    scene: Path, variant: str, camera: Path | None, projector: Path | None, define: Sequence[str] | None
-) -> Any:
+def _bench(scene: Path, variant: str, camera: Path | None, projector: Path | None, define: Sequence[str] | None) -> Any:
     from mitsim.capture.bench import open_bench
 
     return open_bench(_scene(scene), variant, camera, projector, _defines(define))

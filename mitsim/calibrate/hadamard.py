@@ -205,18 +205,14 @@ def _next(
 ) -> FloatArray:
     response = next(responses, None)
     if response is None:
-        raise MitsimError(
-            f"only {index} {name} responses were given; H has {count} columns, give one for each"
-        )
+        raise MitsimError(f"only {index} {name} responses were given; H has {count} columns, give one for each")
     return _response(response, f"{name} response {index}", shape, centre)
 
 
 def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:
     values = np.asarray(response, dtype=np.float64)
     if values.ndim != 2 or values.size == 0 or (shape is not None and values.shape != shape):
-        raise MitsimError(
-            f"{name} has shape {values.shape}; allowed is {shape or 'a 2-D array'}, as the first"
-        )
+        raise MitsimError(f"{name} has shape {values.shape}; allowed is {shape or 'a 2-D array'}, as the first")
     if not np.isfinite(values).all():
         bad = np.count_nonzero(~np.isfinite(values))
         raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
@@ -229,15 +225,9 @@ def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None,
 def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:
     signs = np.asarray(H, dtype=np.float64)
     if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
-        raise MitsimError(
-            f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard"
-        )
+        raise MitsimError(f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard")
     if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
-        raise MitsimError(
-            f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix"
-        )
+        raise MitsimError(f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix")
     if not has_uniform and not (signs[:, 0] == 1).all():
-        raise MitsimError(
-            "column 0 of H is not all +1 and no uniform response was given; give one of the two"
-        )
+        raise MitsimError("column 0 of H is not all +1 and no uniform response was given; give one of the two")
     return signs

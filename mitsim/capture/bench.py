@@ -1,4 +1,4 @@
-"""An optical bench ready to be used: from a scene file and camera and projector files to one object that holds them all."""
+"""An optical bench, ready to use: scene, camera and projector files in, one object that holds them all out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One exposure setting of a bench's camera: from expected irradiance to noisy digital numbers, and back to electrons a second."""
+"""One exposure setting of a camera: from expected irradiance to digital numbers, and back to electrons a second."""
 
 from __future__ import annotations
 
@@ -92,17 +92,13 @@ class Exposer:
         limit = full if sensor.largest_dn is None else min(full, sensor.largest_dn)
         return bool(digital.max() >= np.floor(limit)) if np.isfinite(limit) else False
 
-    def measurements(
-        self, family: PatternFamily, expected: ExpectedFrames
-    ) -> Iterator[tuple[FloatArray, int, int]]:
+    def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
         """Noisy measurement [electrons / s] of every pattern (i, j); a signed pattern is a difference of two frames."""
         numbered = zip(family.captures, expected, strict=True)
         half: FloatArray | None = None
         with ThreadPoolExecutor(WORKERS) as pool:
             while chunk := list(islice(numbered, 4 * WORKERS)):
-                rates = pool.map(
-                    lambda item: self.rate(self.digital(self.electrons(item[1]), *item[0].names)), chunk
-                )
+                rates = pool.map(lambda item: self.rate(self.digital(self.electrons(item[1]), *item[0].names)), chunk)
                 for (shown, _), rate in zip(chunk, rates, strict=True):
                     if shown.sign == 1:
                         half = rate

@@ -1,4 +1,4 @@
-"""Light for a family of patterns: from a bench and an accuracy to sampled light, frames in closed form, and their error."""
+"""Light for a family of patterns: from a bench and an accuracy to sampled light, its frames and their error."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Light:
 
     def flux(self) -> FloatArray:
         """(projector pixels,) irradiance that each pixel's light casts toward the camera, without the mask."""
-        return sum(self.optics.total(group) for group in self.groups) / len(self.groups)
+        return np.asarray(sum(self.optics.total(group) for group in self.groups) / len(self.groups))
 
 
 def make_plan(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, seed: int) -> Plan:
@@ -108,7 +108,7 @@ def collect(
 ) -> Light:
     """Trace until the Monte Carlo error of the frames meets the plan's target, or the limit of 2^32 paths.
 
-    Each group gets the same number of batches; a few captures of the family, evenly spread, are formed to see the error.
+    Each group gets the same number of batches; a few captures, evenly spread, are formed to see the error.
     """
     grid = grid_for(bench, plan.subdivision)
     tracer = Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid, plan.anchors)
@@ -152,7 +152,7 @@ def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArra
         ).reshape(grid.shape)
         for b in (bench, bench.with_board(board_reflectance))
     ]
-    return np.divide(one[0], one[1], out=np.zeros(grid.shape), where=one[1] > 0)
+    return np.asarray(np.divide(one[0], one[1], out=np.zeros(grid.shape), where=one[1] > 0))
 
 
 def _add(total: sparse.csr_array | None, sample: LightSample) -> sparse.csr_array:

@@ -152,7 +152,13 @@ def render(
     names = ("Y",) if frame.mean.shape[2] == 1 else ("R", "G", "B")
     channels = {name: frame.mean[..., i].astype(np.float32) for i, name in enumerate(names)}
     channels |= {f"error.{name}": frame.error[..., i].astype(np.float32) for i, name in enumerate(names)}
-    metadata = {"unit": "W/m^2", "estimator": estimator, "seed": seed, "variant": variant, **versions()}
+    metadata: dict[str, str | int | float] = {
+        "unit": "W/m^2",
+        "estimator": estimator,
+        "seed": seed,
+        "variant": variant,
+        **versions(),
+    }
     write_frame(path, channels, metadata)
     return RenderResult(
         estimator=estimator,

@@ -126,6 +126,18 @@ def capture(
     return result
 
 
+@dataclass(frozen=True, eq=False)
+class _Exposed:
+    """One captured frame: expected electrons, digital numbers, and the two noises [electrons, rms]."""
+
+    index: int
+    shown: Capture
+    electrons: FloatArray
+    digital: Digital
+    rendering_noise: float
+    sensor_noise: float
+
+
 class _Writer:
     """Turns expected frames into noisy ones and writes them; frames already there from the same run are kept."""
 
@@ -153,39 +165,44 @@ class _Writer:
                     exposed = list(pool.map(self._expose, chunk))
                 with clock.stage("write"):
                     list(pool.map(self._write, exposed))
-                for _, _, electrons, _, rendering, noise, full in exposed:
-                    self.noise_ratio = max(self.noise_ratio, rendering / noise)
-                    self.saturated += full
-                    self._noise_energy += noise**2 * electrons.size
-                    self._energy += float(np.square(electrons).sum())
+                for frame in exposed:
+                    self.noise_ratio = max(self.noise_ratio, frame.rendering_noise / frame.sensor_noise)
+                    self.saturated += self.exposer.saturated(frame.digital)
+                    self._noise_energy += frame.sensor_noise**2 * frame.electrons.size
+                    self._energy += float(np.square(frame.electrons).sum())
                 progress("frames", (chunk[-1][0] + 1) / total)
 
-    def _expose(
-        self, item: tuple[int, tuple[Capture, Frame]]
-    ) -> tuple[int, Capture, FloatArray, Digital, float, float, bool]:
+    def _expose(self, item: tuple[int, tuple[Capture, Frame]]) -> _Exposed:
         index, (shown, frame) = item
         electrons = self.exposer.electrons(frame)
-        digital = self.exposer.digital(electrons, *shown.names)
-        noise = self.exposer.rendering_noise(frame), self.exposer.sensor_noise(electrons)
-        return index, shown, electrons, digital, *noise, self.exposer.saturated(digital)
+        return _Exposed(
+            index=index,
+            shown=shown,
+            electrons=electrons,
+            digital=self.exposer.digital(electrons, *shown.names),
+            rendering_noise=self.exposer.rendering_noise(frame),
+            sensor_noise=self.exposer.sensor_noise(electrons),
+        )
 
-    def _write(self, item: tuple[int, Capture, FloatArray, Digital, float, float, bool]) -> None:
-        index, shown, electrons, digital, rendering, _, _ = item
-        path = self.folder / frame_name(index)
-        if _is_kept(path, self.digest, index):
+    def _write(self, frame: _Exposed) -> None:
+        path = self.folder / frame_name(frame.index)
+        if _is_kept(path, self.digest, frame.index):
             return
-        metadata = {
+        metadata: dict[str, str | int | float] = {
             "run": self.digest,
-            "index": index,
-            "row": shown.row,
-            "column": shown.column,
-            "sign": shown.sign,
+            "index": frame.index,
+            "row": frame.shown.row,
+            "column": frame.shown.column,
+            "sign": frame.shown.sign,
             "exposure_s": self.exposer.exposure_s,
-            "rendering_noise_e": rendering,
+            "rendering_noise_e": frame.rendering_noise,
             "seed": self.exposer.seed,
         }
-        dn = digital if digital.dtype == np.uint32 else digital.astype(np.float32)
-        write_frame(path, {"DN": dn, "electrons": electrons.astype(np.float32)}, metadata)
+        electrons = frame.electrons.astype(np.float32)
+        if frame.digital.dtype == np.uint32:
+            write_frame(path, {"DN": frame.digital.astype(np.uint32), "electrons": electrons}, metadata)
+        else:
+            write_frame(path, {"DN": frame.digital.astype(np.float32), "electrons": electrons}, metadata)
 
 
 def frame_name(index: int) -> str:

@@ -1,8 +1,8 @@
 """A rendered Hadamard calibration session on a white board: from a bench to the camera's responses to striped light.
 
-The paper's procedure (section IV-A): every column h_i of a Hadamard matrix is shown as horizontal stripes h_i 1^T and as
-vertical ones 1 h_i^T, each +-1 pattern as two captures (or one and a uniform frame), all at one exposure, with sensor
-noise. When n is no Hadamard order the next one is used and its first n rows: rows stay orthogonal.
+The paper's procedure (section IV-A): every column h_i of a Hadamard matrix is shown as horizontal stripes h_i 1^T and
+as vertical ones 1 h_i^T, each +-1 pattern as two captures (or one and a uniform frame), all at one exposure, with
+sensor noise. When n is no Hadamard order the next one is used and its first n rows: rows stay orthogonal.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Session:
         return 2 * len(self.weights)
 
     def noisy(self) -> tuple[Iterator[FloatArray], Iterator[FloatArray]]:
-        """Responses [electrons / s] to horizontal and to vertical +-1 stripes, from noisy frames, read one at a time."""
+        """Responses [electrons / s] to horizontal and vertical +-1 stripes, from noisy frames, one at a time."""
         horizontal, vertical = (self._signed(self._noisy(side)) for side in SIDES)
         return horizontal, vertical
 

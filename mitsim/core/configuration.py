@@ -21,9 +21,7 @@ def shipped(*parts: str) -> Path:
     "imx249.toml")`. Raises MitsimError when it is not there (mitsim installed without its source tree)."""
     path = Path(__file__).resolve().parents[2].joinpath(*parts)
     if not path.exists():
-        raise MitsimError(
-            f"{'/'.join(parts)}: not found at {path}; run mitsim from its source tree (`make setup`)"
-        )
+        raise MitsimError(f"{'/'.join(parts)}: not found at {path}; run mitsim from its source tree (`make setup`)")
     return path
 
 

@@ -70,9 +70,7 @@ def load_variant(name: str) -> ModuleType:
     try:
         mitsuba.set_variant(name)
     except ImportError as error:
-        raise MitsimError(
-            f"variant {name}: cannot be loaded ({_one_line(error)}); run: mitsim doctor"
-        ) from error
+        raise MitsimError(f"variant {name}: cannot be loaded ({_one_line(error)}); run: mitsim doctor") from error
     module: ModuleType = mitsuba
     return module
 
@@ -81,9 +79,7 @@ def doctor() -> list[Check]:
     """All checks in order. What can crash or hang runs in child processes; takes some ten seconds."""
     checks = [_python(), _llvm(), _child("mitsuba", "import mitsuba", "imports", _reinstall("mitsuba"))]
     mend = _reinstall("mitsuba") if checks[1].ok else checks[1].remedy
-    checks += [
-        _child(f"render {name}", _RENDER.format(name=name), "renders a test image", mend) for name in VARIANTS
-    ]
+    checks += [_child(f"render {name}", _RENDER.format(name=name), "renders a test image", mend) for name in VARIANTS]
     checks += [_openexr(), _kernel_cache()]
     checks.append(_child("matplotlib", _FIGURE, "draws without a display", _reinstall("matplotlib")))
     return checks

@@ -67,9 +67,7 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
         with _open(path) as file:
             header = file.header()
             # Both are emptied when the file closes, so they are copied here.
-            metadata = {
-                key[len(_PREFIX) :]: json.loads(header[key]) for key in header if key.startswith(_PREFIX)
-            }
+            metadata = {key[len(_PREFIX) :]: json.loads(header[key]) for key in header if key.startswith(_PREFIX)}
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError) as error:
         raise MitsimError(
@@ -96,22 +94,16 @@ def _check_channels(channels: Mapping[str, Channel]) -> None:
         raise ValueError("write_frame: no channels given; a frame needs at least one")
     shapes = {np.shape(values) for values in channels.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
-        raise ValueError(
-            f"write_frame: channel shapes are {sorted(shapes)}; all must be one non-empty 2-D shape"
-        )
+        raise ValueError(f"write_frame: channel shapes are {sorted(shapes)}; all must be one non-empty 2-D shape")
     for name, values in channels.items():
         if np.asarray(values).dtype not in (np.float32, np.uint32):
-            raise TypeError(
-                f"write_frame: channel {name!r} is {np.asarray(values).dtype}; make it float32 or uint32"
-            )
+            raise TypeError(f"write_frame: channel {name!r} is {np.asarray(values).dtype}; make it float32 or uint32")
 
 
 def _scalar(value: Value) -> Value:
     plain: Any = value.item() if isinstance(value, np.generic) else value
     if not isinstance(plain, (str, int, float)):
-        raise TypeError(
-            f"write_frame: metadata value {value!r} is {type(value).__name__}; use str, int or float"
-        )
+        raise TypeError(f"write_frame: metadata value {value!r} is {type(value).__name__}; use str, int or float")
     return plain
 
 

@@ -109,9 +109,7 @@ def find_llvm() -> Path:
             return path
         tried.append(f"{path} {result.detail}")
     seen = "; ".join(tried) if tried else "none found"
-    raise MitsimError(
-        f"LLVM: no usable library of version {OLDEST} or newer ({seen}); run: {install_command()}"
-    )
+    raise MitsimError(f"LLVM: no usable library of version {OLDEST} or newer ({seen}); run: {install_command()}")
 
 
 def select_llvm() -> Path:

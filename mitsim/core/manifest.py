@@ -65,9 +65,7 @@ def read_json(path: Path | str) -> Any:
         raise MitsimError(f"file {path}: not valid JSON ({error}); write or copy it again") from error
 
 
-def prepare_output(
-    path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder"
-) -> Path:
+def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> Path:
     """Make sure, before any work, that output can be written to `path`; returns it as a Path.
 
     A folder is created if its parent exists. Nothing is deleted: `overwrite` only allows a folder that
@@ -76,9 +74,7 @@ def prepare_output(
     """
     path = Path(path)
     if not path.parent.is_dir():
-        raise MitsimError(
-            f"output {path}: the folder {path.parent} does not exist; create it or choose another"
-        )
+        raise MitsimError(f"output {path}: the folder {path.parent} does not exist; create it or choose another")
     if kind == "file":
         _prepare_file(path, overwrite)
     else:
@@ -112,9 +108,7 @@ def _prepare_folder(path: Path, overwrite: bool) -> None:
         path.mkdir(exist_ok=True)
         occupied = any(path.iterdir())
     except OSError as error:
-        raise MitsimError(
-            f"output {path}: cannot be used ({error.strerror}); choose another place"
-        ) from error
+        raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
     if occupied and not overwrite:
         raise MitsimError(f"output {path}: the folder holds files already; choose a new one or empty it")
     _try_writing(path, path)

@@ -26,9 +26,7 @@ def integer(root: int, *names: str | int) -> int:
 
 def _sequence(root: int, purpose: str, names: tuple[str | int, ...]) -> np.random.SeedSequence:
     if not 0 <= root < _LARGEST_ROOT:
-        raise MitsimError(
-            f"seed: got {root}; allowed are whole numbers from 0 to 2^64 - 1; pass another --seed"
-        )
+        raise MitsimError(f"seed: got {root}; allowed are whole numbers from 0 to 2^64 - 1; pass another --seed")
     digest = hashlib.sha256()
     # Type and length go in as well, so that ("a", "b"), ("ab",), (1,) and ("1",) are four different names.
     for name in (purpose, *names):

@@ -33,9 +33,7 @@ class CameraGeometry(BaseModel):
     mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
     mask_feature: float = Field(0.06, gt=0, description="mask feature size [mm]")
     mask_distance: float = Field(2.0, gt=0, description="sensor to mask [mm]")
-    scene_distance: float = Field(
-        400.0, gt=0, description="sensor to the plane that the rig is aligned to [mm]"
-    )
+    scene_distance: float = Field(400.0, gt=0, description="sensor to the plane that the rig is aligned to [mm]")
     fov: float = Field(20.0, gt=0, lt=180, description="full angle of the square field stop [degrees]")
 
     @model_validator(mode="after")
@@ -91,8 +89,7 @@ class CameraGeometry(BaseModel):
             return cache[key]
 
         return [
-            (weight * factor(rows, row_edges), factor(columns, column_edges))
-            for weight, rows, columns in mask.terms
+            (weight * factor(rows, row_edges), factor(columns, column_edges)) for weight, rows, columns in mask.terms
         ]
 
 

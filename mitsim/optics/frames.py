@@ -111,9 +111,9 @@ class ExpectedFrames:
     projector pixels that a family always lights together. A family with too many classes is formed capture by capture
     and never held in memory as a whole.
 
-    With one group there is no variance to tell, and it is 0. Otherwise it is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``. Squared norms are estimated
-    without bias from products with random signs (Hutchinson's estimator), because forming G times as many frames would
-    cost more than the frames themselves.
+    The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``; with one group there is
+    none to tell, and it is 0. Squared norms are estimated without bias from products with random signs (Hutchinson's
+    estimator), because forming G times as many frames would cost more than the frames themselves.
     """
 
     def __init__(
@@ -200,9 +200,7 @@ def _row(matrix: sparse.csr_array, row: int) -> tuple[npt.NDArray[np.int64], Flo
     return matrix.indices[inside].astype(np.int64), matrix.data[inside]
 
 
-def _aligned(
-    flat: npt.NDArray[np.int64], parts: Sequence[tuple[npt.NDArray[np.int64], FloatArray]]
-) -> FloatArray:
+def _aligned(flat: npt.NDArray[np.int64], parts: Sequence[tuple[npt.NDArray[np.int64], FloatArray]]) -> FloatArray:
     """(groups, len(flat)) values of each group at the places of their mean, which holds every place of each."""
     order = np.argsort(flat)
     values = np.zeros((len(parts), len(flat)))

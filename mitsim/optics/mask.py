@@ -92,7 +92,5 @@ def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int 
     The polynomial and phase matter: another sequence moves the system's condition number by tens of percent.
     """
     if isinstance(order, bool) or not isinstance(order, int) or not 2 <= order <= 16:
-        raise MitsimError(
-            f"mask order is {order!r}; give a whole number from 2 to 16 (2**order - 1 features a side)"
-        )
+        raise MitsimError(f"mask order is {order!r}; give a whole number from 2 to 16 (2**order - 1 features a side)")
     return Mask(kind, feature_mm, max_len_seq(order)[0].astype(np.int8))

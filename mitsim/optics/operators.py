@@ -58,9 +58,7 @@ class SeparableSum:
     def __post_init__(self) -> None:
         shapes = {(term.input_shape, term.output_shape) for term in self.terms}
         if len(shapes) != 1:
-            raise MitsimError(
-                f"separable terms of {len(shapes)} shapes cannot be added; give terms of one shape"
-            )
+            raise MitsimError(f"separable terms of {len(shapes)} shapes cannot be added; give terms of one shape")
 
     @property
     def input_shape(self) -> tuple[int, int]:

@@ -23,9 +23,7 @@ FloatArray = npt.NDArray[np.float64]
 def centred_edges(count: int, pitch: float) -> FloatArray:
     """(count + 1,) edges of ``count`` equal cells centred on zero, in the unit of ``pitch``."""
     if count < 1 or not (np.isfinite(pitch) and pitch > 0):
-        raise MitsimError(
-            f"a grid of {count} cells of size {pitch} is empty; give at least 1 cell and a size above 0"
-        )
+        raise MitsimError(f"a grid of {count} cells of size {pitch} is empty; give at least 1 cell and a size above 0")
     return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)
 
 
@@ -65,18 +63,12 @@ def shadow_factor(
     """
     values = np.asarray(profile, dtype=np.float64)
     if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
-        raise MitsimError(
-            f"mask profile of shape {values.shape}; give a non-empty 1-D list of finite numbers"
-        )
+        raise MitsimError(f"mask profile of shape {values.shape}; give a non-empty 1-D list of finite numbers")
     _require_positive("mask feature size", feature_mm)
     _require_positive("distance from sensor to mask", mask_distance_mm)
     if not depth_mm > mask_distance_mm:
-        raise MitsimError(
-            f"scene depth is {depth_mm} mm; it must lie beyond the mask at {mask_distance_mm} mm"
-        )
-    pixels = (
-        _checked_edges("sensor pixel edges", pixel_edges_mm) * (1 - mask_distance_mm / depth_mm) / feature_mm
-    )
+        raise MitsimError(f"scene depth is {depth_mm} mm; it must lie beyond the mask at {mask_distance_mm} mm")
+    pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * (1 - mask_distance_mm / depth_mm) / feature_mm
     cells = _checked_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
     return _trapezoid_mean(values, pixels, cells)
 
@@ -129,9 +121,7 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
 def _checked_edges(name: str, edges: npt.ArrayLike) -> FloatArray:
     array = np.asarray(edges, dtype=np.float64)
     if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all() or not (np.diff(array) > 0).all():
-        raise MitsimError(
-            f"{name} of shape {array.shape} are not at least 2 finite increasing numbers; sort them"
-        )
+        raise MitsimError(f"{name} of shape {array.shape} are not at least 2 finite increasing numbers; sort them")
     return array
 
 

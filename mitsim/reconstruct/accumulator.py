@@ -74,13 +74,9 @@ class Accumulator:
         rows, columns = self._seen.shape
         whole = all(isinstance(k, (int, np.integer)) and not isinstance(k, bool) for k in (row, column))
         if not (whole and 0 <= row < rows and 0 <= column < columns):
-            raise MitsimError(
-                f"pattern index is ({row}, {column}); allowed are 0 to {rows - 1} and 0 to {columns - 1}"
-            )
+            raise MitsimError(f"pattern index is ({row}, {column}); allowed are 0 to {rows - 1} and 0 to {columns - 1}")
         if self._seen[row, column]:
-            raise MitsimError(
-                f"frame of pattern ({row}, {column}) was added before; average repeated captures first"
-            )
+            raise MitsimError(f"frame of pattern ({row}, {column}) was added before; average repeated captures first")
 
     def _checked(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
         values = np.asarray(frame)

@@ -77,9 +77,7 @@ def noise_variance(spectrum: Spectrum) -> float:
     """Mean noise variance of one datum [data unit squared], from the energy outside the model's range."""
     spare = spectrum.data_count - np.count_nonzero(spectrum.sigma)
     if spare <= 0:
-        raise MitsimError(
-            "there are no more data than unknowns, so noise cannot be told; give lambda as a number"
-        )
+        raise MitsimError("there are no more data than unknowns, so noise cannot be told; give lambda as a number")
     inside = np.square(spectrum.projected[spectrum.sigma > 0]).sum()
     return max(spectrum.energy - float(inside), 0.0) / spare
 

@@ -50,9 +50,7 @@ class Measurements:
                 continue
             yield waiting.pop(index, 0.0) + frame, *index
         if waiting:
-            raise MitsimError(
-                f"{self.folder}: pattern {next(iter(waiting))} has only one of its two captures"
-            )
+            raise MitsimError(f"{self.folder}: pattern {next(iter(waiting))} has only one of its two captures")
 
     def _rate(self, name: str) -> FloatArray:
         path = self.folder / name
@@ -113,13 +111,9 @@ def read_calibration(folder: Path | str) -> Factors:
     for name in ("left", "right"):
         channels, _ = read_frame(folder / f"{name}.exr")
         if "factor" not in channels:
-            raise MitsimError(
-                f"{folder}/{name}.exr: channels are {', '.join(channels)}; a calibration has factor"
-            )
+            raise MitsimError(f"{folder}/{name}.exr: channels are {', '.join(channels)}; a calibration has factor")
         factors.append(channels["factor"].astype(np.float64))
-    return Factors(
-        factors[0], factors[1], _section(manifest, folder, "camera"), bool(manifest.get("centre", False))
-    )
+    return Factors(factors[0], factors[1], _section(manifest, folder, "camera"), bool(manifest.get("centre", False)))
 
 
 def check_fit(run: Measurements, factors: Factors, calibration: Path | str) -> None:
@@ -145,9 +139,7 @@ def load(run: Measurements, factors: Factors) -> tuple[Prepared, Accumulator]:
     return prepared, frames
 
 
-def solve(
-    prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], method: str
-) -> Solution | TVSolution:
+def solve(prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], method: str) -> Solution | TVSolution:
     """The image by ``tikhonov`` (closed form) or ``tv``; for TV ``lam`` is the weight of the total variation."""
     if method == "tikhonov":
         return prepared.solve(frames, lam)

@@ -106,15 +106,11 @@ class Prepared:
         MitsimError when frames are missing: the closed form holds for all patterns or none.
         """
         if not frames.belongs_to(self.left, self.right):
-            raise MitsimError(
-                "frames were added to an accumulator of other factors; use this one's accumulator()"
-            )
+            raise MitsimError("frames were added to an accumulator of other factors; use this one's accumulator()")
         missing = frames.missing
         if missing:
             total = self.left.pattern_count * self.right.pattern_count
-            raise MitsimError(
-                f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all"
-            )
+            raise MitsimError(f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all")
         sigma = np.outer(self.left.singular, self.right.singular)
         projected = frames.sum
         if self.method == "gram":
@@ -234,7 +230,7 @@ def prepare(
     if centre:
         factors = [centred_columns(factor) for factor in factors]
     blocks = [_blocks(patterns[0], structure)]
-    blocks.append(blocks[0] if np.array_equal(*patterns) else _blocks(patterns[1], structure))
+    blocks.append(blocks[0] if np.array_equal(patterns[0], patterns[1]) else _blocks(patterns[1], structure))
 
     def side(index: int) -> Side:
         return factorise(factors[index], patterns[index], blocks[index], method, structure, centre)

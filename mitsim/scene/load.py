@@ -54,9 +54,7 @@ def check_file(path: Path, defines: Mapping[str, str]) -> None:
             f"{path}:{line}: not well-formed XML (column {column}: {str(error).split(':')[0]}); mend the file"
         ) from None
     except DefusedXmlException as error:
-        raise MitsimError(
-            f"{path}: DTDs and entities are not allowed in a scene ({error}); remove them"
-        ) from None
+        raise MitsimError(f"{path}: DTDs and entities are not allowed in a scene ({error}); remove them") from None
     except (OSError, UnicodeDecodeError) as error:
         raise MitsimError(f"{path}: cannot be read ({error}); check the file") from None
     if root.tag != "scene":
@@ -70,9 +68,7 @@ def check_file(path: Path, defines: Mapping[str, str]) -> None:
             )
 
 
-def load_scene(
-    path: Path, defines: Mapping[str, str] | None = None, needs_projector: bool = True
-) -> LoadedScene:
+def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_projector: bool = True) -> LoadedScene:
     """Load a scene XML into the current variant; the plugin ``mitsim_lensless`` must be registered.
 
     Raises
@@ -90,9 +86,7 @@ def load_scene(
         raise MitsimError(f"{path}: Mitsuba refuses the scene: {_one_line(error)}") from None
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
-        raise MitsimError(
-            f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one'
-        )
+        raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
     emitters = list(scene.emitters())
     projectors = [emitter for emitter in emitters if emitter.class_name() == "Projector"]
     if not needs_projector:

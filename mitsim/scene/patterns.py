@@ -1,7 +1,7 @@
 """Pattern families: from a name such as ``dots:7`` to the factors P_L, P_R and the captures that show every pattern.
 
-Pattern (i, j) is ``P_L[:, i] P_R[:, j]^T`` over the projector's n x n pixels (paper, section III-B). A family with values
-+-1 cannot be projected as it is: each of its patterns is captured twice, as (1 + P)/2 and (1 - P)/2, and the
+Pattern (i, j) is ``P_L[:, i] P_R[:, j]^T`` over the projector's n x n pixels (paper, section III-B). A family with
+values +-1 cannot be projected as it is: each of its patterns is captured twice, as (1 + P)/2 and (1 - P)/2, and the
 measurement is the difference.
 """
 
@@ -65,16 +65,13 @@ class PatternFamily:
         """Every frame to project, row-major over (i, j); a positive half is followed by its negative half."""
         signs = (1, -1) if self.signed else (0,)
         return tuple(
-            Capture(i, j, sign)
-            for i in range(self.left.shape[1])
-            for j in range(self.right.shape[1])
-            for sign in signs
+            Capture(i, j, sign) for i in range(self.left.shape[1]) for j in range(self.right.shape[1]) for sign in signs
         )
 
     def light(self, capture: Capture) -> npt.NDArray[np.float64]:
         """(n, n) fraction 0..1 of full power that each projector pixel emits in one capture."""
         pattern = np.outer(self.left[:, capture.row], self.right[:, capture.column]).astype(np.float64)
-        return pattern if capture.sign == 0 else (1 + capture.sign * pattern) / 2
+        return np.asarray(pattern if capture.sign == 0 else (1 + capture.sign * pattern) / 2)
 
     def classes(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
         """Finest partition of the pixels whose members are always lit alike: labels (n * n,) and weights.
@@ -97,16 +94,16 @@ class PatternFamily:
 
 def shifting_dots(n: int, k: int) -> IntArray:
     """(n, k): column i lights every k-th pixel from i on; n need not be a multiple of k."""
-    return (np.arange(n)[:, None] % k == np.arange(k)[None, :]).astype(np.int8)
+    return np.asarray(np.arange(n)[:, None] % k == np.arange(k)[None, :], dtype=np.int8)
 
 
 def repeated_hadamard(n: int, k: int) -> IntArray:
     """(n, k): rows of the order-k Hadamard matrix, repeated down the grid."""
-    return hadamard_matrix(k)[np.arange(n) % k]
+    return np.asarray(hadamard_matrix(k)[np.arange(n) % k])
 
 
 def random_binary(n: int, k: int, seed: int, side: str) -> IntArray:
-    """(n, k) fair coin flips, each pixel lit by at least one column (the paper asks that the union covers the scene)."""
+    """(n, k) fair coin flips, each pixel lit by at least one column: the union must cover the scene."""
     rng = stream(seed, "patterns", "random", side)
     bits = rng.integers(0, 2, size=(n, k), dtype=np.int8)
     dark = np.flatnonzero(~bits.any(axis=1))

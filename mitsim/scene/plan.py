@@ -39,8 +39,8 @@ class Plan:
     """Settings of the factored estimator for one capture, with their reasons.
 
     ``anchors`` a side of the sensor, ``subdivision`` cells a side of a projector pixel, ``depth`` [mm] of the light,
-    ``sampling_target`` relative Monte Carlo error at which sampling stops, ``systematic_error`` what the discretisations
-    are predicted to leave. ``warnings`` say why a result will be flagged.
+    ``sampling_target`` relative Monte Carlo error at which sampling stops, ``systematic_error`` what the
+    discretisations are predicted to leave. ``warnings`` say why a result will be flagged.
     """
 
     accuracy: float
@@ -87,8 +87,8 @@ def decide(
 ) -> Plan:
     """Choose anchors and cells for ``accuracy``.
 
-    ``anchor_error`` by anchors a side; ``cell_error``, ``sampling_error`` (one path a cell) and ``cells`` (number in the
-    grid) by cells a side of a projector pixel; ``captures`` is the number of frames.
+    ``anchor_error`` by anchors a side; ``cell_error``, ``sampling_error`` (one path a cell) and ``cells`` (number in
+    the grid) by cells a side of a projector pixel; ``captures`` is the number of frames.
     """
     check_accuracy(accuracy)
 
@@ -176,5 +176,7 @@ def _warnings(accuracy: float, left: float, depth_error: float, facts: SceneFact
     if depth_error > _SYSTEMATIC_SHARE * accuracy:
         found.append(f"the scene has depth: one layer leaves about {depth_error:.1e}; layers are not in this version")
     if facts.other_emitters:
-        found.append(f"{facts.other_emitters} emitter(s) beside the projector are left out; ambient light is not in this version")
+        found.append(
+            f"{facts.other_emitters} emitter(s) beside the projector are left out; ambient light is not in this version"
+        )
     return tuple(found)

@@ -67,9 +67,7 @@ def locate_projector(where: str, projector: Any, camera: Any) -> ProjectorGrid:
     lit = texels.reshape(texels.shape[0], texels.shape[1], -1).max(axis=-1) > 0
     rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
     if not rows.size:
-        raise MitsimError(
-            f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels"
-        )
+        raise MitsimError(f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels")
     height, width = int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1
     if height != width or not lit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
         raise MitsimError(
@@ -124,4 +122,4 @@ def _homography(source: FloatArray, target: FloatArray) -> FloatArray:
     for (x, y), (u, v) in zip(source, target, strict=True):
         rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y, -u])
         rows.append([0, 0, 0, x, y, 1, -v * x, -v * y, -v])
-    return np.linalg.svd(np.array(rows))[2][-1].reshape(3, 3)
+    return np.asarray(np.linalg.svd(np.array(rows))[2][-1].reshape(3, 3))

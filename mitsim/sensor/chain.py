@@ -32,9 +32,7 @@ def electrons_from_irradiance(
     return light * (exposure_s * _electrons_per_joule_m2(model, wavelength_nm))
 
 
-def exposure_for_peak(
-    peak_irradiance: float, fraction: float, model: SensorModel, wavelength_nm: float
-) -> float:
+def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorModel, wavelength_nm: float) -> float:
     """Exposure time in seconds after which `peak_irradiance` (W/m^2), with dark current, fills `fraction`
     of the full well in the mean. Raises MitsimError if there is no light, no full well, or the fraction is
     not in (0, 1].
@@ -47,9 +45,7 @@ def exposure_for_peak(
             "check that light reaches the sensor"
         )
     if not np.isfinite(model.full_well_e):
-        raise MitsimError(
-            f"exposure: sensor {model.name!r} has no full well to fill; choose exposure_s instead"
-        )
+        raise MitsimError(f"exposure: sensor {model.name!r} has no full well to fill; choose exposure_s instead")
     rate = peak_irradiance * _electrons_per_joule_m2(model, wavelength_nm)
     return float(fraction * model.superpixel_full_well_e / (rate + model.superpixel_dark_current_e_per_s))
 
@@ -143,9 +139,7 @@ def quantise(signal_dn: Array, model: SensorModel) -> Digital:
     return np.clip(np.rint(signal_dn), 0, model.largest_dn).astype(np.uint32)
 
 
-def frame_moments(
-    expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
-) -> tuple[Array, Array]:
+def frame_moments(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> tuple[Array, Array]:
     """Mean (DN) and variance (DN^2) of `expose`'s output, neglecting saturation of the ADC (EMVA 1288 4.0,
     photon transfer).
     """
@@ -163,7 +157,5 @@ def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
 def _expected(values: npt.ArrayLike, name: str) -> Array:
     array = np.asarray(values, dtype=np.float64)
     if not np.all((array >= 0) & (array < np.inf)):
-        raise ValueError(
-            f"{name}: the range is {array.min()} to {array.max()}; all must be finite and 0 or more"
-        )
+        raise ValueError(f"{name}: the range is {array.min()} to {array.max()}; all must be finite and 0 or more")
     return array

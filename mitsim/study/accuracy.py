@@ -81,9 +81,7 @@ class AccuracyStudy:
         ]
 
 
-def study_accuracy(
-    bench: Bench, output: Path | str, patterns: str, seed: int, progress: Progress
-) -> AccuracyStudy:
+def study_accuracy(bench: Bench, output: Path | str, patterns: str, seed: int, progress: Progress) -> AccuracyStudy:
     """Measure error against time and write accuracy.json and accuracy.png to ``output``."""
     folder = prepare_output(output, overwrite=True)
     family = bench.family(patterns, seed)
@@ -117,9 +115,7 @@ def study_accuracy(
     return study
 
 
-def _factored(
-    bench: Bench, family: PatternFamily, judge: FloatArray, seed: int, progress: Progress
-) -> Iterator[Row]:
+def _factored(bench: Bench, family: PatternFamily, judge: FloatArray, seed: int, progress: Progress) -> Iterator[Row]:
     labels, weights = family.classes()
     for accuracy in ACCURACIES:
         plan = make_plan(bench, labels, weights, accuracy, seed)
@@ -132,9 +128,7 @@ def _factored(
         yield Row("factored", f"accuracy {accuracy:g}", seconds, _relative(frames, judge), mc_error)
 
 
-def _reference(
-    bench: Bench, family: PatternFamily, judge: FloatArray, seed: int, progress: Progress
-) -> Iterator[Row]:
+def _reference(bench: Bench, family: PatternFamily, judge: FloatArray, seed: int, progress: Progress) -> Iterator[Row]:
     index = len(family.captures) // 2
     with projected(bench, family.light(family.captures[index])):
         reference(bench.loaded, SAMPLES[0], seed, progress)

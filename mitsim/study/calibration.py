@@ -1,4 +1,4 @@
-"""`mitsim calibrate`: from a bench to a folder with the camera's factors, estimated from a rendered session, and their error."""
+"""`mitsim calibrate`: from a bench to a folder with the camera's factors, and their error."""
 
 from __future__ import annotations
 

@@ -141,7 +141,10 @@ class _Comparison:
         family = self.bench.family(name, self.seed)
         prepared = self._prepared(family, rendered=True)
         singular = np.sort(prepared.left.singular**2)[::-1]
-        shown = family.captures[0], family.captures[2 * len(family.captures) // 5 + 2 if len(family.captures) > 4 else 0]
+        shown = (
+            family.captures[0],
+            family.captures[2 * len(family.captures) // 5 + 2 if len(family.captures) > 4 else 0],
+        )
         return FamilyResult(
             name=name,
             label=FAMILIES[name],
@@ -271,7 +274,9 @@ def _frames(captured: CaptureResult, family: PatternFamily) -> Iterator[Captured
 
 
 def _budget(captured: CaptureResult, calibrated: CalibrationResult) -> Iterator[BudgetRow]:
-    yield BudgetRow("Monte Carlo", captured.mc_error, "rendering noise of the expected frames, from 8 independent groups")
+    yield BudgetRow(
+        "Monte Carlo", captured.mc_error, "rendering noise of the expected frames, from 8 independent groups"
+    )
     yield BudgetRow(
         "Discretisation", captured.plan.systematic_error, "anchors, cells and depth layers, predicted by the plan"
     )

@@ -39,15 +39,11 @@ def ssim(image: Image, truth: Image) -> float:
 
     image, truth = _pair(image, truth)
     if min(image.shape) < _SSIM_WINDOW:
-        raise MitsimError(
-            f"SSIM: image is {_size(image)} pixels; needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW}"
-        )
+        raise MitsimError(f"SSIM: image is {_size(image)} pixels; needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW}")
     return float(structural_similarity(image, truth, win_size=_SSIM_WINDOW, data_range=1.0))
 
 
-def contrast(
-    region: Image, lines: Literal["vertical", "horizontal"] = "vertical", background: float = 0.0
-) -> float:
+def contrast(region: Image, lines: Literal["vertical", "horizontal"] = "vertical", background: float = 0.0) -> float:
     """Contrast ratio (I_max - I_min) / (I_max + I_min) of one group of lines; the paper's MTF / 100.
 
     `region` (rows, columns) holds only the group. Its mean along the lines gives the profile, less a fixed
@@ -56,9 +52,7 @@ def contrast(
     """
     region = np.asarray(region, dtype=np.float64)
     if region.ndim != 2 or region.size == 0 or not np.all(np.isfinite(region)):
-        raise MitsimError(
-            f"contrast: region of shape {region.shape}; pass finite rows x columns of one line group"
-        )
+        raise MitsimError(f"contrast: region of shape {region.shape}; pass finite rows x columns of one line group")
     if lines not in ("vertical", "horizontal"):
         raise MitsimError(f"contrast: lines is {lines!r}; allowed: 'vertical', 'horizontal'")
     profile = region.mean(axis=0 if lines == "vertical" else 1) - background
@@ -80,9 +74,7 @@ def read_truth(run_folder: Path) -> NDArray[np.float64]:
 
     path = Path(run_folder) / TRUTH_FILE
     if not path.is_file():
-        raise MitsimError(
-            f"{path}: no truth in this run, so no PSNR or SSIM; only `mitsim capture` writes one"
-        )
+        raise MitsimError(f"{path}: no truth in this run, so no PSNR or SSIM; only `mitsim capture` writes one")
     channels, _ = read_frame(path)
     if TRUTH_CHANNEL not in channels:
         found = ", ".join(sorted(channels))
@@ -100,9 +92,7 @@ def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.f
     for name, values in (("image", a), ("truth", b)):
         bad = int(np.count_nonzero(~np.isfinite(values)))
         if bad:
-            raise MitsimError(
-                f"image quality: {name} has {bad} values that are not finite; see the solver's status"
-            )
+            raise MitsimError(f"image quality: {name} has {bad} values that are not finite; see the solver's status")
     return a, b
 
 

@@ -92,9 +92,7 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None, width: f
     axes.hlines(range(len(values)), left, values, color="#d1d5db", lw=2)
     axes.plot(values, np.arange(len(values)), "o", color=BLUE, ms=8)
     for row, value in enumerate(values):
-        axes.annotate(
-            f"{value:.1e}", (value, row), (9, 0), textcoords="offset points", va="center", fontsize=_FONT - 1
-        )
+        axes.annotate(f"{value:.1e}", (value, row), (9, 0), textcoords="offset points", va="center", fontsize=_FONT - 1)
     if limit is not None:
         axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
         axes.annotate(

@@ -144,9 +144,7 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
     Raises MitsimError when one of the two has no rendered result.
     """
     if best.rendered is None or baseline.rendered is None:
-        raise MitsimError(
-            f"report: no rendered result of {best.label} or {baseline.label}; reconstruct both first"
-        )
+        raise MitsimError(f"report: no rendered result of {best.label} or {baseline.label}; reconstruct both first")
     gain = best.rendered.psnr_db - baseline.rendered.psnr_db
     other = baseline.label[:1].lower() + baseline.label[1:]
     beat = f"{best.label} beat {other} by {gain:.1f} dB"
@@ -173,9 +171,7 @@ def build_report(report: ReportData, path: Path) -> Path:
     except OSError as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)
-        raise MitsimError(
-            f"{path}: the report cannot be written ({error.strerror}); give another place"
-        ) from error
+        raise MitsimError(f"{path}: the report cannot be written ({error.strerror}); give another place") from error
     return path
 
 
@@ -238,9 +234,7 @@ def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
 def _reflectance_png(image: Array, name: str = "image") -> str:
     """Reflectance as an sRGB grey PNG: clipped to 0..1 for display only, so a screen shows its lightness."""
     linear = np.clip(_finite(image, name), 0.0, 1.0)
-    encoded = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
-    )  # IEC 61966-2-1
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
     return _grey_png(encoded)
 
 

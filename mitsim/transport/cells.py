@@ -22,7 +22,7 @@ class CellAxis:
     @property
     def edges(self) -> FloatArray:
         """(count + 1,) tan-angles of the cell edges."""
-        return self.start + self.size * np.arange(self.count + 1)
+        return np.asarray(self.start + self.size * np.arange(self.count + 1), dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ pass, the paths are a sparse matrix ``light[projector pixel, anchor x cell]``; e
 sum of its rows, because light is linear. The mask and the sensor pixels are applied afterwards in closed form
 (:mod:`mitsim.optics`), which is what makes the estimator fast.
 
-Value collected, for anchor a and tan-angle t from it (DESIGN section 2; the integrand of the reference estimator without
-its mask)::
+Value collected, for anchor a and tan-angle t from it (the integrand of the reference estimator without its mask)::
 
     g_a(t) dt = L(a, t) (1 + |t|^2)^-2 dt          [W m^-2]
 
@@ -98,9 +97,7 @@ class Tracer:
         pixel, row, column, weight, inverse_depth = self._trace(seed)
         value, lit = np.array(weight), np.array(weight) != 0
         if not np.isfinite(value).all():
-            raise MitsimError(
-                "the scene reflects NaN or infinite light toward the camera; check its materials"
-            )
+            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
         total_columns = self.anchors * self.grid.shape[1]
         total_rows = self.anchors * self.grid.shape[0]
         flat = np.array(row)[lit].astype(np.int64) * total_columns + np.array(column)[lit]
@@ -127,9 +124,7 @@ class Tracer:
         tau_column = self._edge(grid.columns, column, random.next_float32())
         wavelength_sample = random.next_float32()
         positions = mi.Float(self.positions.astype(np.float32))
-        u = mi.Point2f(
-            -dr.gather(mi.Float, positions, anchor_column), -dr.gather(mi.Float, positions, anchor_row)
-        )
+        u = mi.Point2f(-dr.gather(mi.Float, positions, anchor_column), -dr.gather(mi.Float, positions, anchor_row))
         z = dr.opaque(mi.Float, geometry.scene_distance)
         t = mi.Vector2f(-tau_column, -tau_row) - mi.Vector2f(u) / z
         squared = 1 + dr.squared_norm(t)
@@ -148,9 +143,7 @@ class Tracer:
         inverse_depth = dr.rcp(local.z)
         hit_row = self._cell(grid.rows, -local.y * inverse_depth)
         hit_column = self._cell(grid.columns, -local.x * inverse_depth)
-        inside = (
-            (hit_row >= 0) & (hit_row < mi.Int32(rows)) & (hit_column >= 0) & (hit_column < mi.Int32(columns))
-        )
+        inside = (hit_row >= 0) & (hit_row < mi.Int32(rows)) & (hit_column >= 0) & (hit_column < mi.Int32(columns))
         inside &= local.z > geometry.mask_distance
         solid = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) / dr.square(squared)
         weight = dr.select(inside, panchromatic(radiance) * solid, 0)

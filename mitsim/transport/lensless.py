@@ -7,12 +7,12 @@ Irradiance at sensor point u, in the units of the scene's radiance times steradi
     E(u) = integral of  L(u, t) M(u + d t) (1 + |t|^2)^-2  dt
 
 over tan-angles t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, and the last factor
-is cos(theta) d omega written in t. A sample draws u inside its pixel and t uniformly over the field stop, traces the ray
-from u, and returns weight M (1 + |t|^2)^-2 (2 T)^2, T = tan(fov / 2). The mask is a factor, not geometry: thin geometry
-suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
+is cos(theta) d omega written in t. A sample draws u inside its pixel and t uniformly over the field stop, traces the
+ray from u, and returns weight M (1 + |t|^2)^-2 (2 T)^2, T = tan(fov / 2). The mask is a factor, not geometry: thin
+geometry suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
 
-The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks along
-+z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.
+The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks
+along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.
 
 ======================  ========  ==========  =================================================================
 parameter               unit      default     meaning
@@ -77,13 +77,13 @@ def _geometry(props: Any, size: Any) -> CameraGeometry:
 def _sensor_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
-    class Lensless(mi.Sensor):  # type: ignore[misc, name-defined]
+    class Lensless(mi.Sensor):  # type: ignore[misc]
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.m_needs_sample_3 = True
             if self.film().rfilter().radius() > 0.5 + 1e-4:
                 raise MitsimError(
-                    f"{PLUGIN}: the film's reconstruction filter spreads light between pixels; use <rfilter type='box'/>"
+                    f"{PLUGIN}: the film's filter spreads light between pixels; use <rfilter type='box'/>"
                 )
             self.geometry = _geometry(props, self.film().size())
             terms = self.geometry.build_mask().terms

@@ -1,4 +1,4 @@
-"""A short look at a scene before the real work: how much error each discretisation would leave, measured, and at what pace.
+"""A short look at a scene before the real work: the error that each discretisation would leave, and the pace.
 
 Numbers in, numbers out: the effect plan (:mod:`mitsim.scene.plan`) reads them and decides. All errors are relative,
 ``||a - b|| / ||b||``.
@@ -125,15 +125,12 @@ def _anchor_errors(
         tracer = Tracer(scene, camera, projector, grid, anchors, common=True)
         light = tracer.batch(integer(seed, "pilot", "anchors")).light
         optics = FrameOptics(geometry, grid.rows.edges, grid.columns.edges, geometry.scene_distance, anchors)
-        return np.stack(
-            [frame.irradiance for frame in ExpectedFrames(optics, [light], labels, weights, seed)]
-        )
+        return np.stack([frame.irradiance for frame in ExpectedFrames(optics, [light], labels, weights, seed)])
 
     judge = frames(_JUDGE_ANCHORS)
     scale = float(np.linalg.norm(judge))
     return {
-        anchors: float(np.linalg.norm(frames(anchors) - judge)) / scale if scale else 0.0
-        for anchors in ANCHOR_CHOICES
+        anchors: float(np.linalg.norm(frames(anchors) - judge)) / scale if scale else 0.0 for anchors in ANCHOR_CHOICES
     }
 
 
