@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,10 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mitsim.core.configuration import read_toml, shipped
 from mitsim.core.environment import load_variant
 
 SCENES = Path(__file__).parents[1] / "scenes"
 NAMES = ("photograph", "colour_chart", "resolution_target")
+POWER = 151250.0  # scale of the scenes' projector
 
 
 def _generator() -> ModuleType:
@@ -124,9 +127,26 @@ def test_window_lands_squarely_on_the_sheet(scene: tuple[str, Any, Any]) -> None
     canvas_column, canvas_row = 256 * uv[0], 128 * uv[1]
     assert np.allclose(canvas_column, 128 + (60 - np.array(x)) / 120 * 128, atol=1e-3)
     assert np.allclose(canvas_row, (60 - np.array(y)) / 120 * 128, atol=1e-3)
-    assert np.allclose(irradiance, math.pi * 111000 / 400**2, rtol=1e-4)  # float32 geometry
+    assert np.allclose(irradiance, math.pi * POWER / 400**2, rtol=1e-4)  # float32 geometry
     outside = _light(mi, loaded, [60.01, -60.01, 0.0, 0.0], [0.0, 0.0, 60.01, -60.01], 400.0)[1]
     assert np.all(outside == 0.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_power_follows_from_the_projector_file(name: str) -> None:
+    """E = flux / efficacy / area of the picture at 400 mm, 16:9, and scale = E z^2 / pi, z in mm.
+
+    Five digits are written in the scene; the file's own radiant flux, rounded to three, must agree to those.
+    """
+    text = (SCENES / name / "scene.xml").read_text(encoding="utf-8")
+    written = re.search(r'<default name="projector_scale" value="([^"]+)"', text)
+    assert written is not None and float(written[1]) == POWER
+    light = read_toml(shipped("calibration", "mp_cl1.toml"))
+    watts = light["luminous_flux_lm"] / light["luminous_efficacy_lm_per_w"]
+    width_m = 0.4 / light["throw_ratio"]
+    irradiance = watts / (width_m * width_m * 9 / 16)
+    assert pytest.approx(irradiance * 400**2 / math.pi, rel=5e-5) == POWER
+    assert light["radiant_flux_w"] == pytest.approx(watts, rel=5e-3)
 
 
 def test_print_is_upright_and_not_mirrored(scene: tuple[str, Any, Any]) -> None:
