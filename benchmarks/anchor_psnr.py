@@ -48,9 +48,7 @@ def dots(k: int) -> np.ndarray:
     return (np.arange(N)[:, None] % k == np.arange(k)).astype(np.float64)
 
 
-def frames(
-    factor: np.ndarray, patterns: np.ndarray, image: np.ndarray
-) -> Iterator[tuple[int, int, np.ndarray]]:
+def frames(factor: np.ndarray, patterns: np.ndarray, image: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
     """Noise-free frames with their pattern indices."""
     for i, row in enumerate(patterns.T):
         for j, column in enumerate(patterns.T):
@@ -91,9 +89,7 @@ def trial(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="write the table to this file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(

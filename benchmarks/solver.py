@@ -151,22 +151,15 @@ def rounding(rng: np.random.Generator) -> list[dict[str, float]]:
             images[method] = prepared.solve(summed(prepared, {(0, 0): frame}), lam).image
         side = prepared.left
         q = side.basis.T @ (factor.T @ frame @ factor) @ side.basis
-        images["svd+Q"] = (
-            side.basis @ (q / (np.outer(side.singular, side.singular) ** 2 + lam)) @ side.basis.T
-        )
+        images["svd+Q"] = side.basis @ (q / (np.outer(side.singular, side.singular) ** 2 + lam)) @ side.basis.T
         row = {"lambda_rel": lam, "eps/lambda_rel": EPS / lam, "eps/sqrt(lambda_rel)": EPS / lam**0.5}
-        row |= {
-            form: float(np.linalg.norm(image - truth) / np.linalg.norm(truth))
-            for form, image in images.items()
-        }
+        row |= {form: float(np.linalg.norm(image - truth) / np.linalg.norm(truth)) for form, image in images.items()}
         rows.append(row)
     return rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="write the figures to this file")
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--seed", type=int, default=0)

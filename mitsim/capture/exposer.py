@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from mitsim.capture.bench import Bench
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import PatternFamily
@@ -25,7 +25,8 @@ from mitsim.sensor.chain import (
 )
 
 FloatArray = npt.NDArray[np.float64]
-WORKERS = 2
+FRAMES_AT_ONCE = 16
+"""Frames held in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,11 @@ class Exposer:
         """Noisy measurement [electrons / s] of every pattern (i, j); a signed pattern is a difference of two frames."""
         numbered = zip(family.captures, expected, strict=True)
         half: FloatArray | None = None
-        with ThreadPoolExecutor(WORKERS) as pool:
-            while chunk := list(islice(numbered, 4 * WORKERS)):
-                rates = pool.map(lambda item: self.rate(self.digital(self.electrons(item[1]), *item[0].names)), chunk)
-                for (shown, _), rate in zip(chunk, rates, strict=True):
-                    if shown.sign == 1:
-                        half = rate
-                        continue
-                    yield rate if half is None else half - rate, shown.row, shown.column
-                    half = None
+        while chunk := list(islice(numbered, FRAMES_AT_ONCE)):
+            rates = in_threads(lambda item: self.rate(self.digital(self.electrons(item[1]), *item[0].names)), chunk)
+            for (shown, _), rate in zip(chunk, rates, strict=True):
+                if shown.sign == 1:
+                    half = rate
+                    continue
+                yield rate if half is None else half - rate, shown.row, shown.column
+                half = None

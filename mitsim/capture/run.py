@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -16,18 +15,18 @@ import numpy.typing as npt
 
 from mitsim.capture.bench import Bench, load_recipe
 from mitsim.capture.clock import Clock
-from mitsim.capture.exposer import WORKERS, Exposer, Exposure
+from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
 from mitsim.capture.light import Light, Progress, collect, make_plan, silent, uniform_light
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame, write_frame
 from mitsim.core.manifest import prepare_output, read_json, versions, write_json
+from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import Capture, PatternFamily
 from mitsim.scene.plan import Plan
 from mitsim.sensor.chain import Digital
 
 FloatArray = npt.NDArray[np.float64]
-_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -152,25 +151,23 @@ class _Writer:
         return float(np.sqrt(self._noise_energy / self._energy)) if self._energy else 0.0
 
     def write_all(self, expected: ExpectedFrames, clock: Clock, progress: Progress) -> None:
-        """Expose and write in chunks, two threads each; stages are timed on the wall clock."""
-        total = len(expected)
-        with ThreadPoolExecutor(WORKERS) as pool:
-            numbered = enumerate(zip(self.family.captures, expected, strict=True))
-            while True:
-                with clock.stage("optics"):
-                    chunk = list(islice(numbered, _AT_ONCE))
-                if not chunk:
-                    return
-                with clock.stage("sensor"):
-                    exposed = list(pool.map(self._expose, chunk))
-                with clock.stage("write"):
-                    list(pool.map(self._write, exposed))
-                for frame in exposed:
-                    self.noise_ratio = max(self.noise_ratio, frame.rendering_noise / frame.sensor_noise)
-                    self.saturated += self.exposer.saturated(frame.digital)
-                    self._noise_energy += frame.sensor_noise**2 * frame.electrons.size
-                    self._energy += float(np.square(frame.electrons).sum())
-                progress("frames", (chunk[-1][0] + 1) / total)
+        """Expose and write in chunks, one thread a processor; stages are timed on the wall clock."""
+        numbered = enumerate(zip(self.family.captures, expected, strict=True))
+        while True:
+            with clock.stage("optics"):
+                chunk = list(islice(numbered, FRAMES_AT_ONCE))
+            if not chunk:
+                return
+            with clock.stage("sensor"):
+                exposed = in_threads(self._expose, chunk)
+            with clock.stage("write"):
+                in_threads(self._write, exposed)
+            for frame in exposed:
+                self.noise_ratio = max(self.noise_ratio, frame.rendering_noise / frame.sensor_noise)
+                self.saturated += self.exposer.saturated(frame.digital)
+                self._noise_energy += frame.sensor_noise**2 * frame.electrons.size
+                self._energy += float(np.square(frame.electrons).sum())
+            progress("frames", (chunk[-1][0] + 1) / len(expected))
 
     def _expose(self, item: tuple[int, tuple[Capture, Frame]]) -> _Exposed:
         index, (shown, frame) = item

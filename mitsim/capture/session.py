@@ -8,7 +8,6 @@ sensor noise. When n is no Hadamard order the next one is used and its first n r
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 
 import numpy as np
@@ -16,9 +15,10 @@ import numpy.typing as npt
 
 from mitsim.capture.bench import Bench, SessionRecipe
 from mitsim.capture.clock import Clock
-from mitsim.capture.exposer import WORKERS, Exposer, Exposure
+from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
 from mitsim.capture.light import Light, Progress, collect, make_plan, uniform_light
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import hadamard_matrix
 from mitsim.scene.plan import Plan
@@ -103,17 +103,16 @@ class Session:
             return exposer.rate(exposer.digital(exposer.electrons(frame), "calibration", side, index))
 
         done = 0
-        with ThreadPoolExecutor(WORKERS) as pool:
-            while True:
-                with self.clock.stage("optics"):
-                    chunk = list(islice(numbered, 2 * WORKERS))
-                if not chunk:
-                    return
-                with self.clock.stage("sensor"):
-                    rates = list(pool.map(shoot, chunk))
-                done += len(chunk)
-                self.progress(f"{side} stripes", done / len(self.weights))
-                yield from rates
+        while True:
+            with self.clock.stage("optics"):
+                chunk = list(islice(numbered, FRAMES_AT_ONCE))
+            if not chunk:
+                return
+            with self.clock.stage("sensor"):
+                rates = in_threads(shoot, chunk)
+            done += len(chunk)
+            self.progress(f"{side} stripes", done / len(self.weights))
+            yield from rates
 
 
 def _signs(n: int) -> FloatArray:

@@ -38,7 +38,8 @@ def write_frame(path: Path | str, channels: Mapping[str, Channel], metadata: Map
     """
     path = Path(path)
     _check_channels(channels)
-    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    # Noise does not compress: ZIP saves a tenth of the room for four times the time.
+    header: dict[str, Any] = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     header.update({_PREFIX + key: json.dumps(_scalar(value)) for key, value in metadata.items()})
     pixels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from mitsim.core.parallel import in_threads, workers
 from mitsim.core.seeds import stream
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 
@@ -155,9 +156,7 @@ class ExpectedFrames:
                 stop = start + len(weights)
                 yield from self._frames(irradiance[start:stop], deviation[start:stop])
             else:
-                yield from self._frames(
-                    np.tensordot(weights, irradiance, axes=1), np.tensordot(weights, deviation, axes=1)
-                )
+                yield from self._frames(_mix(weights, irradiance), _mix(weights, deviation))
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) deviations of their groups."""
@@ -167,12 +166,15 @@ class ExpectedFrames:
         signs = stream(self._seed, "probe").choice((-1.0, 1.0), size=(pixels, _PROBES))
         frames = np.empty((stop - start, pixels, pixels))
         deviations = np.zeros((stop - start, pixels * groups * _PROBES if groups > 1 else 1))
-        for row in range(stop - start):
+
+        def form(row: int) -> None:
             flat, mean = _row(light, row)
             frames[row] = self._optics.frame(flat, mean)
             if groups > 1:
                 probed = self._optics.probe(flat, _aligned(flat, [_row(part, row) for part in parts]), signs)
                 deviations[row] = (probed - np.tile(frames[row] @ signs, groups)).ravel()
+
+        in_threads(form, range(stop - start))
         return frames, deviations
 
     def _frames(self, irradiance: FloatArray, deviation: FloatArray) -> Iterator[Frame]:
@@ -184,6 +186,20 @@ class ExpectedFrames:
             light = np.maximum(frame, 0)
             total = float(light.sum())
             yield Frame(light, variance, (total - float(frame.sum())) / total if total else 0.0)
+
+
+def _mix(weights: FloatArray, basis: FloatArray) -> FloatArray:
+    """(captures, ...) sums of (B, ...) basis arrays by weights (captures, B)."""
+    flat = basis.reshape(len(basis), -1)
+    mixed = np.empty((len(weights), flat.shape[1]))
+    cuts = np.linspace(0, flat.shape[1], workers() + 1).astype(int)
+
+    def part(index: int) -> None:
+        inside = slice(cuts[index], cuts[index + 1])
+        mixed[:, inside] = weights @ flat[:, inside]
+
+    in_threads(part, range(workers()))
+    return mixed.reshape(len(weights), *basis.shape[1:])
 
 
 def relative_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
