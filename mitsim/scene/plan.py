@@ -20,6 +20,7 @@ State = Literal["exact", "approximate", "off"]
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 _SYSTEMATIC_SHARE = 0.8
 _SAMPLING_MARGIN = 0.95
+_FEWEST_BATCHES = 8.0
 _SECONDS_PER_FRAME = 2.5e-3
 
 
@@ -79,7 +80,8 @@ def decide(
     cell_error: Mapping[int, float],
     sampling_error: Mapping[int, float],
     cells: Mapping[int, int],
-    paths_per_second: float,
+    seconds_per_batch: float,
+    seconds_per_path: float,
     depth: float,
     depth_error: float,
     captures: int,
@@ -95,20 +97,28 @@ def decide(
     def systematic(anchors: int, subdivision: int) -> float:
         return math.hypot(anchor_error[anchors], cell_error[subdivision])
 
+    def room(anchors: int, subdivision: int) -> float:
+        """What is left of the squared budget for sampling."""
+        return max(accuracy**2 - systematic(anchors, subdivision) ** 2, (0.2 * accuracy) ** 2)
+
+    def batches(anchors: int, subdivision: int) -> float:
+        return max(_FEWEST_BATCHES, sampling_error[subdivision] ** 2 / room(anchors, subdivision))
+
+    def pace(anchors: int, subdivision: int) -> float:
+        return seconds_per_batch + anchors**2 * cells[subdivision] * seconds_per_path
+
     def seconds(anchors: int, subdivision: int) -> float:
-        target = max(accuracy**2 - systematic(anchors, subdivision) ** 2, (0.2 * accuracy) ** 2)
-        passes = max(8.0, sampling_error[subdivision] ** 2 / target)
-        paths = passes * anchors**2 * cells[subdivision]
-        return paths / paths_per_second + captures * anchors * _SECONDS_PER_FRAME
+        work = batches(anchors, subdivision) * pace(anchors, subdivision)
+        return work + captures * anchors * _SECONDS_PER_FRAME
 
     choices = sorted(product(anchor_error, cell_error), key=lambda choice: seconds(*choice))
     fitting = [choice for choice in choices if systematic(*choice) <= _SYSTEMATIC_SHARE * accuracy]
     anchors, subdivision = fitting[0] if fitting else min(choices, key=lambda choice: systematic(*choice))
     left = systematic(anchors, subdivision)
-    room = max(accuracy**2 - left**2, (0.2 * accuracy) ** 2)
+    extra = batches(anchors, subdivision) * (pace(anchors, subdivision) - pace(1, subdivision))
     warnings = _warnings(accuracy, left, depth_error, facts)
     effects = (
-        _anchor_effect(anchors, anchor_error, accuracy, seconds(anchors, subdivision) - seconds(1, subdivision)),
+        _anchor_effect(anchors, anchor_error, accuracy, extra),
         Effect(
             "tan-angle cells",
             "approximate",
@@ -117,6 +127,7 @@ def decide(
             0.0,
         ),
         _depth_effect(depth, depth_error, accuracy),
+        *_keystone_effect(facts),
         *_fixed_effects(facts),
     )
     return Plan(
@@ -126,7 +137,7 @@ def decide(
         anchors=anchors,
         subdivision=subdivision,
         depth=depth,
-        sampling_target=_SAMPLING_MARGIN * math.sqrt(room),
+        sampling_target=_SAMPLING_MARGIN * math.sqrt(room(anchors, subdivision)),
         systematic_error=math.hypot(left, depth_error),
         warnings=warnings,
     )
@@ -137,7 +148,7 @@ def _anchor_effect(anchors: int, errors: Mapping[int, float], accuracy: float, s
         reason = f"one anchor leaves {errors[1]:.1e}, within {accuracy:g}"
         return Effect("anchors (falloff, gloss, parallax)", "off", reason, errors[1], 0.0)
     reason = f"{anchors}x{anchors} anchors leave {errors[anchors]:.1e}; one would leave {errors[1]:.1e}"
-    return Effect("anchors (falloff, gloss, parallax)", "approximate", reason, errors[1], max(seconds, 0.0))
+    return Effect("anchors (falloff, gloss, parallax)", "approximate", reason, errors[1], seconds)
 
 
 def _depth_effect(depth: float, error: float, accuracy: float) -> Effect:
@@ -146,6 +157,13 @@ def _depth_effect(depth: float, error: float, accuracy: float) -> Effect:
     else:
         reason = f"the lit depth varies about {depth:.1f} mm and this version has one layer: about {error:.1e} wrong"
     return Effect("depth layers", "off", reason, error, 0.0)
+
+
+def _keystone_effect(facts: SceneFacts) -> Sequence[Effect]:
+    if facts.keystone == 0:
+        return ()
+    reason = f"rendered; corners lie {facts.keystone:.1f} projector pixels off a square, so responses are not separable"
+    return (Effect("projector keystone", "exact", reason, None, 0.0),)
 
 
 def _fixed_effects(facts: SceneFacts) -> Sequence[Effect]:

@@ -44,14 +44,11 @@ class LightSample:
         (n * n, rows * columns) CSR, W m^-2 per cell; rows = anchors x cell rows, columns = anchors x cell columns.
     depth_mean, depth_spread
         mean of 1/z over the light [1/mm], and its standard deviation.
-    paths
-        rays traced.
     """
 
     light: sparse.csr_array
     depth_mean: float
     depth_spread: float
-    paths: int
 
 
 @dataclass(frozen=True)
@@ -81,11 +78,6 @@ class Tracer:
         self.scene, self.camera, self.projector, self.grid = scene, camera, projector, grid
         self.anchors, self.common = anchors, common
         self.positions = anchor_positions(anchors, camera.geometry.half_width)
-        if self.lanes > LANES_PER_LAUNCH:
-            raise MitsimError(
-                f"{anchors}x{anchors} anchors on {grid.shape[0]}x{grid.shape[1]} cells are {self.lanes} paths a batch; "
-                f"at most {LANES_PER_LAUNCH} are possible, ask for a lower accuracy"
-            )
 
     @property
     def lanes(self) -> int:
@@ -94,32 +86,41 @@ class Tracer:
 
     def batch(self, seed: int) -> LightSample:
         """One jittered path through every cell from every anchor."""
-        pixel, row, column, weight, inverse_depth = self._trace(seed)
-        value, lit = np.array(weight), np.array(weight) != 0
-        if not np.isfinite(value).all():
-            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+        launches = [
+            self._launch(seed, first, min(LANES_PER_LAUNCH, self.lanes - first))
+            for first in range(0, self.lanes, LANES_PER_LAUNCH)
+        ]
+        pixel, row, column, value, inverse_depth = (np.concatenate(part) for part in zip(*launches, strict=True))
         total_columns = self.anchors * self.grid.shape[1]
-        total_rows = self.anchors * self.grid.shape[0]
-        flat = np.array(row)[lit].astype(np.int64) * total_columns + np.array(column)[lit]
-        entries = (value[lit].astype(np.float64), (np.array(pixel)[lit].astype(np.int32), flat))
-        shape = (self.projector.n**2, total_rows * total_columns)
+        flat = row.astype(np.int64) * total_columns + column
+        shape = (self.projector.n**2, self.anchors * self.grid.shape[0] * total_columns)
+        entries = (value.astype(np.float64), (pixel.astype(np.int32), flat))
         light = sparse.coo_array(entries, shape=shape).tocsr()
-        mean, spread = _weighted_moments(np.array(inverse_depth)[lit], value[lit])
-        return LightSample(light, mean, spread, self.lanes)
+        return LightSample(light, *_weighted_moments(inverse_depth, value))
 
-    def _trace(self, seed: int) -> tuple[Any, Any, Any, Any, Any]:
+    def _launch(self, seed: int, first: int, count: int) -> list[npt.NDArray[Any]]:
+        """Arrays of :meth:`_trace` for some lanes, without the dark ones."""
+        found = [np.array(values) for values in self._trace(seed, first, count)]
+        if not np.isfinite(found[3]).all():
+            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+        lit = found[3] != 0
+        return [values[lit] for values in found]
+
+    def _trace(self, seed: int, first: int, count: int) -> tuple[Any, Any, Any, Any, Any]:
         """Per path: projector pixel, row and column of (anchor, cell), light [W m^-2], 1/depth."""
-        geometry, grid, count = self.camera.geometry, self.grid, self.anchors
+        geometry, grid = self.camera.geometry, self.grid
         # Opaque numbers keep the compiled kernel the same for every grid and seed.
         rows, columns = dr.opaque(mi.UInt32, grid.shape[0]), dr.opaque(mi.UInt32, grid.shape[1])
-        lane = dr.arange(mi.UInt32, self.lanes)
+        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
         column = lane % columns
         row = (lane // columns) % rows
         anchor = lane // (rows * columns)
-        anchors = dr.opaque(mi.UInt32, count)
+        anchors = dr.opaque(mi.UInt32, self.anchors)
         anchor_row, anchor_column = anchor // anchors, anchor % anchors
         stream_index = lane % (rows * columns) if self.common else lane
-        random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(stream_index))
+        # Neighbouring streams of PCG32 are correlated; the cipher TEA scatters their seeds, as in Mitsuba's samplers.
+        state, sequence = mi.sample_tea_32(dr.opaque(mi.UInt32, seed), stream_index)
+        random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
         tau_row = self._edge(grid.rows, row, random.next_float32())
         tau_column = self._edge(grid.columns, column, random.next_float32())
         wavelength_sample = random.next_float32()

@@ -43,8 +43,10 @@ class Evidence:
         depth of the light, 1 / mean(1/z) [mm], and the error of putting all of it at that depth.
     sampling_error
         by cells a side of a projector pixel: Monte Carlo error of the frames at one path a cell.
-    paths_per_second, seconds
-        pace of the tracer once compiled, and the time that this pilot took.
+    seconds_per_batch, seconds_per_path
+        pace of the tracer once compiled: a batch takes the first, and the second for each path.
+    seconds
+        time that this pilot took.
     """
 
     anchor_error: dict[int, float]
@@ -52,7 +54,8 @@ class Evidence:
     depth: float
     depth_spread_error: float
     sampling_error: dict[int, float]
-    paths_per_second: float
+    seconds_per_batch: float
+    seconds_per_path: float
     seconds: float
 
 
@@ -86,7 +89,8 @@ def measure(
     samples = [tracer.batch(integer(seed, "pilot", "cells", 0))]
     warm = time.perf_counter()
     samples.append(tracer.batch(integer(seed, "pilot", "cells", 1)))
-    pace = tracer.lanes / (time.perf_counter() - warm)
+    per_batch = _overhead(scene, camera, projector, windows, seed)
+    per_path = max(time.perf_counter() - warm - 2 * per_batch, 0.0) / tracer.lanes
     if not any(sample.light.nnz for sample in samples):
         raise MitsimError(
             "no light of the projector reaches the camera; check the scene, the window and the field stop"
@@ -100,7 +104,8 @@ def measure(
         depth=depth,
         depth_spread_error=_depth_error(geometry, grid, depth, spread),
         sampling_error=sampling_error,
-        paths_per_second=pace,
+        seconds_per_batch=per_batch,
+        seconds_per_path=per_path,
         seconds=time.perf_counter() - started,
     )
 
@@ -132,6 +137,21 @@ def _anchor_errors(
     return {
         anchors: float(np.linalg.norm(frames(anchors) - judge)) / scale if scale else 0.0 for anchors in ANCHOR_CHOICES
     }
+
+
+def _overhead(
+    scene: Any,
+    camera: Any,
+    projector: Projector,
+    windows: tuple[tuple[float, float], tuple[float, float]],
+    seed: int,
+) -> float:
+    """Seconds of a batch with hardly any paths."""
+    grid = aligned_grid(*windows, max(projector.n // _COARSE, 1), 1, camera.geometry.tan_half_fov)
+    tracer = Tracer(scene, camera, projector, grid, anchors=1)
+    started = time.perf_counter()
+    tracer.batch(integer(seed, "pilot", "overhead"))
+    return time.perf_counter() - started
 
 
 def _cell_errors(
