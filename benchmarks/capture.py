@@ -1,0 +1,82 @@
+"""`mitsim capture` of 49 dots at 512x512 to 1e-3: cold from the shell, warm in one process, and against the reference.
+
+    python benchmarks/capture.py [--json FILE] [--repeat 5]
+
+Cold: a new process, with an empty kernel cache and LLVM probe (a temporary HOME), from the shell to its exit. Warm:
+medians of later captures in one process. The reference's time at equal error is measured at a feasible error and
+extrapolated by 1/sqrt(samples).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from mitsim.capture.bench import open_bench
+from mitsim.capture.run import capture
+from mitsim.core.configuration import shipped
+from mitsim.core.manifest import versions
+from mitsim.study.accuracy import study_accuracy
+
+SCENE = shipped("scenes", "photograph", "scene.xml")
+PATTERNS, ACCURACY = "dots:7", 1e-3
+
+
+def cold() -> dict[str, float]:
+    """Seconds of two processes in a row: caches empty, then kernels compiled before."""
+    found = {}
+    with tempfile.TemporaryDirectory() as home:
+        for name in ("empty_caches", "new_process"):
+            run = str(Path(home) / name)
+            command = [sys.executable, "-m", "mitsim.cli", "capture", str(SCENE), "--patterns", PATTERNS]
+            command += ["--accuracy", str(ACCURACY), "-o", run, "--json"]
+            started = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True, env={**os.environ, "HOME": home})
+            found[name] = time.perf_counter() - started
+    return found
+
+
+def warm(repeat: int) -> dict[str, float]:
+    """Median seconds by stage over ``repeat`` captures after a first one."""
+    bench = open_bench(SCENE)
+    runs = []
+    with tempfile.TemporaryDirectory() as folder:
+        for index in range(repeat + 1):
+            runs.append(capture(bench, PATTERNS, Path(folder) / str(index), ACCURACY))
+    stages = {key: statistics.median(run.seconds[key] for run in runs[1:]) for key in runs[0].seconds}
+    return {**stages, "transport_and_optics": stages["transport"] + stages["optics"], "mc_error": runs[1].mc_error}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--repeat", type=int, default=5)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        study = study_accuracy(open_bench(SCENE), folder, PATTERNS, 0, lambda stage, fraction: None)
+    result = {
+        "cold_seconds": cold(),
+        "warm_seconds": warm(options.repeat),
+        "speedup_at_equal_error": study.speedup_at_equal_error,
+        "accuracy_rows": study.payload()["rows"],
+        "repeat": options.repeat,
+        "seed": 0,
+        "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
+        "versions": versions(),
+    }
+    text = json.dumps(result, indent=1)
+    print(text)
+    if options.json:
+        options.json.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
