@@ -28,6 +28,7 @@ from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.study.calibration import CalibrationResult, calibrate
+from mitsim.study.describe import scene_line
 from mitsim.study.ideal import ideal_factors, ideal_light
 from mitsim.study.metrics import psnr, read_truth, ssim
 from mitsim.study.report import (
@@ -234,7 +235,7 @@ def _report(
         verdict=headline,
         verdict_detail=detail,
         truth=comparison.truth,
-        scene=str(bench.loaded.path.name),
+        scene=scene_line(bench.loaded.path),
         render=pinhole_view(bench, load_recipe().board_reflectance, seed),
         render_caption="The scene as Mitsuba renders it from the sensor's centre, before mask and noise.",
         families=families,

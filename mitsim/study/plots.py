@@ -6,7 +6,7 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,9 +25,10 @@ _FONT = 11.0  # points
 def frame(values: ArrayLike, unit: str = "DN", width: float = 3.6) -> Figure:
     """A sensor frame (m, m) with its colour bar in `unit`; width in inches. Pixel (0, 0) is top left."""
     image = np.asarray(values, dtype=np.float64)
-    figure, axes = _figure(width, 0.76 * width)
+    # "compressed" makes room around an image of fixed aspect; "constrained" lets the row label run off the figure.
+    figure, axes = _figure(width, 0.75 * width, layout="compressed")
     drawn = axes.imshow(image, cmap="viridis", interpolation="none")
-    bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
+    bar = figure.colorbar(drawn, ax=axes)
     bar.set_label(f"signal [{unit}]", fontsize=_FONT - 1)
     bar.ax.tick_params(labelsize=_FONT - 2)
     axes.set_xlabel("sensor column [pixel]", fontsize=_FONT - 1)
@@ -83,16 +84,19 @@ def quality_bars(
 
 
 def error_bars(errors: Mapping[str, float], limit: float | None = None, width: float = 8.6) -> Figure:
-    """Relative errors {name: value > 0} on a logarithmic axis, largest on top; `limit`: accuracy asked."""
+    """Relative errors {name: value > 0} on a logarithmic axis, largest on top; `limit`: accuracy asked.
+
+    The values stand in a column beside the axes, where no line can cross them.
+    """
     ordered = sorted(errors.items(), key=lambda item: item[1])
     figure, axes = _figure(width, 0.7 + 0.36 * len(ordered))
     values = np.array([value for _, value in ordered], dtype=np.float64)
     reference = values if limit is None else np.append(values, limit)
     left = 10.0 ** np.floor(np.log10(reference.min()) - 0.3)
     axes.hlines(range(len(values)), left, values, color="#d1d5db", lw=2)
-    axes.plot(values, np.arange(len(values)), "o", color=BLUE, ms=8)
+    axes.plot(values, np.arange(len(values)), "o", color=BLUE, ms=8, zorder=3)
     for row, value in enumerate(values):
-        axes.annotate(f"{value:.1e}", (value, row), (9, 0), textcoords="offset points", va="center", fontsize=_FONT - 1)
+        axes.text(1.02, row, f"{value:.1e}", transform=axes.get_yaxis_transform(), va="center", fontsize=_FONT)
     if limit is not None:
         axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
         axes.annotate(
@@ -105,7 +109,7 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None, width: f
             fontsize=_FONT - 1,
         )
     axes.set_xscale("log")
-    axes.set_xlim(left, 10.0 * reference.max())
+    axes.set_xlim(left, 3.0 * reference.max())
     axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=_FONT)
     axes.set_ylim(-0.6, len(values) - 0.4)
     axes.set_xlabel("relative error [1]", fontsize=_FONT)
@@ -141,9 +145,11 @@ def seconds_by_stage(seconds: Mapping[str, float], width: float = 8.6) -> Figure
     return figure
 
 
-def _figure(width: float, height: float) -> tuple[Figure, Axes]:
+def _figure(
+    width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained"
+) -> tuple[Figure, Axes]:
     """An empty figure, width x height in inches, with its own Agg canvas and one open axes."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot()
     for side in ("top", "right"):

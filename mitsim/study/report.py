@@ -25,13 +25,16 @@ from mitsim.study import plots
 
 Array = NDArray[Any]
 
+PATTERN_CORNER = 40  # projector pixels a side that are shown of a pattern
 _DASH = "\N{EN DASH}"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """One reconstruction: (n, n) reflectance, PSNR [dB, peak 1, no fit], SSIM, and the lambda it took."""
+    """One reconstruction: (n, n) reflectance, PSNR [dB, peak 1, no fit], SSIM, the lambda it took, and the
+    solver's sentence, shown only when it says more than "Solved: ...".
+    """
 
     image: Array
     psnr_db: float
@@ -187,10 +190,17 @@ def render_html(report: ReportData) -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        sci=_scientific, db=_decibel, seconds=_seconds, reflectance=_reflectance_png, pattern=_pattern_png
+        sci=_scientific,
+        db=_decibel,
+        seconds=_seconds,
+        trouble=_trouble,
+        reflectance=_reflectance_png,
+        pattern=_pattern_png,
     )
     page = environment.get_template("report.html")
-    return page.render(report=report, figures=_figures(report), best=_best(report.families))
+    return page.render(
+        report=report, figures=_figures(report), best=_best(report.families), pattern_corner=PATTERN_CORNER
+    )
 
 
 def _figures(report: ReportData) -> dict[str, Any]:
@@ -216,10 +226,20 @@ def _figures(report: ReportData) -> dict[str, Any]:
     positive = {row.name: row.value for row in report.budget if row.value > 0.0}
     if positive:
         figures["budget"] = _figure_png(plots.error_bars(positive, report.accuracy))
-    stages = {name: value for name, value in report.seconds.items() if name != "total"}
-    if stages:
-        figures["seconds"] = _figure_png(plots.seconds_by_stage(stages))
+    figures["stages"] = _stages(report.seconds)
+    if figures["stages"]:
+        figures["seconds"] = _figure_png(plots.seconds_by_stage(figures["stages"]))
     return figures
+
+
+def _stages(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Seconds by stage, and as "not in a stage" what the total holds beside them, where that is more than 1 %."""
+    stages = {name: value for name, value in seconds.items() if name != "total"}
+    total = seconds.get("total", 0.0)
+    rest = total - math.fsum(stages.values())
+    if stages and rest > 0.01 * total:
+        stages["not in a stage"] = rest
+    return stages
 
 
 def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
@@ -239,8 +259,8 @@ def _reflectance_png(image: Array, name: str = "image") -> str:
 
 
 def _pattern_png(pattern: Array) -> str:
-    """Pattern as a grey PNG: 0..1 as it is, -1..1 with -1 black."""
-    values = _finite(pattern, "pattern")
+    """Top left corner of a pattern, where single pixels can be told apart: 0..1 as it is, -1..1 with -1 black."""
+    values = _finite(pattern, "pattern")[:PATTERN_CORNER, :PATTERN_CORNER]
     return _grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values)
 
 
@@ -286,4 +306,11 @@ def _decibel(value: float | None) -> str:
 
 
 def _seconds(value: float | None) -> str:
-    return _DASH if value is None else f"{value:.2f} s" if value < 100 else f"{value:.0f} s"
+    if value is None:
+        return _DASH
+    return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
+
+
+def _trouble(status: str) -> str:
+    """The solver's sentence unless it says that nothing is missing: those sentences begin with "Solved: "."""
+    return "" if status.startswith("Solved: ") else status

@@ -48,6 +48,26 @@ def test_error_bars_put_the_largest_on_top_and_keep_the_limit_in_sight() -> None
     assert low < 1e-5 and high > 0.5
 
 
+def test_values_of_error_bars_stand_beside_the_axes_where_no_line_crosses_them() -> None:
+    figure = plots.error_bars({"small": 1e-5, "close": 7.8e-4, "large": 1e-2}, limit=1e-3)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    right = axes.get_window_extent().x1
+    written = [text for text in axes.texts if "e-" in text.get_text() and "asked" not in text.get_text()]
+    assert [text.get_text() for text in written] == ["1.0e-05", "7.8e-04", "1.0e-02"]
+    for text in written:
+        box = text.get_window_extent()
+        assert box.x0 > right and box.x1 < figure.bbox.x1
+
+
+def test_labels_of_a_frame_lie_inside_the_figure() -> None:
+    figure = plots.frame(np.arange(262144.0).reshape(512, 512))
+    figure.canvas.draw()
+    for text in (figure.axes[0].yaxis.label, figure.axes[0].xaxis.label, figure.axes[1].yaxis.label):
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
+
+
 def test_seven_families_can_be_told_apart() -> None:
     lines = plots.singular_values({str(k): np.ones(2) for k in range(7)}).axes[0].lines
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 7

@@ -75,9 +75,7 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
             for i, f in enumerate(families)
         ),
         exposure_used="equal peak, 80 % of full well",
-        calibration=R.CalibrationFacts(
-            128, 512, 1.2e-3, 4.1e-3, 2.6e5, "Factors agree with the noise-free ones."
-        ),
+        calibration=R.CalibrationFacts(128, 512, 1.2e-3, 4.1e-3, 2.6e5, "Factors agree with the noise-free ones."),
         budget=(
             R.BudgetRow("Monte Carlo noise", 2.1e-4, "Reached; five times below the accuracy asked for."),
             R.BudgetRow("Sensor noise", 6.3e-3, "Shot and read noise of one frame; limits the result."),
@@ -87,9 +85,7 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
         accuracy=1e-3,
         effects=(
             R.EffectRow("anchors", "exact", "Lambertian plane: falloff needs 3 a side", 6e-4, 0.1),
-            R.EffectRow(
-                "mask diffraction", "approximate", "Fresnel number 3.3 at 550 nm; three lines", 0.36, 0.8
-            ),
+            R.EffectRow("mask diffraction", "approximate", "Fresnel number 3.3 at 550 nm; three lines", 0.36, 0.8),
             R.EffectRow("interreflection", "off", "one convex sheet: no second bounce", 0.0, 0.0),
             R.EffectRow("ambient light", "off", "no emitter besides the projector", None, None),
         ),
@@ -150,7 +146,7 @@ def test_every_number_that_was_given_is_shown(page: str) -> None:
         *("Uniform", "16 dots", "25 dots", "64 Hadamard", "23.5 dB", "36.4 dB", "31.8 dB", "SSIM 0.965"),
         *("Equal peak", "Equal frame", "Equal total", "equal peak, 80 % of full well"),
         *("512", "1.2\u00d710⁻³", "2.6\u00d710⁵", "Monte Carlo noise", "2.1\u00d710⁻⁴"),
-        *("mask diffraction", "approximate", "Fresnel number", "9.40 s", "15.61 s", "3735928559", "3.9.1"),
+        *("mask diffraction", "approximate", "Fresnel number", "9.40 s", "15.6 s", "3735928559", "3.9.1"),
     ):
         assert wanted in text, wanted
 
@@ -173,6 +169,42 @@ def test_text_cannot_become_markup() -> None:
 
 def test_the_same_data_give_the_same_bytes(page: str) -> None:
     assert R.render_html(example()) == page
+
+
+def test_only_a_solver_with_something_to_say_is_heard(page: str) -> None:
+    assert "Solved" not in page
+
+    def status(text: str) -> str:
+        family = example().families[0]
+        assert family.rendered is not None
+        changed = replace(family, rendered=replace(family.rendered, status=text))
+        return R.render_html(replace(example(), families=(changed,)))
+
+    assert "Solved" not in status("Solved: every direction of the image is measured.")
+    assert "Solved, but 3 of 9" in status("Solved, but 3 of 9 directions are not measured above rounding.")
+    assert "Rank deficient" in status("Rank deficient: 3 of 9 directions are not measured.")
+
+
+def test_plan_shows_costs_where_there_are_any_and_no_column_of_zeros(page: str) -> None:
+    table = page.split("<h2>The effect plan</h2>")[1].split("</table>")[0]
+    assert ">Cost<" in table and "0.80 s" in table and "0.00 s" not in table
+    assert '<td class="n">0</td>' in table, "an effect that changes nothing"
+    assert table.count('<td class="n"></td>') == 2, "no cost, no number"
+    free = tuple(replace(row, seconds=0.0) for row in example().effects)
+    assert ">Cost<" not in R.render_html(replace(example(), effects=free))
+
+
+def test_time_outside_all_stages_is_not_hidden() -> None:
+    assert R._stages({"a": 1.0, "b": 2.0, "total": 5.0}) == {"a": 1.0, "b": 2.0, "not in a stage": 2.0}
+    assert R._stages({"a": 1.0, "b": 2.0, "total": 3.02}) == {"a": 1.0, "b": 2.0}
+    assert R._stages({"a": 1.0}) == {"a": 1.0} and R._stages({}) == {}
+
+
+def test_patterns_are_cut_to_a_corner_where_pixels_can_be_seen() -> None:
+    pattern = np.indices((128, 128)).sum(axis=0) % 7 == 0
+    corner = R.PATTERN_CORNER
+    assert R._pattern_png(pattern) == R._pattern_png(pattern[:corner, :corner])
+    assert R._pattern_png(pattern) != R._pattern_png(pattern[1 : corner + 1, :corner])
 
 
 def test_display_clips_but_the_numbers_do_not() -> None:
