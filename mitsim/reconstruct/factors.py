@@ -27,6 +27,22 @@ Structure = Literal["auto", "block", "full"]
 
 
 @dataclass(frozen=True, eq=False)
+class Group:
+    """Scene pixels factorised together, and their pattern rows as ``weights psi^T`` where they are of rank one.
+
+    ``pixels`` (c,), ``patterns`` (c, K), ``shared`` is (weights (c,), psi (K,)) or None.
+    """
+
+    pixels: IndexArray
+    patterns: FloatArray
+    shared: tuple[FloatArray, FloatArray] | None
+
+    def lights(self, index: int) -> bool:
+        """Whether pattern ``index`` lights any of these pixels."""
+        return bool(self.patterns[:, index].any() if self.shared is None else self.shared[1][index])
+
+
+@dataclass(frozen=True, eq=False)
 class Slab:
     """What one pattern index contributes: ``matrix`` (m, c) and the ``columns`` (c of them) it fills in W."""
 
@@ -100,24 +116,31 @@ def pattern_blocks(patterns: FloatArray) -> tuple[IndexArray, ...]:
     return tuple(sorted(found, key=lambda block: int(block[0])))
 
 
+def group_pixels(patterns: FloatArray, structure: Structure) -> tuple[Group, ...]:
+    """What of the factorisation depends on the patterns (n, K) alone; ``full`` makes one group of general rank."""
+    if structure == "full":
+        return (Group(np.arange(len(patterns)), patterns, None),)
+    return tuple(Group(block, patterns[block], _rank_one(patterns[block])) for block in pattern_blocks(patterns))
+
+
 def factorise(
     phi: FloatArray,
     patterns: FloatArray,
-    blocks: tuple[IndexArray, ...],
+    groups: tuple[Group, ...],
     method: Method,
     structure: Structure,
     centred: bool,
 ) -> Side:
-    """Factorise one side; ``phi`` (m, n) and ``patterns`` (n, K) are already checked, ``blocks`` share no pattern."""
+    """Factorise one side; ``phi`` (m, n) and ``patterns`` (n, K) are checked, ``groups`` are those of the patterns."""
     sensor, scene = phi.shape
     build = _projected if method == "svd" else _gram
-    basis, singular, slabs = build(phi, patterns, blocks, structure)
+    basis, singular, slabs = build(phi, patterns, groups, structure)
     return Side(
         basis=_frozen(basis),
         singular=_frozen(singular),
         slabs=slabs,
         projected=method == "svd",
-        n_blocks=len(blocks),
+        n_blocks=len(groups),
         pattern_count=patterns.shape[1],
         sensor_size=sensor,
         scene_size=scene,
@@ -126,35 +149,33 @@ def factorise(
 
 
 def _projected(
-    phi: FloatArray, patterns: FloatArray, blocks: tuple[IndexArray, ...], structure: Structure
+    phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
 ) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
     """SVD of B block by block: basis, singular values, slabs."""
-    parts = [_block_svd(phi[:, block], patterns[block], structure) for block in blocks]
+    parts = [_block_svd(phi[:, group.pixels], group) for group in groups]
     singular = np.concatenate([part[1] for part in parts])
     starts = np.concatenate(([0], np.cumsum([len(part[1]) for part in parts])))
     basis = np.zeros((phi.shape[1], len(singular)))
-    for block, part, start, stop in zip(blocks, parts, starts[:-1], starts[1:], strict=True):
-        basis[block, start:stop] = part[2].T
+    for group, part, start, stop in zip(groups, parts, starts[:-1], starts[1:], strict=True):
+        basis[group.pixels, start:stop] = part[2].T
     # Rank cut of numpy.linalg.matrix_rank, against the largest value of the whole side, not of the block.
     longest = max(phi.shape[0] * patterns.shape[1], phi.shape[1])
     singular[singular <= singular.max() * longest * np.finfo(np.float64).eps] = 0.0
     slabs = []
     for index in range(patterns.shape[1]):
-        lit = [b for b, block in enumerate(blocks) if structure == "full" or patterns[block, index].any()]
+        lit = [b for b, group in enumerate(groups) if structure == "full" or group.lights(index)]
         columns = np.concatenate([np.arange(starts[b], starts[b + 1]) for b in lit] or [np.arange(0)])
         pieces = [parts[b][0][index] for b in lit] or [np.zeros((phi.shape[0], 0))]
         slabs.append(Slab(_as_slice(columns), _frozen(np.concatenate(pieces, axis=1))))
     return basis, singular, tuple(slabs)
 
 
-def _block_svd(
-    phi: FloatArray, patterns: FloatArray, structure: Structure
-) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray]:
+def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray]:
     """U cut into K slabs (m, r), singular values (r,) and V^T (r, n) of one block's stacked matrix."""
-    shared = None if structure == "full" else _rank_one(patterns)
-    if shared is not None:
+    patterns = group.patterns
+    if group.shared is not None:
         # B = psi (x) Phi diag(w): the SVD of one slab serves all, whatever K.
-        weights, psi = shared
+        weights, psi = group.shared
         norm = float(np.linalg.norm(psi))
         left, singular, right = _svd(phi * weights)
         scale = psi / (norm or 1.0)
@@ -195,13 +216,13 @@ def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _gram(
-    phi: FloatArray, patterns: FloatArray, blocks: tuple[IndexArray, ...], structure: Structure
+    phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
 ) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
     """Eigen-decomposition of A block by block (the paper's way), and slabs Phi diag(p_i)."""
     scene = phi.shape[1]
     basis, eigenvalues = np.zeros((scene, scene)), np.zeros(scene)
     start = 0
-    for block in blocks:
+    for block in (group.pixels for group in groups):
         gram = (phi[:, block].T @ phi[:, block]) * (patterns[block] @ patterns[block].T)
         values, vectors = np.linalg.eigh(gram)
         stop = start + len(block)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame
 from mitsim.core.manifest import read_json
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.tv import TVSolution, solve_tv
@@ -134,8 +135,9 @@ def load(run: Measurements, factors: Factors) -> tuple[Prepared, Accumulator]:
     """Factorise the model and add every frame of the run."""
     prepared = prepare(factors.left, factors.right, run.left, run.right, centre=factors.centre)
     frames = prepared.accumulator()
-    for measurement, row, column in run:
-        frames.add(measurement, row, column)
+    with single_threaded_blas():
+        for measurement, row, column in run:
+            frames.add(measurement, row, column)
     return prepared, frames
 
 

@@ -24,16 +24,16 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.accumulator import Accumulator, centred_columns
 from mitsim.reconstruct.factors import (
     FloatArray,
-    IndexArray,
     Method,
     Side,
     Structure,
     check_choices,
     factorise,
-    pattern_blocks,
+    group_pixels,
 )
 from mitsim.reconstruct.regularisation import Spectrum, automatic_lambda
 
@@ -229,19 +229,16 @@ def prepare(
     same = np.array_equal(factors[0], factors[1]) and np.array_equal(patterns[0], patterns[1])
     if centre:
         factors = [centred_columns(factor) for factor in factors]
-    blocks = [_blocks(patterns[0], structure)]
-    blocks.append(blocks[0] if np.array_equal(patterns[0], patterns[1]) else _blocks(patterns[1], structure))
+    groups = [group_pixels(patterns[0], structure)]
+    groups.append(groups[0] if np.array_equal(patterns[0], patterns[1]) else group_pixels(patterns[1], structure))
 
     def side(index: int) -> Side:
-        return factorise(factors[index], patterns[index], blocks[index], method, structure, centre)
+        return factorise(factors[index], patterns[index], groups[index], method, structure, centre)
 
-    first = side(0)
-    return Prepared(first, first if same else side(1), method, centre)
-
-
-def _blocks(patterns: FloatArray, structure: Structure) -> tuple[IndexArray, ...]:
-    """Groups of scene pixels to factorise alone; one group for ``full``."""
-    return (np.arange(len(patterns)),) if structure == "full" else pattern_blocks(patterns)
+    # Products this small gain little from threads of BLAS, and lose a hundredfold when the cores are busy.
+    with single_threaded_blas():
+        first = side(0)
+        return Prepared(first, first if same else side(1), method, centre)
 
 
 def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
