@@ -34,6 +34,8 @@ class Calibration:
     separability_residual
         sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses: noise plus what no separable
         camera explains.
+    unexplained
+        the part of that residual which the stated sensor noise does not account for; equal to it when none was stated.
     condition
         the larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient.
     noise
@@ -47,6 +49,7 @@ class Calibration:
     left: FloatArray
     right: FloatArray
     separability_residual: float
+    unexplained: float
     condition: float
     noise: float
     predicted_error: tuple[float, float]
@@ -69,6 +72,7 @@ def estimate_factors(
     H: npt.ArrayLike,
     centre: bool = False,
     uniform: npt.ArrayLike | None = None,
+    noise: float = 0.0,
 ) -> Calibration:
     """Factors of a separable camera from its responses to striped light.
 
@@ -86,6 +90,9 @@ def estimate_factors(
         (m, m') response under all light, a better estimate than responses number 0 (for example the mean
         over pairs of positive + negative captures). Default: the mean of ``horizontal[0]`` and
         ``vertical[0]``.
+    noise
+        root mean square sensor noise of a response [frame unit], if known: few photons alone then do not make
+        the responses look inseparable.
 
     Raises
     ------
@@ -102,7 +109,7 @@ def estimate_factors(
     a, v = _rank_one_split(mean)
     left = _split(first[0], rows, "horizontal", v, signs.shape[1], centre)
     right = _split(first[1].T, columns, "vertical", a, signs.shape[1], centre)
-    return _calibration(left, right, a, v, signs)
+    return _calibration(left, right, a, v, signs, noise)
 
 
 def _split(
@@ -126,7 +133,9 @@ def _split(
     return result
 
 
-def _calibration(left: _Split, right: _Split, a: FloatArray, v: FloatArray, signs: FloatArray) -> Calibration:
+def _calibration(
+    left: _Split, right: _Split, a: FloatArray, v: FloatArray, signs: FloatArray, stated_noise: float
+) -> Calibration:
     count = signs.shape[1]
     phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
     energy = left.energy + right.energy
@@ -134,16 +143,18 @@ def _calibration(left: _Split, right: _Split, a: FloatArray, v: FloatArray, sign
     # Each response of m m' numbers spends one fitted number a sensor row (or column).
     spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
     noise = float(np.sqrt((left.misfit + right.misfit) / spare))
+    unexplained = float(np.sqrt(max(left.misfit + right.misfit - spare * stated_noise**2, 0.0) / energy))
     condition = max(_squared_condition(phi[0]), _squared_condition(phi[1]))
     predicted = tuple(
         predicted_error(factor, noise, float(np.linalg.norm(other)), count)
         for factor, other in ((phi[0], v), (phi[1], a))
     )
-    ok, status = _verdict(residual, condition)
+    ok, status = _verdict(unexplained, condition)
     return Calibration(
         left=phi[0],
         right=phi[1],
         separability_residual=residual,
+        unexplained=unexplained,
         condition=condition,
         noise=noise,
         predicted_error=(predicted[0], predicted[1]),

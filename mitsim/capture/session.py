@@ -51,8 +51,24 @@ class Session:
         with clock.stage("transport"):
             self.light: Light = collect(self.board, self.plan, *uniform, seed, progress).merged()
         with clock.stage("optics"):
-            white = next(iter(self.light.frames(*uniform, seed)))
-            self.exposure_s = Exposure(None, recipe.exposure_fraction).choose(bench, float(white.irradiance.max()))
+            self.white = next(iter(self.light.frames(*uniform, seed)))
+            peak = float(self.white.irradiance.max())
+            self.exposure_s = Exposure(None, recipe.exposure_fraction).choose(bench, peak)
+
+    @property
+    def response_noise(self) -> float:
+        """Root mean square noise of a +-1 response [electrons / s], from the sensor's closed form.
+
+        Its two frames share the uniform light: variance (mean electrons + dark + 2 read noise^2) / t^2 for a pair; with
+        one frame and a uniform one, 2 Y(positive) - Y(uniform), it is three times the light and 5/2 of the read noise.
+        """
+        sensor, time = self.bench.sensor, self.exposure_s
+        second = Exposer(self.bench, 1.0, self.seed)
+        light = float(second.electrons(self.white).mean()) + 2 * sensor.superpixel_dark_current_e_per_s
+        read = sensor.superpixel_read_noise_e**2
+        if self.pairs:
+            return float(np.sqrt(light / time + 2 * read / time**2))
+        return float(np.sqrt(3 * light / time + 5 * read / time**2))
 
     @property
     def captures(self) -> int:

@@ -24,13 +24,15 @@ FloatArray = npt.NDArray[np.float64]
 class CalibrationResult:
     """What `mitsim calibrate` reports.
 
-    ``phi_error`` is the relative error of the factors, both sides in quadrature, against those that the same procedure
-    finds in noise-free frames; ``noise_free_residual`` is what those frames leave unexplained.
+    ``unexplained_residual`` is the part of the separability residual beyond the sensor's noise, ``noise_free_residual``
+    the residual of noise-free frames. ``phi_error`` is the relative error of the factors, both sides in quadrature,
+    against those that the same procedure finds in noise-free frames.
     """
 
     n: int
     frames: int
     separability_residual: float
+    unexplained_residual: float
     noise_free_residual: float
     phi_error: float
     condition: float
@@ -59,10 +61,12 @@ def calibrate(
     clock = Clock()
     folder = prepare_output(output)
     session = Session(bench, recipe, accuracy, seed, clock, progress)
-    noisy = estimate_factors(*session.noisy(), session.signs, centre=session.centre)
+    noisy = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
     with clock.stage("noise-free check"):
         clean = estimate_factors(*session.noise_free(), session.signs, centre=session.centre)
     warnings = session.plan.warnings + (() if noisy.ok else (noisy.status,))
+    # (left, right) and (-left, -right) are one camera; centred factors have no sum that would tell which it is.
+    sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
     for name, factor in (("left", noisy.left), ("right", noisy.right)):
         write_frame(
             folder / f"{name}.exr",
@@ -73,8 +77,9 @@ def calibrate(
         n=bench.n,
         frames=session.captures,
         separability_residual=noisy.separability_residual,
+        unexplained_residual=noisy.unexplained,
         noise_free_residual=clean.separability_residual,
-        phi_error=float(np.hypot(_relative(noisy.left, clean.left), _relative(noisy.right, clean.right))),
+        phi_error=float(np.hypot(_relative(sign * noisy.left, clean.left), _relative(sign * noisy.right, clean.right))),
         condition=noisy.condition,
         exposure_s=session.exposure_s,
         seconds=clock.seconds(),
