@@ -138,13 +138,9 @@ def test_a_scene_without_projector_is_for_render_only(small_scene: Write) -> Non
         _ = loaded.pixels
 
 
-@pytest.mark.xfail(
-    reason="accepted, and the frame is that of the whole sensor squeezed into the crop", strict=True
-)
+@pytest.mark.xfail(reason="accepted, and the frame is that of the whole sensor squeezed into the crop", strict=True)
 def test_a_cropped_film_is_refused(small_scene: Write) -> None:
-    crop = (
-        '<rfilter type="box"/><integer name="crop_width" value="32"/><integer name="crop_height" value="32"/>'
-    )
+    crop = '<rfilter type="box"/><integer name="crop_width" value="32"/><integer name="crop_height" value="32"/>'
     refusal(replaced(small_scene(), '<rfilter type="box"/>', crop))
 
 

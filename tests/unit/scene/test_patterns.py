@@ -80,9 +80,7 @@ def test_dots_are_the_papers_grid_of_every_kth_pixel() -> None:
 def test_hadamard_repeats_its_matrix_and_the_halves_complement() -> None:
     family = parse_patterns("hadamard:4", 10)
     assert family.signed
-    assert np.array_equal(family.left[4:8], family.left[:4]) and np.array_equal(
-        family.left[8:], family.left[:2]
-    )
+    assert np.array_equal(family.left[4:8], family.left[:4]) and np.array_equal(family.left[8:], family.left[:2])
     first, second = family.captures[6:8]
     assert (first.row, first.column) == (second.row, second.column) and (first.sign, second.sign) == (1, -1)
     assert np.array_equal(family.light(first) + family.light(second), np.ones((10, 10)))

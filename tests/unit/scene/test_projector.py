@@ -54,9 +54,7 @@ def test_a_window_inside_its_canvas_is_found_with_its_offset(small_scene: Callab
 
 
 @pytest.mark.parametrize(("axis", "degrees"), [("y", 5.0), ("y", -3.0), ("x", -5.0), ("x", 2.0)])
-def test_a_turned_projector_casts_a_keystone(
-    small_scene: Callable[..., Path], axis: str, degrees: float
-) -> None:
+def test_a_turned_projector_casts_a_keystone(small_scene: Callable[..., Path], axis: str, degrees: float) -> None:
     grid = grid_of(small_scene(projector_turn=f'<rotate {axis}="1" angle="{degrees}"/>'))
     corners = by_hand(axis, degrees)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))

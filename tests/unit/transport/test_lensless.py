@@ -47,9 +47,7 @@ def test_a_ray_carries_the_masks_transmission_where_it_crosses(mask: str) -> Non
     known = geometry.build_mask().transmission(-at_mask[:, 1], -at_mask[:, 0])
     expected = known * reach**2 / (1 + np.square(t).sum(axis=1)) ** 2
     feature = (at_mask / geometry.mask_feature) % 1
-    clear = (np.abs(feature - 0.5) % 1 > 0.001).all(
-        axis=1
-    )  # float32 may choose either side of a feature's edge
+    clear = (np.abs(feature - 0.5) % 1 > 0.001).all(axis=1)  # float32 may choose either side of a feature's edge
     assert clear.mean() > 0.99
     assert np.allclose(weight[clear], expected[clear], rtol=1e-5)
     if mask != "open":
@@ -57,9 +55,7 @@ def test_a_ray_carries_the_masks_transmission_where_it_crosses(mask: str) -> Non
         assert not np.allclose(known, mirrored), "the check must be able to tell up from down"
 
 
-@pytest.mark.parametrize(
-    ("mask", "open_part"), [("separable", (256 / 511) ** 2), ("flatcam", 0.5 + 0.5 / 511**2)]
-)
+@pytest.mark.parametrize(("mask", "open_part"), [("separable", (256 / 511) ** 2), ("flatcam", 0.5 + 0.5 / 511**2)])
 def test_how_much_of_the_mask_is_open(mask: str, open_part: float) -> None:
     # A field stop that sees the whole mask: tan(half fov) = 8, mask 30.66 mm wide at 2 mm distance.
     geometry = CameraGeometry(mask=mask, pixels=2, fov=2 * np.degrees(np.arctan(8.0)))

@@ -1,0 +1,63 @@
+"""The bench: files that fit together, and the board in place of the scene."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import load_recipe, open_bench
+from mitsim.capture.light import grid_for
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.transport.factored import Tracer
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def test_a_camera_of_another_pitch_is_refused(small_scene: Callable[..., Path]) -> None:
+    path = small_scene(pitch=0.01)
+    with pytest.raises(MitsimError, match=r"11\.72 um, but .* has 10 um") as caught:
+        open_bench(path)
+    assert "imx249.toml" in str(caught.value) and str(path) in str(caught.value)
+    assert open_bench(path, check_camera=False).n == 16
+
+
+def test_identity_and_provenance(small_scene: Callable[..., Path]) -> None:
+    path = small_scene()
+    bench = open_bench(path, defines={"albedo": "0.7"})
+    identity, provenance = bench.identity(), bench.provenance()
+    assert identity["geometry"]["pixels"] == 64 and identity["projector"]["n"] == 16
+    assert provenance["defines"] == {"albedo": "0.7"} and provenance["scene"] == str(path)
+    # The same camera before another scene is the same camera.
+    assert open_bench(path).identity() == identity
+    assert open_bench(small_scene("other", mask_distance=2.5)).identity() != identity
+
+
+@pytest.mark.parametrize("rig", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
+def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[..., Path], rig: str | None) -> None:
+    """Its light is that of a sheet of that reflectance on the aligned plane, even where the scene has none."""
+    place = {} if rig is None else {"rig": rig}
+    bench = open_bench(small_scene(sheet_z=330, **place))
+    sheet = open_bench(small_scene("sheet", **place), defines={"albedo": "0.9"})
+
+    def light(which: object) -> np.ndarray:
+        scene = which.loaded
+        tracer = Tracer(scene.scene, scene.camera, which.source, grid_for(which, 2), 1)
+        return np.asarray(tracer.batch(4).light.todense())
+
+    board, known = light(bench.with_board(0.9)), light(sheet)
+    assert known.sum() > 0
+    assert np.abs(board - known).sum() < 2e-4 * known.sum()
+
+
+def test_recipes_are_checked(tmp_path: Path) -> None:
+    assert load_recipe().signed_capture in ("pair", "uniform")
+    text = shipped("calibration", "session.toml").read_text()
+    bad = tmp_path / "session.toml"
+    bad.write_text(text.replace('signed_capture = "pair"', 'signed_capture = "single"'))
+    with pytest.raises(MitsimError, match="signed_capture: got 'single'"):
+        load_recipe(bad)
+    bad.write_text(text.replace("board_reflectance = 0.99", "board_reflectance = 1.2"))
+    with pytest.raises(MitsimError, match=r"board_reflectance: got 1\.2"):
+        load_recipe(bad)

@@ -1,0 +1,141 @@
+"""Calibration sessions: factors that are the camera's geometric shadow, with the error that their noise predicts.
+
+Few electrons (1 % of full well) make the sensor's noise the only error that counts.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.calibrate.hadamard import Calibration
+from mitsim.capture.bench import Bench, load_recipe, open_bench
+from mitsim.core.errors import MitsimError
+from mitsim.core.frames import checksum, read_frame
+from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.study.calibration import CalibrationResult, calibrate
+
+pytestmark = pytest.mark.usefixtures("variant")
+N = 16
+CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16), ("separable", "pair", 13)]
+Done = tuple[Bench, CalibrationResult, Calibration]
+
+
+def recipe(mode: str, fraction: float = 0.01) -> object:
+    return load_recipe().model_copy(update={"exposure_fraction": fraction, "signed_capture": mode})
+
+
+@pytest.fixture(scope="module")
+def session(
+    shared_scene: Callable[..., Path], variant: str, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., Done]:
+    made: dict[tuple[str, str, int], Done] = {}
+
+    def run(mask: str, mode: str, n: int) -> Done:
+        key = mask, mode, n
+        if key not in made:
+            bench = open_bench(shared_scene(f"{mask}{n}", mask=mask, n=n), variant)
+            folder = tmp_path_factory.mktemp("calibration") / "cal"
+            made[key] = (bench, *calibrate(bench, folder, 1e-3, seed=2, recipe=recipe(mode)))
+        return made[key]
+
+    return run
+
+
+def geometric(bench: Bench) -> np.ndarray:
+    """(pixels, n) shadow of the mask's code by projector pixels of 120 mm / n at 400 mm; flatcam: centred."""
+    geometry = bench.geometry
+    code = geometry.build_mask().terms[-1][1]
+    scene = centred_edges(bench.n, 120.0 / bench.n)
+    factor = scene_factor(code, geometry.mask_feature, geometry.pixel_edges, scene, geometry.mask_distance, 400.0)
+    return factor - factor.mean(axis=0) if geometry.mask == "flatcam" else factor
+
+
+@pytest.mark.parametrize(("mask", "mode", "n"), CASES)
+def test_factors_are_the_geometric_shadow_within_their_noise(
+    session: Callable[..., Done], mask: str, mode: str, n: int
+) -> None:
+    """Each column up to its own scale (falloff makes them 1 % different): the rest is the predicted noise.
+
+    1008 numbers a side tell a noise to 2 %; the light's fall-off inside a projector pixel adds a per mille.
+    """
+    bench, _, calibration = session(mask, mode, n)
+    truth = geometric(bench)
+    for factor, predicted in zip((calibration.left, calibration.right), calibration.predicted_error, strict=True):
+        scale = (factor * truth).sum(axis=0) / np.square(truth).sum(axis=0)
+        assert np.ptp(scale) < (0.1 if mask == "separable" else 1.0) * abs(scale.mean())
+        error = np.linalg.norm(factor - truth * scale) / np.linalg.norm(factor)
+        assert error == pytest.approx(predicted, rel=0.12)
+        assert np.linalg.norm(factor - truth[::-1] * scale) > 3 * error * np.linalg.norm(factor), "orientation"
+
+
+@pytest.mark.parametrize(("mask", "mode", "n"), CASES)
+def test_the_reported_error_is_the_predicted_one(session: Callable[..., Done], mask: str, mode: str, n: int) -> None:
+    _, result, calibration = session(mask, mode, n)
+    assert result.phi_error == pytest.approx(np.hypot(*calibration.predicted_error), rel=0.3)
+    assert result.noise_free_residual < 2e-3 < result.separability_residual
+    assert result.condition == calibration.condition
+
+
+def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
+    """left x right reproduces the rate of a uniform frame: E A t eta / (h c / lambda), from the board's radiance."""
+    bench, _, calibration = session("separable", "pair", 16)
+    rate = np.outer(calibration.left.sum(axis=1), calibration.right.sum(axis=1))
+    radiance = 0.99 * 111000 / 400**2
+    tau = (np.arange(N) - 7.5) * 0.3 / N
+    falloff = (1 + np.square(tau)[:, None] + np.square(tau)[None, :]) ** -2
+    shadow = geometric(bench)
+    irradiance = radiance * (0.3 / N) ** 2 * shadow @ falloff @ shadow.T
+    photon_j = 6.62607015e-34 * 299792458 / 562e-9
+    expected = irradiance * (11.72e-6) ** 2 * bench.sensor.quantum_efficiency / photon_j
+    # A cell's falloff is taken at its middle (2e-4); noise of the sum of 16 columns is below a percent a pixel.
+    assert rate.mean() == pytest.approx(expected.mean(), rel=3e-3)
+    assert np.linalg.norm(rate - expected) < 0.03 * np.linalg.norm(expected)
+
+
+def test_number_of_frames(session: Callable[..., Done]) -> None:
+    assert session("separable", "pair", 16)[1].frames == 2 * 2 * 16
+    assert session("separable", "uniform", 16)[1].frames == 2 * (16 + 1)
+    # 13 is no Hadamard order: the patterns are those of 16.
+    assert session("separable", "pair", 13)[1].frames == 2 * 2 * 16
+
+
+def test_the_folder(session: Callable[..., Done]) -> None:
+    bench, result, calibration = session("separable", "pair", 16)
+    folder = Path(result.output)
+    assert sorted(path.name for path in folder.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["kind"] == "calibration" and manifest["centre"] is False
+    assert manifest["camera"] == json.loads(json.dumps(bench.identity()))
+    for name, factor in (("left", calibration.left), ("right", calibration.right)):
+        channels, metadata = read_frame(folder / f"{name}.exr")
+        assert np.array_equal(channels["factor"], factor.astype(np.float32))
+        assert metadata["unit"] == "sqrt(e-/s)"
+        assert manifest["checksums"][f"{name}.exr"] == checksum(folder / f"{name}.exr")
+
+
+def test_flatcam_is_centred(session: Callable[..., Done]) -> None:
+    _, result, calibration = session("flatcam", "pair", 16)
+    assert json.loads((Path(result.output) / "manifest.json").read_text())["centre"] is True
+    for factor in (calibration.left, calibration.right):
+        assert np.abs(factor.sum(axis=0)).max() < 1e-9 * np.abs(factor).sum()
+
+
+def test_seeds(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
+    bench = open_bench(shared_scene("separable16", n=16))
+    one, again, other = (
+        calibrate(bench, tmp_path / name, 2e-2, seed=seed, recipe=recipe("uniform"))[1].left
+        for name, seed in (("one", 1), ("again", 1), ("other", 2))
+    )
+    assert np.array_equal(one, again) and not np.allclose(one, other, rtol=1e-6)
+
+
+def test_a_used_folder_is_refused_before_any_work(
+    session: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, result, _ = session("separable", "pair", 16)
+    monkeypatch.setattr("mitsim.capture.session.make_plan", lambda *_: pytest.fail("work was done first"))
+    with pytest.raises(MitsimError, match="holds files already"):
+        calibrate(bench, result.output)
