@@ -6,26 +6,22 @@ carries no time of writing, so the same data give the same bytes.
 
 from __future__ import annotations
 
-import base64
 import math
 import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mitsim.core.errors import MitsimError
 from mitsim.study import plots
+from mitsim.study.images import PATTERN_CORNER, figure_png, finite, pattern_png, reflectance_png
 
 Array = NDArray[Any]
 
-PATTERN_CORNER = 40  # projector pixels a side that are shown of a pattern
 _DASH = "\N{EN DASH}"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -194,8 +190,8 @@ def render_html(report: ReportData) -> str:
         db=_decibel,
         seconds=_seconds,
         trouble=_trouble,
-        reflectance=_reflectance_png,
-        pattern=_pattern_png,
+        reflectance=reflectance_png,
+        pattern=pattern_png,
     )
     page = environment.get_template("report.html")
     return page.render(
@@ -206,17 +202,17 @@ def render_html(report: ReportData) -> str:
 def _figures(report: ReportData) -> dict[str, Any]:
     """The page's plots as data URIs, by name, where there are data for them; and the total time in s."""
     figures: dict[str, Any] = {"total": report.seconds.get("total", math.fsum(report.seconds.values()))}
-    figures["frames"] = [(f.label, _figure_png(plots.frame(_finite(f.dn, f.label)))) for f in report.frames]
+    figures["frames"] = [(f.label, figure_png(plots.frame(finite(f.dn, f.label)))) for f in report.frames]
     spectra = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
     if spectra:
-        figures["spectra"] = _figure_png(plots.singular_values(spectra))
+        figures["spectra"] = figure_png(plots.singular_values(spectra))
     both = [
         (f.label, f.idealised, f.rendered)
         for f in report.families
         if f.idealised is not None and f.rendered is not None
     ]
     if both:
-        figures["quality"] = _figure_png(
+        figures["quality"] = figure_png(
             plots.quality_bars(
                 [label for label, _, _ in both],
                 [ideal.psnr_db for _, ideal, _ in both],
@@ -225,10 +221,10 @@ def _figures(report: ReportData) -> dict[str, Any]:
         )
     positive = {row.name: row.value for row in report.budget if row.value > 0.0}
     if positive:
-        figures["budget"] = _figure_png(plots.error_bars(positive, report.accuracy))
+        figures["budget"] = figure_png(plots.error_bars(positive, report.accuracy))
     figures["stages"] = _stages(report.seconds)
     if figures["stages"]:
-        figures["seconds"] = _figure_png(plots.seconds_by_stage(figures["stages"]))
+        figures["seconds"] = figure_png(plots.seconds_by_stage(figures["stages"]))
     return figures
 
 
@@ -249,46 +245,6 @@ def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
         found = {f.name: getattr(f, row).psnr_db for f in families if getattr(f, row) is not None}
         best[row] = max(found, key=lambda name: found[name]) if found else ""
     return best
-
-
-def _reflectance_png(image: Array, name: str = "image") -> str:
-    """Reflectance as an sRGB grey PNG: clipped to 0..1 for display only, so a screen shows its lightness."""
-    linear = np.clip(_finite(image, name), 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
-    return _grey_png(encoded)
-
-
-def _pattern_png(pattern: Array) -> str:
-    """Top left corner of a pattern, where single pixels can be told apart: 0..1 as it is, -1..1 with -1 black."""
-    values = _finite(pattern, "pattern")[:PATTERN_CORNER, :PATTERN_CORNER]
-    return _grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values)
-
-
-def _grey_png(values: Array) -> str:
-    """Values 0..1 as a grey PNG of at least 384 pixels a side, whole copies of each pixel, as a data URI."""
-    from matplotlib.image import imsave
-
-    copies = max(1, math.ceil(384 / max(values.shape)))
-    buffer = BytesIO()
-    large = np.kron(values, np.ones((copies, copies)))
-    imsave(buffer, large, cmap="gray", vmin=0.0, vmax=1.0, format="png")
-    return _data_uri(buffer)
-
-
-def _figure_png(figure: Figure) -> str:
-    figure.savefig(buffer := BytesIO(), format="png", dpi=160)
-    return _data_uri(buffer)
-
-
-def _data_uri(buffer: BytesIO) -> str:
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def _finite(image: Array, name: str) -> NDArray[np.float64]:
-    values = np.asarray(image, dtype=np.float64)
-    if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
-        raise MitsimError(f"report: {name} of shape {values.shape} must be rows x columns of finite numbers")
-    return values
 
 
 def _scientific(value: float | None) -> str:

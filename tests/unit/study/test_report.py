@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.study import images
 from mitsim.study import report as R
 
 N = 32
@@ -202,19 +203,19 @@ def test_time_outside_all_stages_is_not_hidden() -> None:
 
 def test_patterns_are_cut_to_a_corner_where_pixels_can_be_seen() -> None:
     pattern = np.indices((128, 128)).sum(axis=0) % 7 == 0
-    corner = R.PATTERN_CORNER
-    assert R._pattern_png(pattern) == R._pattern_png(pattern[:corner, :corner])
-    assert R._pattern_png(pattern) != R._pattern_png(pattern[1 : corner + 1, :corner])
+    corner = images.PATTERN_CORNER
+    assert images.pattern_png(pattern) == images.pattern_png(pattern[:corner, :corner])
+    assert images.pattern_png(pattern) != images.pattern_png(pattern[1 : corner + 1, :corner])
 
 
 def test_display_clips_but_the_numbers_do_not() -> None:
     bright = np.full((8, 8), 7.0)
-    assert R._reflectance_png(bright) == R._reflectance_png(np.ones((8, 8)))
-    assert R._reflectance_png(bright) != R._reflectance_png(np.full((8, 8), 0.99))
+    assert images.reflectance_png(bright) == images.reflectance_png(np.ones((8, 8)))
+    assert images.reflectance_png(bright) != images.reflectance_png(np.full((8, 8), 0.99))
 
 
 def test_signed_patterns_show_minus_one_black() -> None:
-    assert R._pattern_png(np.array([[1.0, 0.0, -1.0]])) == R._pattern_png(np.array([[1.0, 0.5, 0.0]]))
+    assert images.pattern_png(np.array([[1.0, 0.0, -1.0]])) == images.pattern_png(np.array([[1.0, 0.5, 0.0]]))
 
 
 def test_a_loss_is_called_a_loss() -> None:
