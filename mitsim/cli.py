@@ -6,7 +6,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,7 +27,12 @@ app = typer.Typer(
 Scene = Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
-Variant = Annotated[str, typer.Option(help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral")]
+Variant = Annotated[
+    str,
+    typer.Option(
+        help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral", callback=lambda name: _variant(name)
+    ),
+]
 Seed = Annotated[int, typer.Option(help="root of every random stream")]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
 Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", metavar="FILE.toml")]
@@ -48,9 +53,19 @@ def main() -> None:
     except Exception as error:
         # Usage errors of click (wherever typer keeps it) carry their own one-line message.
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
-            _fail(error.format_message())
+            _fail(_usage(error))
         raise
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _usage(error: Any) -> str:
+    """Click's sentence about a command line, with the value that a typer which checks with pydantic leaves out."""
+    message: str = error.format_message()
+    checked = getattr(error.__cause__, "errors", None)
+    if checked is not None:
+        message += f"; got {checked()[0].get('input')!r}"
+    # Without arguments the help has been shown already and says what to do.
+    return message or "give one of the commands above"
 
 
 def _fail(message: str) -> None:
@@ -81,7 +96,7 @@ def demo(
     from mitsim.study.demo import FAMILIES
     from mitsim.study.demo import demo as run_demo
 
-    with _progress(quiet or as_json) as progress:
+    with _work(output, quiet or as_json) as progress:
         path = _scene(scene) if scene is not None else None
         result = run_demo(output, path, variant, accuracy, seed, progress)
     lines = [
@@ -151,7 +166,7 @@ def capture(
     from mitsim.capture.run import capture as run_capture
 
     chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
-    with _progress(quiet or as_json) as progress:
+    with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define)
         result = run_capture(bench, patterns, output, accuracy, seed, chosen, resume, progress)
     payload = {key: value for key, value in asdict(result).items() if key != "plan"}
@@ -184,7 +199,7 @@ def calibrate(
     from mitsim.capture.bench import load_recipe
     from mitsim.study.calibration import calibrate as run_calibration
 
-    with _progress(quiet or as_json) as progress:
+    with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define)
         result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress)
     lines = [
@@ -213,7 +228,9 @@ def reconstruct(
     from mitsim.study.quality import summary
 
     value: float | Literal["auto"] = _number("--lambda", lam, "auto", least=0.0) if lam != "auto" else "auto"  # type: ignore[assignment]
-    result = run_reconstruct(run, calibration, output or run / "reconstruction", value, method)
+    output = output or run / "reconstruction"
+    with _work(output, silent=True):
+        result = run_reconstruct(run, calibration, output, value, method)
     lines = [result.status]
     if result.psnr is not None and result.ssim is not None:
         lines.append(f"PSNR {result.psnr:.2f} dB, SSIM {result.ssim:.3f}")
@@ -240,7 +257,9 @@ def render(
     """Expected irradiance under the scene's own light, by either estimator."""
     from mitsim.capture.render import render as run_render
 
-    with _progress(quiet or as_json) as progress:
+    if output.suffix.lower() != ".exr":
+        raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
+    with _work(output, quiet or as_json) as progress:
         result = run_render(_scene(scene), output, estimator, spp, accuracy, seed, variant, _defines(define), progress)
     lines = [
         f"{result.estimator}: mean irradiance {result.mean:.4e} W/m^2, relative noise {result.mc_error:.1e}, "
@@ -266,7 +285,7 @@ def study(
 
     if name not in STUDIES:
         raise MitsimError(f"study {name!r}: this version has {', '.join(STUDIES)}")
-    with _progress(quiet or as_json) as progress:
+    with _work(output, quiet or as_json) as progress:
         module, function = STUDIES[name].split(":")
         run_study = getattr(importlib.import_module(module), function)
         result = run_study(_bench(scene, variant, None, None, define), output, patterns, seed, progress)
@@ -308,6 +327,16 @@ def _scene(scene: Path) -> Path:
     raise MitsimError(f"{scene}: no such scene file, and no shipped scene of that name; shipped are {known}")
 
 
+def _variant(name: str) -> str:
+    """The name, refused when it is none that light can be traced in; every verb checks it alike."""
+    from mitsim.core.environment import VARIANTS
+
+    # CUDA has the same kinds; whether there is a GPU shows when the variant is loaded.
+    if name.replace("cuda_", "llvm_", 1) not in VARIANTS:
+        raise MitsimError(f"--variant {name!r}: use {', '.join(VARIANTS)}")
+    return name
+
+
 def _bench(scene: Path, variant: str, camera: Path | None, projector: Path | None, define: Sequence[str] | None) -> Any:
     from mitsim.capture.bench import open_bench
 
@@ -338,9 +367,23 @@ def _number(option: str, text: str, word: str, least: float | None = None) -> fl
 
 
 @contextmanager
+def _work(output: Path, silent: bool) -> Iterator[Callable[[str, float], None]]:
+    """A progress bar while the context lasts; a folder ``output`` that a refusal would leave empty is removed."""
+    existed = output.exists()
+    try:
+        with _progress(silent) as progress:
+            yield progress
+    except MitsimError:
+        if not existed:
+            with suppress(OSError):
+                output.rmdir()
+        raise
+
+
+@contextmanager
 def _progress(silent: bool) -> Iterator[Callable[[str, float], None]]:
-    """A progress bar on stderr; nothing when asked to be quiet."""
-    if silent:
+    """A progress bar on stderr; nothing when asked to be quiet, or when stderr is no terminal."""
+    if silent or not sys.stderr.isatty():
         yield lambda stage, fraction: None
         return
     from rich.console import Console

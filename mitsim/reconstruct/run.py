@@ -9,118 +9,153 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
+from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame
 from mitsim.core.manifest import read_json
-from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 
 FloatArray = npt.NDArray[np.float64]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Digital(BaseModel):
+    """How digital numbers become photoelectrons a second: (DN - black level) / gain / exposure - dark current."""
+
+    model_config = ConfigDict(frozen=True)
+
+    exposure_s: Positive = Field(description="exposure of every frame [s]")
+    gain_dn_per_e: Positive = Field(description="digital numbers per electron")
+    black_level_dn: NonNegative = Field(description="digital number without charge")
+    dark_current_e_per_s: NonNegative = Field(description="dark electrons a second and pixel")
+
+
+class Shot(BaseModel):
+    """One captured frame: pattern (row, column), whole (sign 0) or the +1 or -1 half of a signed pattern."""
+
+    model_config = ConfigDict(frozen=True)
+
+    file: str = Field(min_length=1, description="name of the frame in the run's folder")
+    row: int = Field(ge=0, description="column i of P_L")
+    column: int = Field(ge=0, description="column j of P_R")
+    sign: Literal[-1, 0, 1] = Field(description="0, or the half of a signed pattern")
+
+
+class Patterns(BaseModel):
+    """Factors of the patterns, (n, K) each, and the frames that show them."""
+
+    model_config = ConfigDict(frozen=True)
+
+    P_L: tuple[tuple[Finite, ...], ...] = Field(description="(n, K) rows of P_L")
+    P_R: tuple[tuple[Finite, ...], ...] = Field(description="(n', K') rows of P_R")
+    captures: tuple[Shot, ...] = Field(description="every frame of the run")
+
+
+class RunManifest(BaseModel):
+    """What a run's manifest.json must say; anything else in it is left to others."""
+
+    model_config = ConfigDict(frozen=True)
+
+    camera: dict[str, Any] = Field(description="identity that a calibration must share")
+    digital: Digital = Field(description="how frames are read")
+    patterns: Patterns = Field(description="what was projected")
+    checksums: dict[str, str] = Field(default={}, description="SHA-256 by file name, where known")
+
+
+class CalibrationManifest(BaseModel):
+    """What a calibration's manifest.json must say."""
+
+    model_config = ConfigDict(frozen=True)
+
+    camera: dict[str, Any] = Field(description="identity that a run must share")
+    centre: StrictBool = Field(default=False, description="row and column means are taken out (FlatCam masks)")
+    checksums: dict[str, str] = Field(default={}, description="SHA-256 by file name, where known")
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Frames of one run, as electrons a second.
-
-    ``left``, ``right`` are P_L and P_R, (n, K); ``camera`` is the identity that a calibration must share.
-    """
+    """Frames of one run, as electrons a second; ``left``, ``right`` are P_L and P_R, (n, K)."""
 
     folder: Path
-    camera: Mapping[str, Any]
+    manifest: RunManifest
     left: FloatArray
     right: FloatArray
-    digital: Mapping[str, float]
-    captures: tuple[Mapping[str, Any], ...]
-    checksums: Mapping[str, str]
 
-    def __iter__(self) -> Iterator[tuple[FloatArray, int, int]]:
-        """(measurement (m, m'), i, j) for every pattern; the halves of a signed pattern come as their difference."""
+    def frames(self, shape: tuple[int, int]) -> Iterator[tuple[FloatArray, int, int]]:
+        """(measurement of ``shape``, i, j) for every pattern; the halves of a signed one come as their difference."""
         waiting: dict[tuple[int, int], FloatArray] = {}
-        for shown in self.captures:
-            index, sign = (int(shown["row"]), int(shown["column"])), int(shown["sign"])
-            frame = self._rate(str(shown["file"])) * (sign or 1)
-            if sign and index not in waiting:
+        for shot in self.manifest.patterns.captures:
+            index = (shot.row, shot.column)
+            frame = self._rate(shot.file, shape) * (shot.sign or 1)
+            if shot.sign and index not in waiting:
                 waiting[index] = frame
                 continue
             yield waiting.pop(index, 0.0) + frame, *index
-        if waiting:
-            raise MitsimError(f"{self.folder}: pattern {next(iter(waiting))} has only one of its two captures")
 
-    def _rate(self, name: str) -> FloatArray:
+    def _rate(self, name: str, shape: tuple[int, int]) -> FloatArray:
         path = self.folder / name
-        expected = self.checksums.get(name)
-        if expected is not None and checksum(path) != expected:
-            raise MitsimError(
-                f"{path}: the frame is not the one that was captured (checksum); capture it again with --resume"
-            )
-        channels, _ = read_frame(path)
-        if "DN" not in channels:
-            raise MitsimError(f"{path}: channels are {', '.join(channels)}; a captured frame has DN")
-        digital = self.digital
-        electrons = (channels["DN"].astype(np.float64) - digital["black_level_dn"]) / digital["gain_dn_per_e"]
-        return electrons / digital["exposure_s"] - digital["dark_current_e_per_s"]
+        verify(self.folder, name, self.manifest.checksums, "capture it again with --resume")
+        values = _channel(path, "DN")
+        if values.shape != shape:
+            raise MitsimError(f"{path}: the frame is {_size(values.shape)}, but the calibration's are {_size(shape)}")
+        digital = self.manifest.digital
+        electrons = (values - digital.black_level_dn) / digital.gain_dn_per_e
+        return electrons / digital.exposure_s - digital.dark_current_e_per_s
 
 
 @dataclass(frozen=True)
 class Factors:
-    """Calibrated Phi_L, Phi_R [sqrt(electrons / s)] and the camera they belong to; ``centre`` for FlatCam masks."""
+    """Calibrated Phi_L (m, n), Phi_R (m', n') [sqrt(electrons / s)] and what the calibration says of them."""
 
     left: FloatArray
     right: FloatArray
-    camera: Mapping[str, Any]
-    centre: bool
+    manifest: CalibrationManifest
 
 
 def read_run(folder: Path | str) -> Measurements:
     """The run in a folder. MitsimError when it is not a complete capture."""
     folder = Path(folder)
-    manifest = _manifest(folder, "capture")
-    patterns = _section(manifest, folder, "patterns")
-    try:
-        digital = {key: float(value) for key, value in _section(manifest, folder, "digital").items()}
-        left, right = (np.array(patterns[name], dtype=np.float64) for name in ("P_L", "P_R"))
-        captures = tuple(dict(shown) for shown in patterns["captures"])
-        for key in ("exposure_s", "black_level_dn", "gain_dn_per_e", "dark_current_e_per_s"):
-            digital[key]
-    except (KeyError, TypeError, ValueError) as error:
-        raise MitsimError(
-            f"{folder}/manifest.json: {error} is missing or of the wrong form; see docs/formats.md"
-        ) from None
-    return Measurements(
-        folder,
-        _section(manifest, folder, "camera"),
-        left,
-        right,
-        digital,
-        captures,
-        manifest.get("checksums", {}),
-    )
+    where = f"{folder}/manifest.json"
+    manifest = validated(RunManifest, _manifest(folder, "capture"), where)
+    left = _matrix(where, "P_L", manifest.patterns.P_L)
+    right = _matrix(where, "P_R", manifest.patterns.P_R)
+    _check_captures(where, manifest.patterns.captures, left.shape[1], right.shape[1])
+    return Measurements(folder, manifest, left, right)
 
 
 def read_calibration(folder: Path | str) -> Factors:
     """The factors in a calibration folder. MitsimError when it is not a complete calibration."""
     folder = Path(folder)
-    manifest = _manifest(folder, "calibration")
+    manifest = validated(CalibrationManifest, _manifest(folder, "calibration"), f"{folder}/manifest.json")
     factors = []
-    for name in ("left", "right"):
-        channels, _ = read_frame(folder / f"{name}.exr")
-        if "factor" not in channels:
-            raise MitsimError(f"{folder}/{name}.exr: channels are {', '.join(channels)}; a calibration has factor")
-        factors.append(channels["factor"].astype(np.float64))
-    return Factors(factors[0], factors[1], _section(manifest, folder, "camera"), bool(manifest.get("centre", False)))
+    for name in ("left.exr", "right.exr"):
+        verify(folder, name, manifest.checksums, "calibrate again")
+        factors.append(_channel(folder / name, "factor"))
+    return Factors(factors[0], factors[1], manifest)
+
+
+def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -> None:
+    """MitsimError when a file is not the one whose checksum was noted; files without one are taken as they are."""
+    expected = checksums.get(name)
+    if expected is not None and checksum(folder / name) != expected:
+        raise MitsimError(f"{folder / name}: not the file that was written (its checksum differs); {remedy}")
 
 
 def check_fit(run: Measurements, factors: Factors, calibration: Path | str) -> None:
     """Refuse a calibration of another camera, mask, distance or projector, naming the first thing that differs."""
-    for part in sorted({*run.camera, *factors.camera}):
-        ours, theirs = run.camera.get(part), factors.camera.get(part)
+    ours_all, theirs_all = run.manifest.camera, factors.manifest.camera
+    for part in sorted({*ours_all, *theirs_all}):
+        ours, theirs = ours_all.get(part), theirs_all.get(part)
         if ours == theirs:
             continue
         if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
@@ -129,15 +164,20 @@ def check_fit(run: Measurements, factors: Factors, calibration: Path | str) -> N
         raise MitsimError(
             f"calibration {calibration}: {part} is {theirs}, but {run.folder} has {ours}; calibrate this camera"
         )
+    for side, pattern, factor in (("P_L", run.left, factors.left), ("P_R", run.right, factors.right)):
+        if len(pattern) != factor.shape[1]:
+            raise MitsimError(
+                f"{run.folder}/manifest.json: patterns.{side} has {len(pattern)} scene pixels, but calibration "
+                f"{calibration} has {factor.shape[1]}; calibrate with this projector"
+            )
 
 
 def load(run: Measurements, factors: Factors) -> tuple[Prepared, Accumulator]:
     """Factorise the model and add every frame of the run."""
-    prepared = prepare(factors.left, factors.right, run.left, run.right, centre=factors.centre)
+    prepared = prepare(factors.left, factors.right, run.left, run.right, centre=factors.manifest.centre)
     frames = prepared.accumulator()
-    with single_threaded_blas():
-        for measurement, row, column in run:
-            frames.add(measurement, row, column)
+    for measurement, row, column in run.frames((len(factors.left), len(factors.right))):
+        frames.add(measurement, row, column)
     return prepared, frames
 
 
@@ -150,7 +190,7 @@ def solve(prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"],
     raise MitsimError(f"--method {method!r}: use tikhonov or tv")
 
 
-def _manifest(folder: Path, kind: str) -> Mapping[str, Any]:
+def _manifest(folder: Path, kind: str) -> dict[str, Any]:
     if not folder.is_dir():
         raise MitsimError(
             f"{folder}: no such folder; give the output of `mitsim {'capture' if kind == 'capture' else 'calibrate'}`"
@@ -164,8 +204,49 @@ def _manifest(folder: Path, kind: str) -> Mapping[str, Any]:
     return manifest
 
 
-def _section(manifest: Mapping[str, Any], folder: Path, name: str) -> Mapping[str, Any]:
-    section = manifest.get(name)
-    if not isinstance(section, dict):
-        raise MitsimError(f"{folder}/manifest.json: section {name!r} is missing; see docs/formats.md")
-    return section
+def _channel(path: Path, name: str) -> FloatArray:
+    """One channel of a frame, all of it finite."""
+    channels, _ = read_frame(path)
+    if name not in channels:
+        raise MitsimError(f"{path}: channels are {', '.join(channels)}; {name} is needed")
+    values = channels[name].astype(np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(values)))
+    if bad:
+        raise MitsimError(f"{path}: {bad} values are not finite; capture or calibrate again")
+    return values
+
+
+def _matrix(where: str, name: str, rows: tuple[tuple[float, ...], ...]) -> FloatArray:
+    lengths = sorted({len(row) for row in rows})
+    if len(lengths) != 1 or lengths[0] == 0:
+        found = ", ".join(map(str, lengths)) or "no"
+        raise MitsimError(f"{where}: patterns.{name} has rows of {found} numbers; give one row of K for a scene pixel")
+    return np.array(rows, dtype=np.float64)
+
+
+def _check_captures(where: str, captures: tuple[Shot, ...], rows: int, columns: int) -> None:
+    """Every pattern once, or as its two halves."""
+    signs: dict[tuple[int, int], list[int]] = {}
+    for number, shot in enumerate(captures):
+        if shot.row >= rows or shot.column >= columns:
+            raise MitsimError(
+                f"{where}: patterns.captures.{number}: got pattern ({shot.row}, {shot.column}); "
+                f"allowed are 0 to {rows - 1} and 0 to {columns - 1}"
+            )
+        signs.setdefault((shot.row, shot.column), []).append(shot.sign)
+    for (row, column), found in signs.items():
+        if sorted(found) not in ([0], [-1, 1]):
+            raise MitsimError(
+                f"{where}: patterns.captures: pattern ({row}, {column}) has frames of signs {found}; "
+                "give one of sign 0, or one of +1 and one of -1"
+            )
+    missing = [(i, j) for i in range(rows) for j in range(columns) if (i, j) not in signs]
+    if missing:
+        raise MitsimError(
+            f"{where}: patterns.captures: {len(missing)} of {rows * columns} patterns have no frame, "
+            f"first {missing[0]}; capture them all"
+        )
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape))

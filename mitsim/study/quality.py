@@ -14,11 +14,12 @@ from matplotlib import image as matplotlib_image
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
 from mitsim.core.manifest import prepare_output, write_json
-from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run, solve
+from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run, solve, verify
 from mitsim.reconstruct.solver import Solution
 from mitsim.study.metrics import TRUTH_FILE, psnr, read_truth, ssim
 
 FloatArray = npt.NDArray[np.float64]
+IMAGE_FILE = "image.exr"
 
 
 @dataclass(frozen=True)
@@ -57,14 +58,17 @@ def reconstruct(
         raise MitsimError(f"--method {method!r}: use tikhonov or tv")
     measurements, factors = read_run(run), read_calibration(calibration)
     check_fit(measurements, factors, calibration)
-    folder = prepare_output(output, overwrite=True)
+    truth = None
+    if (Path(run) / TRUTH_FILE).is_file():
+        verify(Path(run), TRUTH_FILE, measurements.manifest.checksums, "remove it, or capture again with --resume")
+        truth = read_truth(Path(run))
+    # Only an earlier result is replaced: image.exr is the first file of one.
+    folder = prepare_output(output, overwrite=(Path(output) / IMAGE_FILE).is_file())
     read = time.perf_counter()
     prepared, frames = load(measurements, factors)
     added = time.perf_counter()
     solution = solve(prepared, frames, lam, method)
     solved = time.perf_counter()
-    has_truth = (Path(run) / TRUTH_FILE).is_file()
-    truth = read_truth(Path(run)) if has_truth else None
     result = ReconstructionResult(
         image=solution.image,
         psnr=psnr(solution.image, truth) if truth is not None else None,
@@ -98,7 +102,7 @@ def summary(result: ReconstructionResult) -> dict[str, object]:
 
 
 def _write(folder: Path, result: ReconstructionResult, method: str) -> None:
-    write_frame(folder / "image.exr", {"reflectance": result.image.astype(np.float32)}, {"method": method})
+    write_frame(folder / IMAGE_FILE, {"reflectance": result.image.astype(np.float32)}, {"method": method})
     # Display only: clipped to 0..1 and with the sRGB curve's approximate 1/2.2.
     display = np.clip(result.image, 0, 1) ** (1 / 2.2)
     part = folder / ".image.part.png"
