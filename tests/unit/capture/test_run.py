@@ -5,6 +5,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -282,6 +283,15 @@ def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> No
         assert residual.std() == pytest.approx(noise, rel=0.06)
 
 
+def test_dark_current_is_taken_off(bench: Bench) -> None:
+    """1e5 dark electrons a second in 0.1 s on a frame without light: 1e4 electrons, a rate of 0 +- 1000 a pixel."""
+    noisy = replace(bench, sensor=bench.sensor.model_copy(update={"dark_current_e_per_s": 25e3}))
+    exposer = Exposer(noisy, 0.1, seed=1)
+    rate = exposer.rate(exposer.digital(np.zeros((64, 64)), "dark"))
+    assert abs(rate.mean()) < 5 * 1000 / 64
+    assert rate.std() == pytest.approx(1000, rel=0.06)
+
+
 def test_ambient_light_is_flagged(small_scene: Callable[..., Path], tmp_path: Path) -> None:
     light = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
     done = capture(open_bench(small_scene(extra=light)), "uniform", tmp_path / "run", 2e-2)
@@ -307,5 +317,6 @@ def test_sampling_stops_at_its_target(bench: Bench) -> None:
     for light, target in zip((loose, tight), targets, strict=True):
         assert light.reached and len(light.groups) == GROUPS
         assert target / 4 < light.sampling_error <= target
+        assert all((a != b).nnz for a, b in combinations(light.groups, 2)), "groups have to be independent"
     # Half the error takes four times the paths; the estimate of the error is good to some 25 %.
     assert tight.paths / loose.paths == pytest.approx((loose.sampling_error / tight.sampling_error) ** 2, rel=0.6)

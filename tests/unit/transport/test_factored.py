@@ -151,6 +151,25 @@ def test_light_is_filed_where_it_was_reflected_not_where_it_was_aimed(small_scen
     assert np.average(middle, weights=left) == pytest.approx(-0.30 + 0.15 / N, abs=size)
 
 
+def test_all_anchors_see_a_point_in_the_same_cell(shared_scene: Callable[..., Path]) -> None:
+    """A sheet off the aligned plane: rays are aimed past its points by up to a quarter of a cell, filed where they hit.
+
+    Anchors lie at +-14 mm; 14 mm (1/350 - 1/400) is 0.005 in tan-angle, one cell of this grid.
+    """
+    bench = open_bench(shared_scene("off", pitch=0.625, sheet_z=350), check_camera=False)
+    trace = tracer(bench, subdivision=4, anchors=2)
+    rows, columns = trace.grid.shape
+    light = sum(trace.batch(seed).light for seed in range(8))[[5 * N + 9]].todense().reshape(2, rows, 2, columns)
+    row_middle, column_middle = (np.arange(count) + 0.5 for count in (rows, columns))
+    centre = np.array(
+        [
+            (np.average(row_middle, weights=block.sum(axis=1)), np.average(column_middle, weights=block.sum(axis=0)))
+            for block in (np.asarray(light[a, :, b]) for a, b in np.ndindex(2, 2))
+        ]
+    )
+    assert np.ptp(centre, axis=0).max() < 0.35, "in cells; by aim it would be 2"
+
+
 def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:
     bench = open_bench(small_scene(), defines={"albedo": "nan"})
     with pytest.raises(MitsimError, match="NaN"):
