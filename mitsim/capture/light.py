@@ -68,9 +68,8 @@ class Light:
 
 def make_plan(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, seed: int) -> Plan:
     """Look at the scene for a moment and decide what to simulate."""
-    evidence = pilot.measure(
-        bench.loaded.scene, bench.loaded.camera, bench.source, bench.windows, labels, weights, seed
-    )
+    view = pilot.View(bench.loaded.scene, bench.loaded.camera, bench.source, bench.windows)
+    evidence = pilot.measure(view, labels, weights, seed)
     wavelength = bench.projector.effective_wavelength_nm
     facts = SceneFacts(
         other_emitters=bench.loaded.other_emitters,
@@ -112,7 +111,7 @@ def collect(
     Each group gets the same number of batches; a few captures, evenly spread, are formed to see the error.
     """
     grid = grid_for(bench, plan.subdivision)
-    tracer = Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid, plan.anchors)
+    tracer = Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid, plan.anchors, plan.depth)
     optics = FrameOptics(bench.geometry, grid.rows.edges, grid.columns.edges, plan.depth, plan.anchors)
     chosen = np.unique(np.linspace(0, len(weights) - 1, min(len(weights), _CHECKED_CAPTURES)).astype(int))
     sums: list[sparse.csr_array | None] = [None] * GROUPS

@@ -12,9 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from typing import TypeVar
-
-from threadpoolctl import ThreadpoolController
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -34,8 +32,11 @@ def single_threaded_blas() -> Iterator[None]:
 
 
 @cache
-def _controller() -> ThreadpoolController:
+def _controller() -> Any:
     """The thread pools of this process; looking for them takes a millisecond, so once."""
+    # Imported here: threadpoolctl sets an environment variable when it is imported, and importing mitsim sets none.
+    from threadpoolctl import ThreadpoolController
+
     return ThreadpoolController()
 
 

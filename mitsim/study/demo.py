@@ -260,7 +260,7 @@ def _report(
         notes=(
             "PSNR has peak 1 and no gain or offset fit; truth is apparent reflectance relative to the board.",
             "Idealised: the paper's model with its own exact factors and the same sensor noise.",
-            "lambda is chosen by generalised cross-validation; no result has seen the truth.",
+            "lambda is chosen by an unbiased risk estimate; no result has seen the truth.",
             *captured.warnings,
             *calibrated.warnings,
         ),

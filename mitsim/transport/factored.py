@@ -11,8 +11,8 @@ Value collected, for anchor a and tan-angle t from it (the integrand of the refe
     g_a(t) dt = L(a, t) (1 + |t|^2)^-2 dt          [W m^-2]
 
 Cells are seen from the sensor's centre, tau = (x/z, y/z) of the point that was hit. The ray from anchor a is aimed at
-tau on the aligned plane (t = tau - a/z, so dt = dtau at any depth) and its light is filed under the tau of the point it
-really hits; on that plane the two agree.
+tau on a plane at the depth of the light (t = tau - a/z, so dt = dtau at any depth) and its light is filed under the tau
+of the point it really hits; on that plane the two agree.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from mitsim.transport.cells import CellGrid
 
 FloatArray = npt.NDArray[np.float64]
 LANES_PER_LAUNCH = 2**24
+_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +73,18 @@ class Tracer:
         projector: Projector,
         grid: CellGrid,
         anchors: int,
+        depth: float | None = None,
         common: bool = False,
     ) -> None:
-        """``common`` gives every anchor the same random numbers (differences between anchors are then smooth)."""
+        """Settings of the estimator.
+
+        ``depth`` [mm] is where the rays of different anchors through one cell meet: best at the depth of the light, and
+        the camera's scene distance without it. ``common`` gives every anchor the same random numbers, so that
+        differences between anchors are smooth.
+        """
         self.scene, self.camera, self.projector, self.grid = scene, camera, projector, grid
         self.anchors, self.common = anchors, common
+        self.depth = camera.geometry.scene_distance if depth is None else depth
         self.positions = anchor_positions(anchors, camera.geometry.half_width)
 
     @property
@@ -126,7 +134,7 @@ class Tracer:
         wavelength_sample = random.next_float32()
         positions = mi.Float(self.positions.astype(np.float32))
         u = mi.Point2f(-dr.gather(mi.Float, positions, anchor_column), -dr.gather(mi.Float, positions, anchor_row))
-        z = dr.opaque(mi.Float, geometry.scene_distance)
+        z = dr.opaque(mi.Float, self.depth)
         t = mi.Vector2f(-tau_column, -tau_row) - mi.Vector2f(u) / z
         squared = 1 + dr.squared_norm(t)
         to_world = self.camera.world_transform()
@@ -142,8 +150,8 @@ class Tracer:
         pixel, radiance, point = self._direct(ray, spectral)
         local = to_world.inverse() @ point
         inverse_depth = dr.rcp(local.z)
-        hit_row = self._cell(grid.rows, -local.y * inverse_depth)
-        hit_column = self._cell(grid.columns, -local.x * inverse_depth)
+        hit_row = self._cell(grid.rows, -local.y * inverse_depth, row, tau_row)
+        hit_column = self._cell(grid.columns, -local.x * inverse_depth, column, tau_column)
         inside = (hit_row >= 0) & (hit_row < mi.Int32(rows)) & (hit_column >= 0) & (hit_column < mi.Int32(columns))
         inside &= local.z > geometry.mask_distance
         solid = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) / dr.square(squared)
@@ -180,9 +188,11 @@ class Tracer:
         return start + (mi.Float(index) + jitter) * size
 
     @staticmethod
-    def _cell(axis: Any, tau: Any) -> Any:
+    def _cell(axis: Any, tau: Any, aimed: Any, aimed_tau: Any) -> Any:
+        """Cell of tau; a point within rounding of where its ray was aimed stays in the cell that was aimed at."""
         start, rate = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, 1 / axis.size)
-        return mi.Int32(dr.floor((tau - start) * rate))
+        found = mi.Int32(dr.floor((tau - start) * rate))
+        return dr.select(dr.abs(tau - aimed_tau) * rate < _ROUNDING, mi.Int32(aimed), found)
 
 
 def panchromatic(radiance: Any) -> Any:

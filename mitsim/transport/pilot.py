@@ -59,19 +59,38 @@ class Evidence:
     seconds: float
 
 
-def measure(
-    scene: Any,
-    camera: Any,
-    projector: Projector,
-    windows: tuple[tuple[float, float], tuple[float, float]],
-    labels: npt.NDArray[np.int64],
-    weights: FloatArray,
-    seed: int,
-) -> Evidence:
+@dataclass(frozen=True)
+class View:
+    """What the pilot looks at: scene, camera, projector, and the row and column tan-angles of its window."""
+
+    scene: Any
+    camera: Any
+    projector: Projector
+    windows: tuple[tuple[float, float], tuple[float, float]]
+
+    @property
+    def geometry(self) -> CameraGeometry:
+        """The camera's geometry."""
+        geometry: CameraGeometry = self.camera.geometry
+        return geometry
+
+    def grid(self, pixels: int, subdivision: int = 1, multiple: int = 1) -> CellGrid:
+        """Cells for a window of ``pixels`` a side."""
+        return aligned_grid(*self.windows, pixels, subdivision, self.geometry.tan_half_fov, multiple)
+
+    def coarse_grid(self) -> CellGrid:
+        """Cells of several projector pixels each."""
+        return self.grid(max(self.projector.n // _COARSE, 1))
+
+    def tracer(self, grid: CellGrid, anchors: int = 1, depth: float | None = None, common: bool = False) -> Tracer:
+        """A tracer of this scene."""
+        return Tracer(self.scene, self.camera, self.projector, grid, anchors, depth, common)
+
+
+def measure(view: View, labels: npt.NDArray[np.int64], weights: FloatArray, seed: int) -> Evidence:
     """Trace a few small batches and compare discretisations on a handful of the family's captures.
 
-    ``windows`` are the row and column tan-angles of the projector's window; ``labels`` and ``weights`` describe the
-    family as in :class:`mitsim.optics.frames.ExpectedFrames`.
+    ``labels`` and ``weights`` describe the family as in :class:`mitsim.optics.frames.ExpectedFrames`.
 
     Raises
     ------
@@ -79,57 +98,67 @@ def measure(
         when no light of the projector reaches the camera.
     """
     started = time.perf_counter()
-    geometry: CameraGeometry = camera.geometry
     chosen = np.unique(np.linspace(0, len(weights) - 1, min(len(weights), _PILOT_CAPTURES)).astype(int))
     weights = weights[chosen]
-    anchor_error = _anchor_errors(scene, camera, projector, windows, labels, weights, seed)
+    depth = _depth(view, seed)
+    anchor_error = _anchor_errors(view, depth, labels, weights, seed)
     finest = CELL_CHOICES[-1]
-    grid = aligned_grid(*windows, projector.n, finest, geometry.tan_half_fov, multiple=finest)
-    tracer = Tracer(scene, camera, projector, grid, anchors=1)
+    grid = view.grid(view.projector.n, finest, multiple=finest)
+    tracer = view.tracer(grid, depth=depth)
     samples = [tracer.batch(integer(seed, "pilot", "cells", 0))]
     warm = time.perf_counter()
     samples.append(tracer.batch(integer(seed, "pilot", "cells", 1)))
-    per_batch = _overhead(scene, camera, projector, windows, seed)
-    per_path = max(time.perf_counter() - warm - 2 * per_batch, 0.0) / tracer.lanes
-    if not any(sample.light.nnz for sample in samples):
-        raise MitsimError(
-            "no light of the projector reaches the camera; check the scene, the window and the field stop"
-        )
-    depth = 1 / float(np.mean([sample.depth_mean for sample in samples if sample.light.nnz]))
+    fine = time.perf_counter() - warm
+    per_batch = _overhead(view, seed)
+    cell_error, sampling_error = _cell_errors(view.geometry, grid, depth, samples, labels, weights, seed)
     spread = float(np.mean([sample.depth_spread for sample in samples]))
-    cell_error, sampling_error = _cell_errors(geometry, grid, depth, samples, labels, weights, seed)
     return Evidence(
         anchor_error=anchor_error,
         cell_error=cell_error,
         depth=depth,
-        depth_spread_error=_depth_error(geometry, grid, depth, spread),
+        depth_spread_error=_depth_error(view.geometry, grid, depth, spread),
         sampling_error=sampling_error,
         seconds_per_batch=per_batch,
-        seconds_per_path=per_path,
+        seconds_per_path=max(fine - per_batch, 0.0) / tracer.lanes,
         seconds=time.perf_counter() - started,
     )
 
 
+def _depth(view: View, seed: int) -> float:
+    """Depth of the light, 1 / mean(1/z) [mm], from one path through each projector pixel."""
+    found = view.tracer(view.grid(view.projector.n)).batch(integer(seed, "pilot", "depth"))
+    if not found.light.nnz:
+        raise MitsimError(
+            "no light of the projector reaches the camera; check the scene, the window and the field stop"
+        )
+    return 1 / found.depth_mean
+
+
+def _overhead(view: View, seed: int) -> float:
+    """Seconds of a batch with hardly any paths, the better of two."""
+    tracer = view.tracer(view.coarse_grid())
+
+    def once(index: int) -> float:
+        started = time.perf_counter()
+        tracer.batch(integer(seed, "pilot", "overhead", index))
+        return time.perf_counter() - started
+
+    return min(once(0), once(1))
+
+
 def _anchor_errors(
-    scene: Any,
-    camera: Any,
-    projector: Projector,
-    windows: tuple[tuple[float, float], tuple[float, float]],
-    labels: npt.NDArray[np.int64],
-    weights: FloatArray,
-    seed: int,
+    view: View, depth: float, labels: npt.NDArray[np.int64], weights: FloatArray, seed: int
 ) -> dict[int, float]:
     """Error of the frames with fewer anchors, on coarse cells, with the same random paths from every anchor.
 
     Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame.
     """
-    geometry = camera.geometry
-    grid = aligned_grid(*windows, max(projector.n // _COARSE, 1), 1, geometry.tan_half_fov)
+    grid = view.coarse_grid()
 
     def frames(anchors: int) -> FloatArray:
-        tracer = Tracer(scene, camera, projector, grid, anchors, common=True)
+        tracer = view.tracer(grid, anchors, depth, common=True)
         light = tracer.batch(integer(seed, "pilot", "anchors")).light
-        optics = FrameOptics(geometry, grid.rows.edges, grid.columns.edges, geometry.scene_distance, anchors)
+        optics = FrameOptics(view.geometry, grid.rows.edges, grid.columns.edges, depth, anchors)
         return np.stack([frame.irradiance for frame in ExpectedFrames(optics, [light], labels, weights, seed)])
 
     judge = frames(_JUDGE_ANCHORS)
@@ -137,21 +166,6 @@ def _anchor_errors(
     return {
         anchors: float(np.linalg.norm(frames(anchors) - judge)) / scale if scale else 0.0 for anchors in ANCHOR_CHOICES
     }
-
-
-def _overhead(
-    scene: Any,
-    camera: Any,
-    projector: Projector,
-    windows: tuple[tuple[float, float], tuple[float, float]],
-    seed: int,
-) -> float:
-    """Seconds of a batch with hardly any paths."""
-    grid = aligned_grid(*windows, max(projector.n // _COARSE, 1), 1, camera.geometry.tan_half_fov)
-    tracer = Tracer(scene, camera, projector, grid, anchors=1)
-    started = time.perf_counter()
-    tracer.batch(integer(seed, "pilot", "overhead"))
-    return time.perf_counter() - started
 
 
 def _cell_errors(

@@ -35,7 +35,8 @@ def evidence(bench: Bench) -> Evidence:
 def measured(bench: Bench, seed: int) -> Evidence:
     labels, weights = parse_patterns("dots:4", N).classes()
     loaded = bench.loaded
-    return pilot.measure(loaded.scene, loaded.camera, bench.source, bench.windows, labels, weights, seed)
+    view = pilot.View(loaded.scene, loaded.camera, bench.source, bench.windows)
+    return pilot.measure(view, labels, weights, seed)
 
 
 def frames(bench: Bench, subdivision: int, batches: int) -> ExpectedFrames:
