@@ -206,9 +206,7 @@ def test_more_frames_than_one_block() -> None:
     frames = [frame.irradiance for frame in expected]
     assert len(frames) == len(expected) == 70
     again = [frame.irradiance for frame in expected]
-    assert all(np.array_equal(a, b) for a, b in zip(frames, again, strict=True)), (
-        "iterable as often as needed"
-    )
+    assert all(np.array_equal(a, b) for a, b in zip(frames, again, strict=True)), "iterable as often as needed"
     # Linear: frame 69 is the same mix of the first four as its weights are.
     mix = np.linalg.solve(weights[:4].T, weights[69])
     assert np.allclose(frames[69], np.tensordot(mix, np.stack(frames[:4]), axes=1), rtol=1e-9)
@@ -225,9 +223,7 @@ def test_the_predicted_variance_is_the_actual_one(groups: int) -> None:
     G (G - 1) would be wrong by 1/2 and 1/4.
     """
     optics, weights, labels = small_optics(), np.eye(PIXELS), np.arange(PIXELS)
-    exact = [
-        frame.irradiance for frame in ExpectedFrames(optics, random_groups(1, 0, 0.0), labels, weights, 0)
-    ]
+    exact = [frame.irradiance for frame in ExpectedFrames(optics, random_groups(1, 0, 0.0), labels, weights, 0)]
     actual, predicted = [], []
     for seed in range(SEEDS):
         found = list(ExpectedFrames(optics, random_groups(groups, 100 + seed, 0.2), labels, weights, seed))

@@ -25,7 +25,9 @@ SIGMAS = 5.0
 
 
 def tracer(bench: Bench, subdivision: int = 2, anchors: int = 1, common: bool = False) -> Tracer:
-    return Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid_for(bench, subdivision), anchors, common=common)
+    return Tracer(
+        bench.loaded.scene, bench.loaded.camera, bench.source, grid_for(bench, subdivision), anchors, common=common
+    )
 
 
 @pytest.fixture(scope="module")
