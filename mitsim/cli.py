@@ -24,6 +24,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+INTERRUPTED = 130
+
 Scene = Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
@@ -48,13 +50,14 @@ def main() -> None:
     except MitsimError as error:
         _fail(str(error))
     except (typer.Abort, KeyboardInterrupt):
-        print("mitsim: interrupted", file=sys.stderr)
-        sys.exit(130)
+        code = INTERRUPTED
     except Exception as error:
         # Usage errors of click (wherever typer keeps it) carry their own one-line message.
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
             _fail(_usage(error))
         raise
+    if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
+        print("mitsim: interrupted", file=sys.stderr)
     sys.exit(code if isinstance(code, int) else 0)
 
 

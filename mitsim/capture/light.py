@@ -18,6 +18,8 @@ from mitsim.transport import pilot
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.factored import LightSample, Tracer
 
+__all__ = ["Light", "Plan", "Progress", "collect", "grid_for", "make_plan", "pinhole_view", "silent", "uniform_light"]
+
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 Progress = Callable[[str, float], None]

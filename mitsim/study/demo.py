@@ -18,19 +18,15 @@ import numpy.typing as npt
 from mitsim.calibrate.hadamard import Calibration
 from mitsim.capture.bench import Bench, PatternFamily, load_recipe, open_bench
 from mitsim.capture.clock import Clock
-from mitsim.capture.exposer import Exposer, Exposure
-from mitsim.capture.light import Light, Progress, collect, pinhole_view, silent, uniform_light
+from mitsim.capture.light import Progress, collect, pinhole_view, silent
 from mitsim.capture.run import CaptureResult, capture, frame_name
 from mitsim.core.configuration import shipped
 from mitsim.core.frames import read_frame
 from mitsim.core.manifest import prepare_output, read_json, versions, write_json
-from mitsim.optics.frames import ExpectedFrames
-from mitsim.reconstruct.solver import Prepared, Solution, prepare
-from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.study.calibration import CalibrationResult, calibrate
+from mitsim.study.compare import Comparison
 from mitsim.study.describe import scene_line
-from mitsim.study.ideal import ideal_factors, ideal_light
-from mitsim.study.metrics import psnr, read_truth, ssim
+from mitsim.study.metrics import read_truth
 from mitsim.study.report import (
     BudgetRow,
     CalibrationFacts,
@@ -38,7 +34,6 @@ from mitsim.study.report import (
     EffectRow,
     ExposureRow,
     FamilyResult,
-    Recovery,
     ReportData,
     build_report,
     verdict,
@@ -53,7 +48,6 @@ FAMILIES = {
     MAIN: "49 dots",
     "hadamard:8": "64 Hadamard",
 }
-CONVENTIONS = ("equal peak", "equal frame", "equal total")
 
 
 @dataclass(frozen=True)
@@ -90,13 +84,17 @@ def demo(
     clock.add(captured.seconds)
     calibrated, factors = calibrate(bench, folder / "calibration", accuracy, seed, progress=progress)
     clock.add(calibrated.seconds, "calibration ")
-    comparison = _Comparison(bench, captured, factors, folder, seed, clock, progress)
-    families = [comparison.family(name) for name in FAMILIES]
-    exposure = [comparison.exposures(name) for name in FAMILIES]
+    with clock.stage("transport"):
+        light = collect(bench, captured.plan, *bench.family(MAIN, seed).classes(), seed)
+    truth = read_truth(folder / "run")
+    comparison = Comparison(bench, light, factors, truth, captured.plan, seed, progress)
+    with clock.stage("compare families"):
+        compared = [comparison.family(name, label) for name, label in FAMILIES.items()]
+    families = [family for family, _ in compared]
     result = DemoResult(
         psnr={f.name: f.rendered.psnr_db for f in families if f.rendered},
         psnr_ideal={f.name: f.idealised.psnr_db for f in families if f.idealised},
-        exposure={name: rows for name, (rows, _) in zip(FAMILIES, exposure, strict=True)},
+        exposure={name: found for name, (_, found) in zip(FAMILIES, compared, strict=True)},
         gain_db=_quality(families, MAIN) - _quality(families, "uniform"),
         mc_error=captured.mc_error,
         seconds=clock.seconds(),
@@ -104,100 +102,12 @@ def demo(
         warnings=captured.warnings + calibrated.warnings,
     )
     with clock.stage("report"):
-        rows = tuple(row for _, row in exposure)
-        data = _report(bench, captured, calibrated, factors, comparison, tuple(families), rows, clock, seed)
+        rows = tuple(ExposureRow(FAMILIES[name], *found.values()) for name, found in result.exposure.items())
+        white = CapturedFrame("Uniform, the only frame", comparison.frame("uniform", 0))
+        data = _report(bench, captured, calibrated, factors, white, tuple(families), rows, truth, clock, seed)
         build_report(data, folder / "report.html")
     write_json(folder / "demo.json", {"kind": "demo", **asdict(result)})
     return result
-
-
-class _Comparison:
-    """Reconstructions of every family from one light, rendered and idealised, at several exposures."""
-
-    def __init__(
-        self,
-        bench: Bench,
-        captured: CaptureResult,
-        factors: Calibration,
-        folder: Path,
-        seed: int,
-        clock: Clock,
-        progress: Progress,
-    ) -> None:
-        self.bench, self.seed, self.clock, self.progress = bench, seed, clock, progress
-        self.captured, self.factors = captured, factors
-        self.truth = read_truth(folder / "run")
-        main = bench.family(MAIN, seed)
-        with clock.stage("transport"):
-            self.light = collect(bench, captured.plan, *main.classes(), seed)
-            board = bench.with_board(load_recipe().board_reflectance)
-            self.board_flux = float(collect(board, captured.plan, *uniform_light(bench.n), seed).flux().mean())
-        self.ideal = ideal_light(bench, self.truth, self.board_flux)
-        rate = float(electrons_from_irradiance(1.0, 1.0, bench.sensor, bench.projector.effective_wavelength_nm))
-        self.ideal_factors = ideal_factors(bench, self.board_flux, rate)
-        self.uniform_s = self._peak_time(self.light, "uniform")
-
-    def family(self, name: str) -> FamilyResult:
-        """Both reconstructions at equal peak, with singular values and two example patterns."""
-        family = self.bench.family(name, self.seed)
-        prepared = self._prepared(family, rendered=True)
-        singular = np.sort(prepared.left.singular**2)[::-1]
-        shown = (
-            family.captures[0],
-            family.captures[2 * len(family.captures) // 5 + 2 if len(family.captures) > 4 else 0],
-        )
-        return FamilyResult(
-            name=name,
-            label=FAMILIES[name],
-            captures=len(family.captures),
-            patterns=tuple(family.light(one) for one in shown[: min(2, len(family.captures))]),
-            singular_values=singular / singular[0],
-            idealised=self._recovery(name, self._peak_time(self.ideal, name), rendered=False),
-            rendered=self._recovery(name, self._peak_time(self.light, name), rendered=True),
-        )
-
-    def exposures(self, name: str) -> tuple[dict[str, float], ExposureRow]:
-        """PSNR of the rendered reconstruction under the three exposure conventions."""
-        captures = len(self.bench.family(name, self.seed).captures)
-        times = (self._peak_time(self.light, name), self.uniform_s, self.uniform_s / captures)
-        found = [self._recovery(name, time, rendered=True).psnr_db for time in times]
-        return dict(zip(CONVENTIONS, found, strict=True)), ExposureRow(FAMILIES[name], *found)
-
-    def _recovery(self, name: str, exposure_s: float, rendered: bool) -> Recovery:
-        family = self.bench.family(name, self.seed)
-        light = self.light if rendered else self.ideal
-        exposer = Exposer(self.bench, exposure_s, self.seed if rendered else self.seed + 1)
-        prepared = self._prepared(family, rendered)
-        with self.clock.stage("compare families"):
-            solution = _solve(prepared, exposer, family, self._expected(light, family))
-        self.progress(f"{FAMILIES[name]}", 1.0)
-        return Recovery(
-            solution.image,
-            psnr(solution.image, self.truth),
-            ssim(solution.image, self.truth),
-            solution.lam,
-            solution.status,
-        )
-
-    def _prepared(self, family: PatternFamily, rendered: bool) -> Prepared:
-        left, right = (self.factors.left, self.factors.right) if rendered else self.ideal_factors
-        return prepare(left, right, family.left, family.right, centre=self.bench.geometry.mask == "flatcam")
-
-    def _expected(self, light: Light, family: PatternFamily) -> ExpectedFrames:
-        return light.frames(*family.classes(), self.seed)
-
-    def _peak_time(self, light: Light, name: str) -> float:
-        family = self.bench.family(name, self.seed)
-        with self.clock.stage("compare families"):
-            peak = max(float(frame.irradiance.max()) for frame in self._expected(light, family))
-        return Exposure().choose(self.bench, peak)
-
-
-def _solve(prepared: Prepared, exposer: Exposer, family: PatternFamily, expected: ExpectedFrames) -> Solution:
-    frames = prepared.accumulator()
-    for measurement, row, column in exposer.measurements(family, expected):
-        frames.add(measurement, row, column)
-    return prepared.solve(frames, "auto")
 
 
 def _quality(families: list[FamilyResult], name: str) -> float:
@@ -221,9 +131,10 @@ def _report(
     captured: CaptureResult,
     calibrated: CalibrationResult,
     factors: Calibration,
-    comparison: _Comparison,
+    white: CapturedFrame,
     families: tuple[FamilyResult, ...],
     exposure: tuple[ExposureRow, ...],
+    truth: FloatArray,
     clock: Clock,
     seed: int,
 ) -> ReportData:
@@ -234,12 +145,12 @@ def _report(
         title=f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
         verdict=headline,
         verdict_detail=detail,
-        truth=comparison.truth,
+        truth=truth,
         scene=scene_line(bench.loaded.path),
         render=pinhole_view(bench, load_recipe().board_reflectance, seed),
         render_caption="The scene as Mitsuba renders it from the sensor's centre, before mask and noise.",
         families=families,
-        frames=tuple(_frames(captured, main)),
+        frames=(white, *_frames(captured, main)),
         exposure=exposure,
         exposure_used="equal peak: each family's brightest pixel fills 80 % of the full well",
         calibration=CalibrationFacts(
@@ -269,7 +180,7 @@ def _report(
 
 def _frames(captured: CaptureResult, family: PatternFamily) -> Iterator[CapturedFrame]:
     count = len(family.captures)
-    for index in (0, count // 2, count - 1):
+    for index in (0, count // 2):
         channels, _ = read_frame(Path(captured.output) / frame_name(index))
         yield CapturedFrame(f"{FAMILIES[MAIN]}, frame {index + 1} of {count}", channels["DN"])
 
