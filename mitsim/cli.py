@@ -371,12 +371,12 @@ def _number(option: str, text: str, word: str, least: float | None = None) -> fl
 
 @contextmanager
 def _work(output: Path, silent: bool) -> Iterator[Callable[[str, float], None]]:
-    """A progress bar while the context lasts; a folder ``output`` that a refusal would leave empty is removed."""
+    """A progress bar while the context lasts; a folder ``output`` left empty by a refusal or Control-C is removed."""
     existed = output.exists()
     try:
         with _progress(silent) as progress:
             yield progress
-    except MitsimError:
+    except (MitsimError, KeyboardInterrupt):
         if not existed:
             with suppress(OSError):
                 output.rmdir()

@@ -1,0 +1,285 @@
+"""What other programs may rely on (DESIGN section 7): verbs, JSON keys, exit statuses, and where output goes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import pty
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+VERBS = ("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "doctor")
+CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
+
+
+def number(value: object, least: float = 0.0, most: float = math.inf) -> bool:
+    """A finite JSON number in a range."""
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and least <= value <= most and value < math.inf
+    )
+
+
+def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
+    """All stages are there, and they fit into the total."""
+    assert {*stages, "total"} <= seconds.keys()
+    assert all(number(value) for value in seconds.values())
+    assert sum(seconds[stage] for stage in stages) <= seconds["total"] * 1.001
+
+
+# ---- keys and types --------------------------------------------------------------------------------------------------
+
+
+def test_plan(call: Callable[..., Any], lab: Any) -> None:
+    plan = call("plan", *lab.rig, "--json", "--quiet", "--variant", "llvm_ad_mono").payload
+    assert {"effects", "accuracy", "predicted_seconds"} <= plan.keys()
+    assert plan["accuracy"] == 0.02 and number(plan["predicted_seconds"], 1e-6, 600)
+    assert len({effect["name"] for effect in plan["effects"]}) == len(plan["effects"]) >= 5
+    for effect in plan["effects"]:
+        assert {"name", "state", "reason", "error_if_off", "seconds"} <= effect.keys()
+        assert effect["state"] in ("exact", "approximate", "off")
+        assert isinstance(effect["reason"], str) and effect["reason"]
+        assert effect["error_if_off"] is None or number(effect["error_if_off"])
+        assert number(effect["seconds"])
+    # The names are those that DESIGN section 6 lists.
+    names = " ".join(effect["name"] for effect in plan["effects"])
+    for effect in ("anchors", "depth", "interreflection", "aperture", "ambient", "diffraction", "thickness", "noise"):
+        assert effect in names
+
+
+def test_capture(lab: Any) -> None:
+    captured = lab.captured.payload
+    keys = {"frames", "shape", "seconds", "mc_error", "variant", "seed", "output"}
+    assert keys <= captured.keys()
+    assert (captured["frames"], captured["shape"]) == (16, [64, 64])
+    assert (captured["variant"], captured["seed"], captured["output"]) == ("llvm_ad_mono", 0, str(lab.run))
+    assert_seconds(captured["seconds"], "transport", "optics", "sensor", "write")
+    assert number(captured["mc_error"], 1e-9, 0.02)
+    assert len(list(lab.run.glob("*.exr"))) == 17, "16 frames and the truth"
+
+
+def test_calibrate(lab: Any) -> None:
+    found = lab.calibrated.payload
+    keys = {"n", "frames", "separability_residual", "phi_error", "condition", "seconds", "output"}
+    assert keys <= found.keys()
+    assert (found["n"], found["output"]) == (16, str(lab.calibration))
+    assert found["frames"] == 2 * 2 * 16, "n horizontal and n vertical patterns, two captures each"
+    assert number(found["separability_residual"], 1e-9, 0.1) and number(found["phi_error"], 1e-9, 0.1)
+    assert number(found["condition"], 1, 1e6)
+    assert_seconds(found["seconds"])
+
+
+def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    options = "--json", "--quiet", "--variant", "llvm_ad_mono", "-o", tmp_path / "image"
+    found = call("reconstruct", lab.run, "--calibration", lab.calibration, *options).payload
+    keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "seconds", "output"}
+    assert found.keys() == keys
+    assert number(found["psnr"], 20, 100) and number(found["ssim"], 0.5, 1)
+    assert number(found["lambda"]) and found["rank"] == 16 * 16 and number(found["condition"], 1, 1e6)
+    assert number(found["residual"], 1e-9, 0.5) and found["status"].endswith(".")
+    assert_seconds(found["seconds"])
+    assert found["output"] == str(tmp_path / "image")
+    assert sorted(path.name for path in (tmp_path / "image").iterdir()) == ["image.exr", "image.png", "result.json"]
+    assert json.loads((tmp_path / "image" / "result.json").read_text()) == found
+
+
+def test_reconstruct_writes_into_the_run_by_default(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    run = lab.copy("run", tmp_path / "run")
+    found = call("reconstruct", "run", "--calibration", lab.calibration, "--json", cwd=tmp_path).payload
+    assert found["output"] == "run/reconstruction" and (run / "reconstruction" / "image.exr").is_file()
+
+
+@pytest.mark.parametrize("estimator", ["reference", "factored"])
+def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: str) -> None:
+    options = "--estimator", estimator, "--spp", 16, "--accuracy", "0.02", "--seed", 3, "--json", "--quiet"
+    found = call("render", lab.scene, "-o", tmp_path / "frame.exr", *options).payload
+    assert (found["estimator"], found["seed"], found["output"]) == (estimator, 3, str(tmp_path / "frame.exr"))
+    assert number(found["mean"], 1e-6, 1) and number(found["mc_error"], 1e-9, 10) and number(found["seconds"])
+    assert [path.name for path in tmp_path.iterdir()] == ["frame.exr"]
+
+
+def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    # A grey sheet: on the laboratory's print an error of 3e-4 takes minutes.
+    scene = lab.write_scene("grey", reflectance=None)
+    options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
+    outcome = call("study", "accuracy", scene, *options)
+    study = outcome.payload
+    assert {"rows", "speedup_at_equal_error"} <= study.keys()
+    assert number(study["speedup_at_equal_error"], 1)
+    for row in study["rows"]:
+        assert {"estimator", "setting", "seconds", "error", "mc_error"} <= row.keys()
+        assert row["estimator"] in ("factored", "reference") and isinstance(row["setting"], str)
+        assert number(row["seconds"], 1e-6) and number(row["error"], 1e-9) and number(row["mc_error"], 1e-9)
+    assert {row["estimator"] for row in study["rows"]} == {"factored", "reference"}
+
+
+def test_doctor(call: Callable[..., Any]) -> None:
+    found = call("doctor", "--json", "--quiet", "--variant", "llvm_ad_mono").payload
+    assert found["ok"] is True, found
+    assert all({"name", "ok", "detail", "remedy"} <= check.keys() for check in found["checks"])
+
+
+# ---- exit statuses ---------------------------------------------------------------------------------------------------
+
+
+def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    scene = lab.write_scene("ambient", extra=CONSTANT)
+    for verb in (("plan", scene), ("capture", scene, "-o", tmp_path / "run", "--patterns", "uniform")):
+        outcome = call(*verb, *lab.electronics, "--json")
+        assert outcome.code == 1
+        assert outcome.payload["warnings"] and "ambient" in outcome.payload["warnings"][0]
+        lines = outcome.err.splitlines()
+        assert len(lines) == len(outcome.payload["warnings"])
+        assert all(line.startswith("mitsim: warning: ") for line in lines)
+
+
+def test_a_saturated_capture_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "uniform", "--exposure", "100")
+    assert outcome.code == 1 and "full well" in outcome.err
+
+
+def test_an_under_determined_image_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    # 12 sensor rows cannot tell 16 scene rows apart under one pattern.
+    scene = lab.write_scene("few", pixels=12)
+    assert call("capture", scene, *lab.electronics, "-o", tmp_path / "run", "--patterns", "uniform").code == 0
+    assert call("calibrate", scene, *lab.electronics, "-o", tmp_path / "cal").code in (0, 1)
+    outcome = call("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal", "--json", "--lambda", "1")
+    assert outcome.code == 1
+    assert "Under-determined" in outcome.payload["status"] and "Under-determined" in outcome.err
+
+
+def test_a_program_error_is_not_hidden(call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
+    def broken(*arguments: object) -> None:
+        raise ZeroDivisionError("planted")
+
+    monkeypatch.setattr("mitsim.capture.light.make_plan", broken)
+    with pytest.raises(ZeroDivisionError, match="planted"):
+        call("plan", *lab.rig)
+
+
+# ---- the installed program -------------------------------------------------------------------------------------------
+
+
+def test_the_program(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    good = shell("capture", *lab.rig, "-o", "run", "--patterns", "uniform", "--json", cwd=tmp_path)
+    assert good.code == 0 and good.err == ""
+    assert good.payload["output"] == "run"
+    bad = shell("capture", *lab.rig, "-o", "run", "--patterns", "uniform", "--json", cwd=tmp_path)
+    assert "run" in bad.refusal
+
+
+def test_version_and_help(shell: Callable[..., Any]) -> None:
+    import mitsim
+
+    version = shell("--version")
+    assert (version.code, version.out, version.err) == (0, f"{mitsim.__version__}\n", "")
+    text = shell("--help", env={**os.environ, "COLUMNS": "100"})
+    assert text.code == 0 and text.err == ""
+    for verb in VERBS:
+        assert re.search(rf"\b{verb}\b +\S+", text.out), f"{verb} has no description"
+
+
+def test_help_of_every_verb_names_every_option(call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "dumb")
+    for verb in VERBS:
+        text = call(verb, "--help")
+        assert text.code == 0 and text.err == ""
+        # Every verb takes the three common options, and every option says what it is.
+        assert all(option in text.out for option in ("--json", "--variant", "--quiet")), verb
+        assert max(map(len, text.out.splitlines())) <= 100
+    text = " ".join(call("capture", "--help").out.replace("│", " ").split())
+    for fragment in ("SCENE", "dots:K", "hadamard:K", "--accuracy", "0.001", "--resume", "NAME=VALUE", "auto|SECONDS"):
+        assert fragment in text, fragment
+
+
+def test_no_arguments_show_the_help(call: Callable[..., Any]) -> None:
+    outcome = call()
+    assert outcome.code == 2 and "Usage" in outcome.out + outcome.err
+    assert [line for line in outcome.err.splitlines() if line.startswith("mitsim:")] == [
+        "mitsim: give one of the commands above"
+    ]
+
+
+def test_importing_the_command_line_is_cheap() -> None:
+    heavy = "'mitsuba', 'drjit', 'numpy', 'scipy', 'matplotlib'"
+    program = f"import sys, mitsim.cli; print([name for name in ({heavy}) if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# ---- the progress bar ------------------------------------------------------------------------------------------------
+
+
+def on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
+) -> tuple[str, str]:
+    """stdout, and what a terminal on stderr received, of one call in this process."""
+    from mitsim import cli
+
+    master, slave = pty.openpty()
+    seen: list[bytes] = []
+
+    def read() -> None:
+        # The terminal's end reports an error once nobody holds the other one.
+        with contextlib.suppress(OSError):
+            while data := os.read(master, 4096):
+                seen.append(data)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    capsys.readouterr()
+    with monkeypatch.context() as patch, os.fdopen(slave, "w", buffering=1) as file:
+        patch.setenv("TERM", "xterm")
+        patch.setattr(sys, "argv", ["mitsim", *map(str, arguments)])
+        patch.setattr(sys, "stderr", file)
+        with pytest.raises(SystemExit):
+            cli.main()
+    reader.join(timeout=10)
+    os.close(master)
+    return capsys.readouterr().out, b"".join(seen).decode()
+
+
+@pytest.mark.parametrize("verb", ["capture", "calibrate", "render"])
+def test_a_terminal_sees_a_bar_that_goes_away(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lab: Any, tmp_path: Path, verb: str
+) -> None:
+    arguments = {
+        "capture": ("capture", *lab.rig, "--patterns", "dots:4", "-o"),
+        "calibrate": ("calibrate", *lab.rig, "-o"),
+        "render": ("render", lab.scene, "--spp", 256, "-o"),
+    }[verb]
+    out, err = on_a_terminal(monkeypatch, capsys, *arguments, tmp_path / "loud.exr")
+    assert "\x1b" not in out and str(tmp_path / "loud.exr") in out
+    last = {"capture": "frames", "calibrate": "vertical stripes", "render": "reference"}[verb]
+    assert last in err and "━" in err
+    assert err.rstrip().endswith("\x1b[2K"), "the bar's line is erased"
+    for option in ("--quiet", "--json"):
+        out, err = on_a_terminal(monkeypatch, capsys, *arguments, tmp_path / f"{option}.exr", option)
+        assert err == ""
+        assert out.startswith("{") == (option == "--json")
+
+
+def test_a_refusal_on_a_terminal_leaves_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lab: Any, tmp_path: Path
+) -> None:
+    out, err = on_a_terminal(
+        monkeypatch, capsys, "capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4", "--accuracy", "0"
+    )
+    assert out == ""
+    visible = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", err.rsplit("\x1b[2K", 1)[-1])
+    assert visible.strip().startswith("mitsim: --accuracy 0") and visible.strip().count("\n") == 0
+
+
+def test_no_bar_where_stderr_is_no_terminal(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "uniform")
+    assert outcome.code == 0 and outcome.err == ""
+    assert len(outcome.out.splitlines()) == 2 and "\x1b" not in outcome.out

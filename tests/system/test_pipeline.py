@@ -1,0 +1,183 @@
+"""The main job on a small scene, by the commands a user types: capture, calibrate, reconstruct, render.
+
+The laboratory: a print with shading, a disc and bars on 16 x 16 projector pixels, a 64 x 64 sensor 2 mm behind the
+mask, Poisson and read noise, seed 0. Lower limits of image quality lie some 3 dB below what seeds 0 and 1 gave.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.frames import read_frame
+
+FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 45.0), "hadamard:4": (32, 55.0), "random:4": (16, 37.0)}
+"""Frames, and the least PSNR [dB] of an image with automatic lambda."""
+
+
+@pytest.fixture(scope="module")
+def runs(
+    call: Callable[..., Any], lab: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], tuple[Path, dict[str, Any]]]:
+    """Run folder and report of each family, captured once."""
+    folder = tmp_path_factory.mktemp("runs")
+
+    @cache
+    def captured(patterns: str) -> tuple[Path, dict[str, Any]]:
+        run = folder / patterns.replace(":", "")
+        return run, call("capture", *lab.rig, "-o", run, "--patterns", patterns, "--json").payload
+
+    return captured
+
+
+@pytest.fixture(scope="module")
+def recover(call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]]) -> Callable[..., Any]:
+    """Report of `mitsim reconstruct` on a family's run."""
+
+    @cache
+    def recovered(patterns: str, *options: object) -> dict[str, Any]:
+        return call("reconstruct", runs(patterns)[0], "--calibration", lab.calibration, "--json", *options).payload
+
+    return recovered
+
+
+@pytest.mark.parametrize("patterns", FAMILIES)
+def test_every_family_is_captured_and_recovered(
+    runs: Callable[[str], tuple[Path, Any]], recover: Callable[..., Any], patterns: str
+) -> None:
+    frames, least = FAMILIES[patterns]
+    run, captured = runs(patterns)
+    assert captured["frames"] == frames == len(list(run.glob("frame_*.exr")))
+    assert captured["mc_error"] <= 0.02, "the accuracy that was asked for"
+    found = recover(patterns)
+    assert least < found["psnr"] < least + 20 and found["rank"] == 256
+    image = read_frame(Path(found["output"]) / "image.exr")[0]["reflectance"]
+    truth = read_frame(run / "truth.exr")[0]["reflectance"]
+    # PSNR is peak 1 with no gain or offset fit (DESIGN section 5), so that anyone can compute it from the files.
+    assert found["psnr"] == pytest.approx(-10 * np.log10(np.mean((image - truth.astype(float)) ** 2)), abs=1e-3)
+
+
+def test_the_image_stands_upright(lab: Any, recover: Callable[..., Any]) -> None:
+    """Row 0 of print, truth and image is the top, column 0 the left: no turn or mirror fits as well.
+
+    The window shows the middle 120 mm of the 128 mm sheet; every projector pixel is the mean of what it lights.
+    """
+    from skimage.io import imread
+
+    sheet = imread(lab.scene.parent / "laboratory_reflectance.png").astype(float) / 255
+    fine = np.kron(sheet, np.ones((8, 8)))[16:-16, 16:-16].reshape(16, 30, 16, 30).mean(axis=(1, 3))
+    truth = read_frame(lab.run / "truth.exr")[0]["reflectance"]
+    # The board has reflectance 0.99; what a pixel at an edge of the disc weighs differs a little with its place.
+    assert np.sqrt(np.mean((truth - fine / 0.99) ** 2)) < 0.01
+    image = read_frame(Path(recover("dots:4")["output"]) / "image.exr")[0]["reflectance"]
+    assert np.sqrt(np.mean((image - fine / 0.99) ** 2)) < 0.02
+    for other in (fine[::-1], fine[:, ::-1], fine.T, fine[::-1, ::-1]):
+        assert np.sqrt(np.mean((image - other / 0.99) ** 2)) > 0.05
+
+
+def test_dots_beat_uniform_light(recover: Callable[..., Any]) -> None:
+    # Seeds 0 and 1 gave 15.5 and 15.2 dB at equal peak.
+    assert recover("dots:4")["psnr"] > recover("uniform")["psnr"] + 10
+
+
+def test_the_brightest_pixel_is_at_the_fraction_of_full_well(
+    call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
+) -> None:
+    full_well = 4 * 32360.0
+    for run, fraction in ((runs("dots:4")[0], 0.8), (tmp_path / "dim", 0.25)):
+        if not run.exists():
+            options = "--patterns", "dots:4", "--exposure-fraction", fraction
+            assert call("capture", *lab.rig, "-o", run, *options).code == 0
+        peak = max(read_frame(path)[0]["electrons"].max() for path in run.glob("frame_*.exr"))
+        # Dark current, 6 electrons a second, is the rest.
+        assert peak == pytest.approx(fraction * full_well, rel=1e-4)
+
+
+def test_exposure_by_hand(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    peaks = []
+    for seconds in ("0.01", "0.02"):
+        options = "--patterns", "uniform", "--exposure", seconds, "--json"
+        captured = call("capture", *lab.rig, "-o", tmp_path / seconds, *options).payload
+        assert captured["exposure_s"] == float(seconds)
+        peaks.append(read_frame(tmp_path / seconds / "frame_00000.exr")[0]["electrons"])
+    assert np.allclose(peaks[1], 2 * peaks[0], rtol=1e-6)
+
+
+def test_lambda_by_value(recover: Callable[..., Any]) -> None:
+    auto = recover("uniform")
+    assert recover("uniform", "--lambda", auto["lambda"])["psnr"] == pytest.approx(auto["psnr"], abs=1e-6)
+    # Far too much and none at all are both worse than the automatic one.
+    for value in (auto["lambda"] * 1e3, 0):
+        found = recover("uniform", "--lambda", value)
+        assert found["lambda"] == value and found["psnr"] < auto["psnr"] - 3
+
+
+def test_total_variation(recover: Callable[..., Any]) -> None:
+    # Few data and a print of smooth parts: seeds 0 and 1 gave 5.7 and 6.0 dB over Tikhonov.
+    found = recover("uniform", "--method", "tv")
+    assert found["psnr"] > recover("uniform")["psnr"] + 3
+    assert "total variation" in found["status"]
+
+
+@pytest.mark.xfail(reason="ADMM stops after one step, far from the minimum, and says converged", strict=True)
+@pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])
+def test_a_little_total_variation_changes_a_good_image_little(recover: Callable[..., Any], patterns: str) -> None:
+    # A weight of 1e-9 of the data's scale: the minimum is the least-squares image.
+    plain = recover(patterns, "--lambda", 0)
+    assert recover(patterns, "--method", "tv", "--lambda", 1.0)["psnr"] == pytest.approx(plain["psnr"], abs=1)
+    assert recover(patterns, "--method", "tv")["psnr"] > plain["psnr"] - 3
+
+
+def test_a_second_reconstruction_replaces_the_first(
+    call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
+) -> None:
+    options = "--calibration", lab.calibration, "-o", tmp_path / "image", "--json"
+    for value in (1.0, 1e9):
+        call("reconstruct", runs("dots:4")[0], *options, "--lambda", value)
+        assert json.loads((tmp_path / "image" / "result.json").read_text())["lambda"] == value
+
+
+def test_the_same_seed_gives_the_same_frames_and_another_gives_others(
+    call: Callable[..., Any], lab: Any, tmp_path: Path
+) -> None:
+    def frame(name: str, seed: int) -> np.ndarray:
+        options = "--patterns", "dots:2", "--seed", seed
+        assert call("capture", *lab.rig, "-o", tmp_path / name, *options).code == 0
+        return read_frame(tmp_path / name / "frame_00003.exr")[0]["DN"].astype(float)
+
+    first, again, other = frame("a", 5), frame("b", 5), frame("c", 6)
+    assert np.array_equal(first, again)
+    assert np.mean(first != other) > 0.5
+
+
+def test_a_flatcam_from_end_to_end(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    rig = lab.write_scene("flatcam", mask="flatcam"), *lab.electronics
+    assert call("capture", *rig, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
+    assert call("calibrate", *rig, "-o", tmp_path / "cal").code in (0, 1)
+    assert json.loads((tmp_path / "cal" / "manifest.json").read_text())["centre"] is True
+    found = call("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal", "--json").payload
+    assert found["psnr"] > 30
+
+
+def test_both_estimators_render_the_same_frame(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """Under uniform light both estimators see the same irradiance.
+
+    The mean over the frame, and the frame's projection on the factored one: each within 5 standard errors of the
+    reference (two tests, two-sided significance 1e-6), which are the only noise that matters here.
+    """
+    frames = {}
+    for name, options in {"reference": ("--spp", 1024), "factored": ("--accuracy", "0.002")}.items():
+        outcome = call("render", lab.scene, "-o", tmp_path / f"{name}.exr", "--estimator", name, *options, "--json")
+        frames[name] = read_frame(tmp_path / f"{name}.exr")[0]
+        assert outcome.payload["mean"] == pytest.approx(float(frames[name]["Y"].mean()), rel=1e-5)
+    reference, factored = (frames[name]["Y"].astype(float) for name in ("reference", "factored"))
+    error = frames["reference"]["error.Y"].astype(float)
+    for weight in (np.ones_like(factored), factored):
+        z = ((reference - factored) * weight).sum() / np.sqrt(np.square(error * weight).sum())
+        assert abs(z) < 5, z

@@ -1,0 +1,135 @@
+"""Frames of a real camera: folders made by hand with no more than docs/formats.md asks for reconstruct as well.
+
+The 'real camera' is numpy: frames of the paper's model with factors of its own, rounded to digital numbers. No part of
+mitsim's renderer or sensor is in it, so that scale, sign and order of the documented keys are checked independently.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.frames import read_frame, write_frame
+
+CAMERA = {"name": "bench 3"}
+DIGITAL = {"exposure_s": 0.02, "black_level_dn": 160, "gain_dn_per_e": 0.125, "dark_current_e_per_s": 6}
+ROWS, COLUMNS, N, K = 40, 36, 12, 3
+
+
+class Bench3:
+    """A camera that mitsim has never seen: 40 x 36 pixels, scene of 12 x 12."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        rng = np.random.default_rng(20)
+        self.left = rng.random((ROWS, N)) * 300
+        self.right = rng.random((COLUMNS, N)) * 300
+        self.scene = rng.random((N, N))
+
+    def digital_numbers(self, pattern: np.ndarray) -> np.ndarray:
+        """What the camera reads out, (40, 36)."""
+        rate = self.left @ (pattern * self.scene) @ self.right.T + DIGITAL["dark_current_e_per_s"]
+        electrons = rate * DIGITAL["exposure_s"]
+        return np.rint(electrons * DIGITAL["gain_dn_per_e"] + DIGITAL["black_level_dn"])
+
+    def run(self, signed: bool, **extra: object) -> Path:
+        """A RUN folder with shifting dots, or with Hadamard stripes as pairs of which the negative half comes first."""
+        folder = self.folder / "run"
+        folder.mkdir()
+        columns = np.array([[1, 1], [1, -1]])[np.arange(N) % 2] if signed else np.eye(K)[np.arange(N) % K]
+        captures = []
+        for i in range(columns.shape[1]):
+            for j in range(columns.shape[1]):
+                pattern = np.outer(columns[:, i], columns[:, j])
+                for sign in (-1, 1) if signed else (0,):
+                    name = f"shot {i}{j}{sign}.exr"
+                    light = (1 + sign * pattern) / 2 if sign else pattern
+                    write_frame(folder / name, {"DN": self.digital_numbers(light).astype(np.uint32)}, {})
+                    captures.append({"file": name, "row": i, "column": j, "sign": sign})
+        patterns = {"P_L": columns.tolist(), "P_R": columns.tolist(), "captures": captures}
+        self._manifest(folder, kind="capture", digital=DIGITAL, patterns=patterns, **extra)
+        return folder
+
+    def calibration(self) -> Path:
+        """A CAL folder with the camera's true factors."""
+        folder = self.folder / "cal"
+        folder.mkdir()
+        for name, factor in (("left", self.left), ("right", self.right)):
+            write_frame(folder / f"{name}.exr", {"factor": factor.astype(np.float32)}, {})
+        self._manifest(folder, kind="calibration")
+        return folder
+
+    @staticmethod
+    def _manifest(folder: Path, **sections: object) -> None:
+        (folder / "manifest.json").write_text(json.dumps({"status": "complete", "camera": CAMERA, **sections}))
+
+
+@pytest.mark.parametrize("signed", [False, True], ids=["dots", "signed pairs"])
+def test_a_folder_made_by_hand_reconstructs(call: Callable[..., Any], tmp_path: Path, signed: bool) -> None:
+    bench = Bench3(tmp_path)
+    found = call("reconstruct", bench.run(signed), "--calibration", bench.calibration(), "--json").payload
+    assert found["psnr"] is None and found["ssim"] is None, "nobody knows the truth"
+    assert found["rank"] == N * N and found["output"] == str(tmp_path / "run" / "reconstruction")
+    image = read_frame(tmp_path / "run" / "reconstruction" / "image.exr")[0]["reflectance"]
+    # Rounding to whole digital numbers is the only noise; a wrong dark current, black level, exposure, gain or sign is
+    # at least ten times as much.
+    assert np.abs(image - bench.scene).max() < 3e-3
+    text = call("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal")
+    assert text.code == 0 and "PSNR" not in text.out
+
+
+def test_what_others_note_in_a_manifest_is_theirs(call: Callable[..., Any], tmp_path: Path) -> None:
+    bench = Bench3(tmp_path)
+    run = bench.run(False, operator="M. Curie", temperature_c=21.5, checksums={})
+    assert call("reconstruct", run, "--calibration", bench.calibration()).code == 0
+
+
+def test_files_of_another_program(call: Callable[..., Any], tmp_path: Path) -> None:
+    """Half floats and further channels are read as they are."""
+    import OpenEXR
+
+    bench = Bench3(tmp_path)
+    run, calibration = bench.run(False), bench.calibration()
+    path = run / "shot 000.exr"
+    dn = read_frame(path)[0]["DN"]
+    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"DN": dn.astype(np.float16), "preview": dn.astype(np.float32)}).write(str(path))
+    assert call("reconstruct", run, "--calibration", calibration).code == 0
+
+
+def test_another_bench_is_refused(refused: Callable[..., str], tmp_path: Path) -> None:
+    bench = Bench3(tmp_path)
+    bench.run(False)
+    manifest = json.loads((bench.calibration() / "manifest.json").read_text())
+    manifest["camera"] = {"name": "bench 4"}
+    (tmp_path / "cal" / "manifest.json").write_text(json.dumps(manifest))
+    line = refused("reconstruct", "run", "--calibration", "cal")
+    assert "name is bench 4" in line and "bench 3" in line
+
+
+def test_the_example_of_the_documentation(call: Callable[..., Any], tmp_path: Path) -> None:
+    """The manifest in docs/formats.md is read as it stands there."""
+    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    section = text[text.index("## A real camera") :]
+    manifest = section[section.index("```json") + 7 :]
+    run, calibration = tmp_path / "run", tmp_path / "cal"
+    for folder in (run, calibration):
+        folder.mkdir()
+    (run / "manifest.json").write_text(manifest[: manifest.index("```")])
+    factor = np.arange(1, 9).reshape(4, 2) ** 2.0
+    truth = np.array([[0.2, 0.9], [0.5, 0.4]])
+    dn = (factor @ truth @ factor.T + 6) * 0.02 * 0.125 + 160
+    write_frame(run / "a.exr", {"DN": dn.astype(np.float32)}, {})
+    for name in ("left", "right"):
+        write_frame(calibration / f"{name}.exr", {"factor": factor.astype(np.float32)}, {})
+    minimal = {"kind": "calibration", "status": "complete", "camera": {"name": "bench 3"}}
+    (calibration / "manifest.json").write_text(json.dumps(minimal))
+    assert call("reconstruct", run, "--calibration", calibration, "--lambda", 0).code == 0
+    image = read_frame(run / "reconstruction" / "image.exr")[0]["reflectance"]
+    # Numbers of 160 in float32 carry 1.5e-5 of rounding, which the factors magnify.
+    assert np.allclose(image, truth, atol=0.02)

@@ -1,0 +1,65 @@
+"""Every Mitsuba variant through the installed program; another variant than mono needs a process of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.frames import read_frame
+
+VARIANTS = ("llvm_ad_rgb", "llvm_ad_spectral")
+
+
+def channels(path: Path) -> list[np.ndarray]:
+    """The colour channels of a rendered frame."""
+    found = read_frame(path)[0]
+    return [found[name].astype(float) for name in ("Y", "R", "G", "B") if name in found]
+
+
+@pytest.mark.parametrize("colour", VARIANTS)
+def test_the_reference_sees_a_grey_scene_alike_in_every_variant(
+    call: Callable[..., Any], shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str
+) -> None:
+    """White light on grey paper: colour adds nothing, so the mean irradiance of every channel is that of mono.
+
+    Means differ by their noise, which the frames carry: 5 standard errors, significance 1e-6 a channel.
+    """
+    options = "--spp", 64, "--json"
+    mono = call("render", lab.scene, "-o", tmp_path / "mono.exr", *options).payload
+    outcome = shell("render", lab.scene, "-o", tmp_path / "colour.exr", *options, "--variant", colour)
+    assert outcome.err == "" and outcome.payload["variant"] == colour
+    for frame in channels(tmp_path / "colour.exr"):
+        error = np.hypot(mono["mc_error"] * mono["mean"], outcome.payload["mc_error"] * mono["mean"])
+        assert abs(frame.mean() - mono["mean"]) < 5 * error / np.sqrt(frame.size)
+
+
+@pytest.mark.parametrize("colour", VARIANTS)
+def test_capture_in_every_variant(shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str) -> None:
+    """The same frames as in mono within the accuracy asked for, and the same truth within its noise."""
+    options = "-o", tmp_path / "run", "--patterns", "dots:4", "--json", "--variant", colour
+    outcome = shell("capture", *lab.rig, *options)
+    assert outcome.err == "" and outcome.payload["variant"] == colour
+    frames = [
+        np.stack([read_frame(path)[0]["electrons"].astype(float) for path in sorted(run.glob("frame_*.exr"))])
+        for run in (tmp_path / "run", lab.run)
+    ]
+    # The exposures of the two runs differ, each fills the well by its own light; both estimates have an error of 2 %.
+    ours, theirs = (values / np.linalg.norm(values) for values in frames)
+    assert np.linalg.norm(ours - theirs) < 2 * 0.02
+    assert outcome.payload["exposure_s"] == pytest.approx(lab.captured.payload["exposure_s"], rel=0.04)
+    truths = [read_frame(run / "truth.exr")[0]["reflectance"] for run in (tmp_path / "run", lab.run)]
+    # Sampled wavelengths make the spectral truth noisier, 0.023 at this accuracy; another place or scale gives 0.1.
+    assert np.sqrt(np.mean((truths[0] - truths[1]) ** 2)) < 0.05
+
+
+def test_a_variant_that_is_not_on_this_machine(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """A GPU variant: one line where there is no GPU, the usual frames where there is one."""
+    outcome = shell(
+        "capture", *lab.rig, "-o", "run", "--patterns", "uniform", "--variant", "cuda_ad_mono", cwd=tmp_path
+    )
+    if outcome.code:
+        assert "cuda_ad_mono" in outcome.refusal and not (tmp_path / "run").exists()
