@@ -83,6 +83,13 @@ class Bench:
         """Row and column tan-angles of the projector's window on the aligned plane."""
         return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
 
+    @property
+    def field_stop_cuts(self) -> bool:
+        """Whether some sensor point does not see all of the projector's window through the field stop."""
+        reach = max(abs(edge) for window in self.windows for edge in window)
+        shift = self.geometry.half_width / self.geometry.scene_distance
+        return bool(reach + shift > self.geometry.tan_half_fov)
+
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
         """The pattern family of that name on this projector; MitsimError when it does not fit."""
         return parse_patterns(patterns, self.n, seed)

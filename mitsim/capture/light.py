@@ -78,6 +78,7 @@ def make_plan(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float
         fresnel_number=bench.geometry.fresnel_number(wavelength),
         wavelength_nm=wavelength,
         keystone=bench.loaded.pixels.keystone,
+        field_stop_cuts=bench.field_stop_cuts,
     )
     cells = {choice: math.prod(grid_for(bench, choice).shape) for choice in evidence.cell_error}
     return decide(
@@ -107,10 +108,12 @@ def collect(
     weights: FloatArray,
     seed: int,
     progress: Progress = silent,
+    purpose: str = "scene",
 ) -> Light:
     """Trace until the Monte Carlo error of the frames meets the plan's target, or the limit of 2^32 paths.
 
-    Each group gets the same number of batches; a few captures, evenly spread, are formed to see the error.
+    Each group gets the same number of batches; a few captures, evenly spread, are formed to see the error. ``purpose``
+    names the random streams: light for two purposes shares none.
     """
     grid = grid_for(bench, plan.subdivision)
     tracer = Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid, plan.anchors, plan.depth)
@@ -121,7 +124,7 @@ def collect(
     while True:
         for index in range(done, wanted):
             for group in range(GROUPS):
-                sample = tracer.batch(integer(seed, "transport", group, index))
+                sample = tracer.batch(integer(seed, "transport", purpose, group, index))
                 sums[group] = _add(sums[group], sample)
         done = wanted
         groups = tuple(total / done for total in sums if total is not None)

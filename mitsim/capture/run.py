@@ -16,10 +16,10 @@ import numpy.typing as npt
 from mitsim.capture.bench import Bench, load_recipe
 from mitsim.capture.clock import Clock
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
+from mitsim.capture.folder import RunFolder, claimed, frame_name
 from mitsim.capture.light import Light, Progress, collect, make_plan, silent, uniform_light
-from mitsim.core.errors import MitsimError
-from mitsim.core.frames import checksum, read_frame, write_frame
-from mitsim.core.manifest import prepare_output, read_json, versions, write_json
+from mitsim.core.frames import Channel
+from mitsim.core.manifest import versions
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import Capture, PatternFamily
@@ -80,49 +80,68 @@ def capture(
     digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
     clock = Clock()
     labels, weights = family.classes()
-    with clock.stage("plan"):
-        plan = make_plan(bench, labels, weights, accuracy, seed)
-    folder = _open_run(Path(output), digest, configuration, resume)
-    with clock.stage("transport"):
-        light = collect(bench, plan, labels, weights, seed, progress)
-    with clock.stage("truth"):
-        _write_truth(bench, plan, light, folder, seed)
-    expected = light.frames(labels, weights, seed)
-    with clock.stage("optics"):
-        # Forming the frames once finds the brightest pixel; a family with few classes keeps them for the second time.
-        peak, energy, variance, removed = 0.0, 0.0, 0.0, 0.0
+    with claimed(Path(output), digest, configuration, resume) as folder:
+        with clock.stage("plan"):
+            plan = make_plan(bench, labels, weights, accuracy, seed)
+        with clock.stage("transport"):
+            light = collect(bench, plan, labels, weights, seed, progress)
+        with clock.stage("truth"):
+            reflectance = truth(bench, plan, light, seed)
+        expected = light.frames(labels, weights, seed)
+        with clock.stage("optics"):
+            # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
+            totals = _Totals.of(expected)
+        exposer = Exposer(bench, exposure.choose(bench, totals.peak), seed)
+        folder.begin()
+        folder.write_truth(reflectance, load_recipe().board_reflectance)
+        writer = _Writer(family, folder, exposer)
+        writer.write_all(expected, clock, progress)
+        result = CaptureResult(
+            frames=len(family.captures),
+            shape=(bench.geometry.pixels, bench.geometry.pixels),
+            seconds=clock.seconds(),
+            mc_error=totals.mc_error,
+            variant=bench.variant,
+            seed=seed,
+            output=str(folder.path),
+            exposure_s=exposer.exposure_s,
+            mc_to_sensor_noise=writer.noise_ratio,
+            sensor_noise=writer.sensor_noise,
+            plan=plan,
+            warnings=plan.warnings + _warnings(accuracy, light, totals, writer),
+        )
+        folder.finish(_manifest(bench, family, result, light.paths))
+    return result
+
+
+@dataclass(frozen=True)
+class _Totals:
+    """Over all expected frames: brightest pixel [W m^-2], relative Monte Carlo error, most light below zero."""
+
+    peak: float
+    mc_error: float
+    removed: float
+
+    @classmethod
+    def of(cls, expected: ExpectedFrames) -> _Totals:
+        peak = energy = variance = removed = 0.0
         for frame in expected:
             removed = max(removed, frame.removed)
             peak = max(peak, float(frame.irradiance.max()))
             energy += float(np.square(frame.irradiance).sum())
             variance += frame.variance * frame.irradiance.size
-    exposure_s = exposure.choose(bench, peak)
-    writer = _Writer(family, folder, digest, Exposer(bench, exposure_s, seed))
-    writer.write_all(expected, clock, progress)
-    mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
-    warnings = plan.warnings
+        return cls(peak, float(np.sqrt(variance / energy)) if energy else 0.0, removed)
+
+
+def _warnings(accuracy: float, light: Light, totals: _Totals, writer: _Writer) -> tuple[str, ...]:
+    found = []
     if not light.reached:
-        warnings += (f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached",)
-    if removed > accuracy:
-        warnings += (f"interpolation between anchors left {removed:.1e} of a frame below zero; ask for more accuracy",)
+        found.append(f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached")
+    if totals.removed > accuracy:
+        found.append(f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for more")
     if writer.saturated:
-        warnings += (f"{writer.saturated} frames have pixels at the full well or the ADC's end; shorten the exposure",)
-    result = CaptureResult(
-        frames=len(family.captures),
-        shape=(bench.geometry.pixels, bench.geometry.pixels),
-        seconds=clock.seconds(),
-        mc_error=mc_error,
-        variant=bench.variant,
-        seed=seed,
-        output=str(folder),
-        exposure_s=exposure_s,
-        mc_to_sensor_noise=writer.noise_ratio,
-        sensor_noise=writer.sensor_noise,
-        plan=plan,
-        warnings=warnings,
-    )
-    _write_manifest(bench, family, folder, digest, configuration, result, light, writer)
-    return result
+        found.append(f"{writer.saturated} frames have pixels at the full well or the ADC's end; shorten the exposure")
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +159,8 @@ class _Exposed:
 class _Writer:
     """Turns expected frames into noisy ones and writes them; frames already there from the same run are kept."""
 
-    def __init__(self, family: PatternFamily, folder: Path, digest: str, exposer: Exposer) -> None:
-        self.family, self.folder, self.digest, self.exposer = family, folder, digest, exposer
+    def __init__(self, family: PatternFamily, folder: RunFolder, exposer: Exposer) -> None:
+        self.family, self.folder, self.exposer = family, folder, exposer
         self.saturated, self.noise_ratio = 0, 0.0
         self._noise_energy = self._energy = 0.0
 
@@ -163,7 +182,9 @@ class _Writer:
             with clock.stage("write"):
                 in_threads(self._write, exposed)
             for frame in exposed:
-                self.noise_ratio = max(self.noise_ratio, frame.rendering_noise / frame.sensor_noise)
+                if frame.rendering_noise:
+                    ratio = frame.rendering_noise / frame.sensor_noise if frame.sensor_noise else np.inf
+                    self.noise_ratio = max(self.noise_ratio, ratio)
                 self.saturated += self.exposer.saturated(frame.digital)
                 self._noise_energy += frame.sensor_noise**2 * frame.electrons.size
                 self._energy += float(np.square(frame.electrons).sum())
@@ -182,12 +203,9 @@ class _Writer:
         )
 
     def _write(self, frame: _Exposed) -> None:
-        path = self.folder / frame_name(frame.index)
-        if _is_kept(path, self.digest, frame.index):
+        if self.folder.keeps(frame.index):
             return
         metadata: dict[str, str | int | float] = {
-            "run": self.digest,
-            "index": frame.index,
             "row": frame.shown.row,
             "column": frame.shown.column,
             "sign": frame.shown.sign,
@@ -196,51 +214,10 @@ class _Writer:
             "seed": self.exposer.seed,
         }
         electrons = frame.electrons.astype(np.float32)
-        if frame.digital.dtype == np.uint32:
-            write_frame(path, {"DN": frame.digital.astype(np.uint32), "electrons": electrons}, metadata)
-        else:
-            write_frame(path, {"DN": frame.digital.astype(np.float32), "electrons": electrons}, metadata)
-
-
-def frame_name(index: int) -> str:
-    """File name of a capture in its run folder."""
-    return f"frame_{index:05d}.exr"
-
-
-def _is_kept(path: Path, digest: str, index: int) -> bool:
-    if not path.exists():
-        return False
-    try:
-        _, metadata = read_frame(path)
-    except MitsimError:
-        return False
-    return metadata.get("run") == digest and metadata.get("index") == index
-
-
-def _open_run(folder: Path, digest: str, configuration: dict[str, Any], resume: bool) -> Path:
-    manifest = folder / "manifest.json"
-    if resume and manifest.exists():
-        found = read_json(manifest)
-        if found.get("configuration_sha256") != digest:
-            changed = [k for k, v in configuration.items() if found.get("configuration", {}).get(k) != v]
-            raise MitsimError(
-                f"--resume: {folder} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
-                "use the same options, or another folder"
-            )
-        prepare_output(folder, overwrite=True)
-        return folder
-    prepare_output(folder)
-    write_json(
-        manifest,
-        {"kind": "capture", "status": "incomplete", "configuration": configuration, "configuration_sha256": digest},
-    )
-    return folder
-
-
-def _write_truth(bench: Bench, plan: Plan, light: Light, folder: Path, seed: int) -> None:
-    write_frame(
-        folder / "truth.exr", {"reflectance": truth(bench, plan, light, seed).astype(np.float32)}, {"peak": 1.0}
-    )
+        # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
+        whole = frame.digital.dtype == np.uint32
+        dn: Channel = frame.digital.astype(np.uint32) if whole else frame.digital.astype(np.float32)
+        self.folder.write_frame(frame.index, {"DN": dn, "electrons": electrons}, metadata)
 
 
 def truth(bench: Bench, plan: Plan, light: Light, seed: int) -> FloatArray:
@@ -248,7 +225,9 @@ def truth(bench: Bench, plan: Plan, light: Light, seed: int) -> FloatArray:
 
     The board is the session's, so a board of reflectance 0.99 counts as 1 (DESIGN section 5).
     """
-    board = collect(bench.with_board(load_recipe().board_reflectance), plan, *uniform_light(bench.n), seed)
+    board = collect(
+        bench.with_board(load_recipe().board_reflectance), plan, *uniform_light(bench.n), seed, purpose="board"
+    )
     reference = board.flux()
     ratio = np.divide(light.flux(), reference, out=np.zeros_like(reference), where=reference > 0)
     return ratio.reshape(bench.n, bench.n)
@@ -278,34 +257,17 @@ def digital_block(bench: Bench, exposure_s: float) -> dict[str, float]:
     }
 
 
-def _write_manifest(
-    bench: Bench,
-    family: PatternFamily,
-    folder: Path,
-    digest: str,
-    configuration: dict[str, Any],
-    result: CaptureResult,
-    light: Light,
-    writer: _Writer,
-) -> None:
-    files = [frame_name(index) for index in range(result.frames)]
-    write_json(
-        folder / "manifest.json",
-        {
-            "kind": "capture",
-            "status": "complete",
-            "configuration": configuration,
-            "configuration_sha256": digest,
-            "camera": bench.identity(),
-            "digital": digital_block(bench, result.exposure_s),
-            "patterns": pattern_block(family, files),
-            "checksums": {name: checksum(folder / name) for name in [*files, "truth.exr"]},
-            "plan": asdict(result.plan),
-            "mc_error": result.mc_error,
-            "mc_to_sensor_noise": result.mc_to_sensor_noise,
-            "paths": light.paths,
-            "seconds": result.seconds,
-            "warnings": result.warnings,
-            "versions": versions(),
-        },
-    )
+def _manifest(bench: Bench, family: PatternFamily, result: CaptureResult, paths: int) -> dict[str, Any]:
+    """What a solver and a reader of the run need, beside what the folder adds itself."""
+    return {
+        "camera": bench.identity(),
+        "digital": digital_block(bench, result.exposure_s),
+        "patterns": pattern_block(family, [frame_name(index) for index in range(result.frames)]),
+        "plan": asdict(result.plan),
+        "mc_error": result.mc_error,
+        "mc_to_sensor_noise": result.mc_to_sensor_noise,
+        "paths": paths,
+        "seconds": result.seconds,
+        "warnings": result.warnings,
+        "versions": versions(),
+    }

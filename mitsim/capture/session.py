@@ -49,7 +49,7 @@ class Session:
         with clock.stage("plan"):
             self.plan: Plan = make_plan(self.board, *uniform, accuracy, seed)
         with clock.stage("transport"):
-            self.light: Light = collect(self.board, self.plan, *uniform, seed, progress).merged()
+            self.light: Light = collect(self.board, self.plan, *uniform, seed, progress, "calibration").merged()
         with clock.stage("optics"):
             self.white = next(iter(self.light.frames(*uniform, seed)))
             peak = float(self.white.irradiance.max())

@@ -203,10 +203,10 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     MitsimError
         for an unknown family, a K that is not a whole number, or K outside 1..n.
     """
-    name, _, size = text.partition(":")
-    if name not in FAMILIES or (name == "uniform") != (size == ""):
+    name, colon, size = text.partition(":")
+    if name not in FAMILIES or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
         raise MitsimError(f"patterns {text!r}: use uniform, dots:K, hadamard:K or random:K")
-    if size and not (size.isascii() and size.isdigit()):
+    if colon and not (size.isascii() and size.isdigit() and len(size) < 10):
         raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {n}")
     k = int(size or 1)
     if not 1 <= k <= n:

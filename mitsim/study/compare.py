@@ -43,7 +43,7 @@ class Comparison:
         self.bench, self.light, self.truth, self.seed, self.progress = bench, light, truth, seed, progress
         self.factors = factors.left, factors.right
         board = bench.with_board(load_recipe().board_reflectance)
-        flux = float(collect(board, plan, *uniform_light(bench.n), seed).flux().mean())
+        flux = float(collect(board, plan, *uniform_light(bench.n), seed, purpose="board").flux().mean())
         self.ideal = ideal_light(bench, truth, flux)
         rate = float(electrons_from_irradiance(1.0, 1.0, bench.sensor, bench.projector.effective_wavelength_nm))
         self.ideal_factors = ideal_factors(bench, flux, rate)

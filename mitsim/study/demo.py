@@ -18,8 +18,9 @@ import numpy.typing as npt
 from mitsim.calibrate.hadamard import Calibration
 from mitsim.capture.bench import Bench, PatternFamily, load_recipe, open_bench
 from mitsim.capture.clock import Clock
+from mitsim.capture.folder import frame_name
 from mitsim.capture.light import Progress, collect, pinhole_view, silent
-from mitsim.capture.run import CaptureResult, capture, frame_name
+from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.configuration import shipped
 from mitsim.core.frames import read_frame
 from mitsim.core.manifest import prepare_output, read_json, versions, write_json

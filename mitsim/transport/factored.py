@@ -154,6 +154,8 @@ class Tracer:
         hit_column = self._cell(grid.columns, -local.x * inverse_depth, column, tau_column)
         inside = (hit_row >= 0) & (hit_row < mi.Int32(rows)) & (hit_column >= 0) & (hit_column < mi.Int32(columns))
         inside &= local.z > geometry.mask_distance
+        stop = dr.opaque(mi.Float, geometry.tan_half_fov)
+        inside &= (dr.abs(t.x) <= stop) & (dr.abs(t.y) <= stop)
         solid = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) / dr.square(squared)
         weight = dr.select(inside, panchromatic(radiance) * solid, 0)
         full_row = anchor_row * rows + mi.UInt32(dr.maximum(hit_row, 0))

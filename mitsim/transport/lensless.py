@@ -49,12 +49,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.camera import CameraGeometry
 
 PLUGIN = "mitsim_lensless"
 _REGISTERED: set[str] = set()
+_RIGID = 1e-4
 
 
 def register() -> None:
@@ -74,6 +76,16 @@ def _geometry(props: Any, size: Any) -> CameraGeometry:
     return CameraGeometry.checked(PLUGIN, pixels=int(size[0]), **values)
 
 
+def _check_rigid(matrix: npt.NDArray[np.float64]) -> None:
+    rotation = matrix[:3, :3]
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if not (np.isfinite(matrix).all() and error < _RIGID and np.linalg.det(rotation) > 0):
+        raise MitsimError(
+            f"{PLUGIN}: to_world is no rotation and translation (it scales, shears or mirrors: R^T R is {error:.2g} "
+            "from 1); lengths are mm everywhere, so move and turn the camera only"
+        )
+
+
 def _sensor_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
@@ -85,6 +97,9 @@ def _sensor_class() -> type:
                 raise MitsimError(
                     f"{PLUGIN}: the film's filter spreads light between pixels; use <rfilter type='box'/>"
                 )
+            if list(self.film().crop_size()) != list(self.film().size()):
+                raise MitsimError(f"{PLUGIN}: the film is cropped; the whole sensor is simulated, remove the crop")
+            _check_rigid(np.array(self.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0])
             self.geometry = _geometry(props, self.film().size())
             terms = self.geometry.build_mask().terms
             self._weights = [weight for weight, _, _ in terms]

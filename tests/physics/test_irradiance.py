@@ -220,7 +220,6 @@ def test_a_bright_patch_of_the_scene_lands_where_it_should(small_scene: Callable
     assert centroid(render(path, spp=2048)) == pytest.approx(expected, abs=1.0)
 
 
-@pytest.mark.xfail(reason="the factored estimator knows no field stop, and the plan does not say so", strict=True)
 def test_a_field_stop_inside_the_window_dims_both_estimators(small_scene: Callable[..., Path]) -> None:
     """A stop of 14 degrees sees tan-angles to 0.123 of the window's 0.15: two thirds of the light."""
     path = small_scene(mask="open", fov=14)

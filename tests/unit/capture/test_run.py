@@ -229,7 +229,6 @@ def test_a_folder_in_use_is_refused(bench: Bench, captured: CaptureResult, tmp_p
         capture(bench, "dots:3", tmp_path / "no" / "run", ACCURACY)
 
 
-@pytest.mark.xfail(reason="the pilot runs first: seconds of work before the refusal", strict=True)
 def test_a_folder_in_use_is_refused_before_any_work(
     bench: Bench, captured: CaptureResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
