@@ -13,12 +13,23 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, FrameOptics, relative_error
-from mitsim.scene.plan import Plan, SceneFacts, decide
+from mitsim.scene.plan import Plan, SceneFacts, check_accuracy, decide
 from mitsim.transport import pilot
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.factored import LightSample, Tracer
 
-__all__ = ["Light", "Plan", "Progress", "collect", "grid_for", "make_plan", "pinhole_view", "silent", "uniform_light"]
+__all__ = [
+    "Light",
+    "Plan",
+    "Progress",
+    "check_accuracy",
+    "collect",
+    "grid_for",
+    "make_plan",
+    "pinhole_view",
+    "silent",
+    "uniform_light",
+]
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]

@@ -20,6 +20,7 @@ from mitsim.reconstruct.solver import Prepared
 
 FloatArray = npt.NDArray[np.float64]
 
+_BALANCE = 3.0
 AUTO_WEIGHT = 0.12
 """Automatic weight in units of the noise that the data term's gradient carries to one scene pixel."""
 
@@ -74,18 +75,23 @@ def solve_tv(
     data = spectrum.sigma * spectrum.projected
     smooth = prepared.image(data / (squared + rho))
     dual = np.zeros_like(smooth)
-    image, change, spent = smooth, float("inf"), 0
+    change, spent = float("inf"), 0
     while spent < iterations and change >= tolerance:
         spent += 1
         target = prepared.coefficients(smooth - dual)
         # Directions outside the basis (under-determined sides) are not measured: they keep the target.
         kept = smooth - dual - prepared.image(target)
         updated = prepared.image((data + rho * target) / (squared + rho)) + kept
+        before = smooth
         # skimage minimises |u - f|^2 / (2 weight) + TV(u).
         smooth = denoise_tv_chambolle(updated + dual, weight=weight / rho, eps=1e-6, max_num_iter=60)
         dual = dual + updated - smooth
-        change = float(np.linalg.norm(updated - image)) / max(float(np.linalg.norm(updated)), 1e-300)
-        image = updated
+        # Primal and dual residual (Boyd et al., section 3.3): one alone can be small far from the minimum.
+        primal, moved = float(np.linalg.norm(updated - smooth)), float(np.linalg.norm(smooth - before))
+        change = max(primal, moved) / max(float(np.linalg.norm(smooth)), 1e-300)
+        # Residual balancing (section 3.4.1): the penalty sets the speed only, and costs nothing to change here.
+        factor = 2.0 if primal > _BALANCE * moved else 0.5 if moved > _BALANCE * primal else 1.0
+        rho, dual = rho * factor, dual / factor
     return _solution(prepared, spectrum, smooth, float(weight), spent, change, change < tolerance)
 
 

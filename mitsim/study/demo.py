@@ -19,7 +19,7 @@ from mitsim.calibrate.hadamard import Calibration
 from mitsim.capture.bench import Bench, PatternFamily, load_recipe, open_bench
 from mitsim.capture.clock import Clock
 from mitsim.capture.folder import frame_name
-from mitsim.capture.light import Progress, collect, pinhole_view, silent
+from mitsim.capture.light import Progress, check_accuracy, collect, pinhole_view, silent
 from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.configuration import shipped
 from mitsim.core.frames import read_frame
@@ -78,9 +78,13 @@ def demo(
     An earlier demo in ``output`` is replaced; any other content there is refused.
     """
     clock = Clock()
-    folder = _fresh(Path(output))
     with clock.stage("open scene"):
         bench = open_bench(scene or shipped("scenes", "photograph", "scene.xml"), variant)
+    check_accuracy(accuracy)
+    for name in FAMILIES:
+        bench.family(name, seed)
+    # Only now, with nothing left to refuse, is an earlier demo taken away.
+    folder = _fresh(Path(output))
     captured = capture(bench, MAIN, folder / "run", accuracy, seed, progress=progress)
     clock.add(captured.seconds)
     calibrated, factors = calibrate(bench, folder / "calibration", accuracy, seed, progress=progress)
@@ -115,9 +119,14 @@ def _quality(families: list[FamilyResult], name: str) -> float:
     return next(f.rendered.psnr_db for f in families if f.name == name and f.rendered)
 
 
+def _is_demo(path: Path) -> bool:
+    found = read_json(path)
+    return isinstance(found, dict) and found.get("kind") == "demo"
+
+
 def _fresh(folder: Path) -> Path:
     """The output folder, emptied of an earlier demo and of nothing else."""
-    if folder.is_dir() and (folder / "demo.json").is_file() and read_json(folder / "demo.json").get("kind") == "demo":
+    if folder.is_dir() and (folder / "demo.json").is_file() and _is_demo(folder / "demo.json"):
         for part in ("run", "calibration"):
             shutil.rmtree(folder / part, ignore_errors=True)
         for name in ("demo.json", "report.html"):
