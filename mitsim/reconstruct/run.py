@@ -79,6 +79,9 @@ class CalibrationManifest(BaseModel):
 
     camera: dict[str, Any] = Field(description="identity that a run must share")
     centre: StrictBool = Field(default=False, description="row and column means are taken out (FlatCam masks)")
+    board_reflectance: float | None = Field(
+        default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; None: unknown"
+    )
     checksums: dict[str, str] = Field(default={}, description="SHA-256 by file name, where known")
 
 

@@ -94,6 +94,7 @@ def calibrate(
             "configuration": {**bench.provenance(), "accuracy": accuracy, "seed": seed, "recipe": recipe},
             "camera": bench.identity(),
             "centre": session.centre,
+            "board_reflectance": recipe.board_reflectance,
             "digital": digital_block(bench, session.exposure_s),
             "checksums": {name: checksum(folder / name) for name in ("left.exr", "right.exr")},
             "result": {key: value for key, value in vars(result).items() if key != "output"},

@@ -65,9 +65,10 @@ def contrast(region: Image, lines: Literal["vertical", "horizontal"] = "vertical
     return (high - low) / (high + low)
 
 
-def read_truth(run_folder: Path) -> NDArray[np.float64]:
+def read_truth(run_folder: Path, board_reflectance: float | None = None) -> NDArray[np.float64]:
     """(n_rows, n_columns) apparent reflectance that `capture` wrote beside its frames as truth.exr.
 
+    It is relative to the board of the shipped session recipe, or to one of ``board_reflectance`` when that is given.
     Raises MitsimError when the folder holds no truth, as with frames of a real camera.
     """
     from mitsim.core.frames import read_frame
@@ -75,11 +76,13 @@ def read_truth(run_folder: Path) -> NDArray[np.float64]:
     path = Path(run_folder) / TRUTH_FILE
     if not path.is_file():
         raise MitsimError(f"{path}: no truth in this run, so no PSNR or SSIM; only `mitsim capture` writes one")
-    channels, _ = read_frame(path)
+    channels, metadata = read_frame(path)
     if TRUTH_CHANNEL not in channels:
         found = ", ".join(sorted(channels))
         raise MitsimError(f"{path}: channels are {found}; needs {TRUTH_CHANNEL!r}; capture the scene again")
-    return np.asarray(channels[TRUTH_CHANNEL], dtype=np.float64)
+    truth = np.asarray(channels[TRUTH_CHANNEL], dtype=np.float64)
+    board = metadata.get("board_reflectance")
+    return truth if board_reflectance is None or board is None else truth * (float(board) / board_reflectance)
 
 
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -61,7 +61,7 @@ def reconstruct(
     truth = None
     if (Path(run) / TRUTH_FILE).is_file():
         verify(Path(run), TRUTH_FILE, measurements.manifest.checksums, "remove it, or capture again with --resume")
-        truth = read_truth(Path(run))
+        truth = read_truth(Path(run), factors.manifest.board_reflectance)
     # Only an earlier result is replaced: image.exr is the first file of one.
     folder = prepare_output(output, overwrite=(Path(output) / IMAGE_FILE).is_file())
     read = time.perf_counter()

@@ -78,6 +78,14 @@ def test_truth_is_read_as_written(tmp_path: Path) -> None:
     assert read.dtype == np.float64 and np.array_equal(read, values)
 
 
+def test_truth_follows_the_board_of_the_calibration(tmp_path: Path) -> None:
+    # A sheet that is 0.5 of a 0.99 board is 0.55 of a 0.9 board.
+    values = np.full((3, 4), 0.5, dtype=np.float32)
+    write_frame(tmp_path / "truth.exr", {"reflectance": values}, {"board_reflectance": 0.99})
+    assert read_truth(tmp_path, 0.9) == pytest.approx(0.55)
+    assert read_truth(tmp_path) == pytest.approx(0.5)
+
+
 def test_a_run_without_truth_says_so(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match="no truth in this run"):
         read_truth(tmp_path)
