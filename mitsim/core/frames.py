@@ -11,7 +11,7 @@ import io
 import json
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -109,10 +109,22 @@ def _scalar(value: Value) -> Value:
 
 
 def _open(path: Path) -> Any:
-    # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone; it
-    # raises later on. The lock keeps two threads from restoring each other's stdout.
-    with _stdout_lock, contextlib.redirect_stdout(io.StringIO()):
+    # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone, and its C++ part
+    # one to stderr, past Python; it raises later on. The lock keeps two threads from restoring each other's streams.
+    with _stdout_lock, contextlib.redirect_stdout(io.StringIO()), _stderr_nowhere():
         return OpenEXR.File(str(path), separate_channels=True)
+
+
+@contextlib.contextmanager
+def _stderr_nowhere() -> Iterator[None]:
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _check_magic(path: Path) -> None:

@@ -65,9 +65,7 @@ def test_the_slope_of_variance_over_mean_is_the_gain(camera: SensorModel, record
     dark_mean, dark_variance = pair(camera, 0.0, side, 0.0, "dark")
     slopes = []
     for level in LEVELS:
-        mean, variance = pair(
-            camera, level * camera.superpixel_full_well_e, side, EXPOSURE_S, f"level {level}"
-        )
+        mean, variance = pair(camera, level * camera.superpixel_full_well_e, side, EXPOSURE_S, f"level {level}")
         slopes.append((variance - dark_variance) / (mean - dark_mean))
     error = np.mean(slopes) / camera.gain_dn_per_e - 1
     record_property("gain error", error)

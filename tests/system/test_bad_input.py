@@ -10,7 +10,6 @@ import pytest
 
 Refused = Callable[..., str]
 NEW = ("-o", "new")
-LATE_DEMO = pytest.mark.xfail(reason="the folder is prepared, and an earlier demo deleted, first", strict=True)
 LATE_EXPOSURE = pytest.mark.xfail(reason="an exposure is chosen after the run has begun", strict=True)
 
 
@@ -32,7 +31,7 @@ def mentions(line: str, *fragments: str) -> None:
         ("render", "-o", "new.exr"),
         ("render", "-o", "new.exr", "--estimator", "factored"),
         ("study", "accuracy", *NEW),
-        pytest.param(("demo", *NEW, "--scene"), marks=LATE_DEMO),
+        ("demo", *NEW, "--scene"),
     ],
     ids=lambda verb: verb[0],
 )
@@ -213,7 +212,6 @@ def test_a_study_refuses_patterns_that_do_not_fit(refused: Refused, lab: Any) ->
     mentions(refused("study", "accuracy", lab.scene, *NEW, "--patterns", "dots:17"), "dots:17", "16")
 
 
-@LATE_DEMO
 def test_a_demo_refuses_a_projector_too_small_for_its_families(refused: Refused, lab: Any) -> None:
     mentions(refused("demo", *NEW, "--scene", lab.write_scene("tiny", n=4)), "dots:", "4")
 

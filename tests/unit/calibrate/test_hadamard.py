@@ -103,8 +103,7 @@ def flatcam(pixel_mm, order=9):
     mask = mls_mask("flatcam", order=order)
     pixels, scene = centred_edges(64, pixel_mm), centred_edges(N, 120 / N)
     return [
-        (weight, scene_factor(profile, mask.feature_mm, pixels, scene, 2.0, 400.0))
-        for weight, profile, _ in mask.terms
+        (weight, scene_factor(profile, mask.feature_mm, pixels, scene, 2.0, 400.0)) for weight, profile, _ in mask.terms
     ]
 
 

@@ -11,9 +11,7 @@ from mitsim.core.errors import MitsimError
 
 def in_child(program: str, **env: str) -> subprocess.CompletedProcess[str]:
     """Setting a variant is for the whole process, so it is done in another one."""
-    return subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, **env}
-    )
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, **env})
 
 
 def test_load_variant_gives_mitsuba_with_the_variant_set() -> None:
@@ -45,9 +43,7 @@ def test_an_old_llvm_never_reaches_mitsuba() -> None:
     assert done.returncode == 0 and "LLVM 15, but Dr.Jit needs 17 or newer" in done.stdout
 
 
-def test_the_doctor_names_one_command_for_all_that_fails(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_doctor_names_one_command_for_all_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / ".drjit").touch()  # a file where the cache folder should be
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so.19.1")

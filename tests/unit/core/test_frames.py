@@ -27,9 +27,7 @@ def test_channels_and_metadata_come_back_bit_for_bit(tmp_path: Path) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(value=st.one_of(st.text(max_size=40), st.integers(), st.floats(allow_nan=False)))
-def test_any_metadata_value_comes_back(
-    tmp_path_factory: pytest.TempPathFactory, value: str | int | float
-) -> None:
+def test_any_metadata_value_comes_back(tmp_path_factory: pytest.TempPathFactory, value: str | int | float) -> None:
     path = tmp_path_factory.mktemp("frames") / "a.exr"
     write_frame(path, {"DN": DN}, {"value": value})
     assert read_frame(path)[1] == {"value": value}
@@ -41,9 +39,7 @@ def test_rows_stay_rows(tmp_path: Path) -> None:
     assert np.array_equal(read_frame(tmp_path / "a.exr")[0]["DN"], tall.T[:, ::-1])
 
 
-def test_a_failed_write_leaves_the_old_frame_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_leaves_the_old_frame_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.exr"
     write_frame(path, {"DN": DN}, {"version": 1})
     before = checksum(path)

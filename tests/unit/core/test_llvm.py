@@ -52,9 +52,7 @@ def test_a_link_tells_its_target_s_version(tmp_path: Path) -> None:
     assert llvm.version(tmp_path / "libLLVM.so") == 15
 
 
-def test_old_libraries_are_no_candidates_and_links_count_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_old_libraries_are_no_candidates_and_links_count_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "libLLVM.so.19.1").touch()
     (tmp_path / "libLLVM-19.so").symlink_to(tmp_path / "libLLVM.so.19.1")
     names = ["libLLVM.so.20.1", "libLLVM.so.19.1", "libLLVM-19.so", "libLLVM-15.so.1", "libLLVM-14.so.1"]
@@ -69,17 +67,13 @@ def test_names_cover_debian_s_spelling() -> None:
     assert not any(f"libLLVM-{old}.so" in name for name in names for old in (14, 15, 16))
 
 
-def test_a_library_that_fails_the_probe_is_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_library_that_fails_the_probe_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_libraries(monkeypatch, tmp_path, "libLLVM.so.20.1", "libLLVM.so.19.1")
-    monkeypatch.setattr(llvm, "probe", lambda path: llvm.Probe("19" in str(path), "seen"))
+    monkeypatch.setattr(llvm, "probe", lambda path: llvm.Probe("19" in path.name, "seen"))
     assert llvm.find_llvm().name == "libLLVM.so.19.1"
 
 
-def test_without_a_library_the_error_names_the_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_library_the_error_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_libraries(monkeypatch, tmp_path, "libLLVM-14.so.1")
     with pytest.raises(MitsimError, match=r"none found.*install") as caught:
         llvm.select_llvm()
@@ -107,9 +101,7 @@ def test_a_named_library_must_exist_and_work(tmp_path: Path, monkeypatch: pytest
         llvm.find_llvm()
 
 
-def test_a_good_probe_is_remembered_until_the_library_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_good_probe_is_remembered_until_the_library_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (path,) = fake_libraries(monkeypatch, tmp_path, "libLLVM.so.19.1")
     probed: list[Path] = []
 

@@ -104,9 +104,7 @@ def test_a_place_that_takes_no_files_is_refused(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
-def test_a_folder_without_write_access_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_a_folder_without_write_access_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     # Root may write anywhere, so the read-only file system is played.
     def refuse(dir: Path) -> None:
         raise OSError(30, f"Read-only file system: {dir}")

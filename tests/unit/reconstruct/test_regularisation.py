@@ -28,9 +28,7 @@ def photograph():
 def captured(factor, image, k, peak=1e4, read_noise=2.24, seed=0):
     """Prepared model and summed noisy frames, peak electrons in the brightest pixel of all."""
     dots = (np.arange(N)[:, None] % k == np.arange(k)).astype(float)
-    clean = {
-        (i, j): factor[:, i::k] @ image[i::k, j::k] @ factor[:, j::k].T for i in range(k) for j in range(k)
-    }
+    clean = {(i, j): factor[:, i::k] @ image[i::k, j::k] @ factor[:, j::k].T for i in range(k) for j in range(k)}
     gain = peak / max(frame.max() for frame in clean.values())
     rng = np.random.default_rng([seed, k])
     prepared = prepare(factor, factor, dots, dots)
@@ -45,9 +43,7 @@ def psnr(image, truth):
     return -10 * np.log10(np.mean((image - truth) ** 2))
 
 
-@pytest.mark.parametrize(
-    ("k", "peak", "read_noise"), [(1, 1e4, 2.24), (5, 1e4, 2.24), (7, 1e4, 2.24), (7, 15.0, 7.4)]
-)
+@pytest.mark.parametrize(("k", "peak", "read_noise"), [(1, 1e4, 2.24), (5, 1e4, 2.24), (7, 1e4, 2.24), (7, 15.0, 7.4)])
 def test_automatic_lambda_is_within_half_a_decibel_of_the_oracle(factor, photograph, k, peak, read_noise):
     # Poisson noise is not of one variance, as the score assumes, there are up to 12.8 million data for 16384
     # unknowns, and at 15 electrons little is left of the image: all this the score must survive.

@@ -28,11 +28,7 @@ def families(n):
 
 
 def frames_of(left, right, P_L, P_R, image):
-    return {
-        (i, j): left @ (np.outer(p, q) * image) @ right.T
-        for i, p in enumerate(P_L.T)
-        for j, q in enumerate(P_R.T)
-    }
+    return {(i, j): left @ (np.outer(p, q) * image) @ right.T for i, p in enumerate(P_L.T) for j, q in enumerate(P_R.T)}
 
 
 def solve(left, right, P_L, P_R, frames, lam, **options):
@@ -80,9 +76,7 @@ def test_blocks_of_dots_and_full_agree(n, k, seed):
     factor = rng.random((n + 10, n)) + np.eye(n + 10, n) * n / 2
     image = rng.random((n, n))
     frames = frames_of(factor, factor, dots(n, k), dots(n, k), image)
-    results = [
-        solve(factor, factor, dots(n, k), dots(n, k), frames, 0.0, structure=s) for s in ("block", "full")
-    ]
+    results = [solve(factor, factor, dots(n, k), dots(n, k), frames, 0.0, structure=s) for s in ("block", "full")]
     np.testing.assert_allclose(results[0].image, image, rtol=0, atol=1e-10)
     np.testing.assert_allclose(results[1].image, image, rtol=0, atol=1e-10)
     assert results[0].condition == pytest.approx(results[1].condition, rel=1e-9)

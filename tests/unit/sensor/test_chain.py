@@ -175,9 +175,7 @@ def test_read_noise_comes_from_its_own_stream() -> None:
     # In the dark the shot stream draws nothing that shows: the frame must follow the read stream alone.
     model = sensor(read_noise_e=5.0)
     dark = np.zeros((30, 30))
-    first, second = (
-        chain.expose(dark, 0.0, model, stream(seed, "shot"), stream(1, "read")) for seed in (1, 2)
-    )
+    first, second = (chain.expose(dark, 0.0, model, stream(seed, "shot"), stream(1, "read")) for seed in (1, 2))
     assert np.array_equal(first, second)
 
 
@@ -185,9 +183,7 @@ def test_noise_streams_are_separate() -> None:
     # Another read stream leaves the electrons as they were; with no read noise the stream does not matter.
     model = sensor()
     expected = np.full((30, 30), 50.0)
-    frames = [
-        chain.expose(expected, 0.0, model, stream(1, "shot"), stream(1, "read", index)) for index in (0, 1)
-    ]
+    frames = [chain.expose(expected, 0.0, model, stream(1, "shot"), stream(1, "read", index)) for index in (0, 1)]
     assert np.array_equal(frames[0], frames[1])
     other = chain.expose(expected, 0.0, model, stream(2, "shot"), stream(1, "read", 0))
     assert not np.array_equal(frames[0], other)
