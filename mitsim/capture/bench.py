@@ -52,7 +52,7 @@ class SessionRecipe(BaseModel):
 class Bench:
     """A loaded scene with the camera's electronics and the projector's light.
 
-    ``defines`` are the ``-D`` parameters that the scene was loaded with.
+    ``defines`` are the ``-D`` parameters that the scene was loaded with, ``camera_file`` where the electronics stand.
     """
 
     loaded: LoadedScene
@@ -60,6 +60,7 @@ class Bench:
     projector: ProjectorModel
     variant: str
     defines: dict[str, str]
+    camera_file: str
 
     @property
     def geometry(self) -> CameraGeometry:
@@ -167,7 +168,7 @@ def open_bench(
             f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
             "use the camera of that scene, or change pixel_pitch, or binning"
         )
-    return Bench(loaded, sensor, light, variant, dict(defines or {}))
+    return Bench(loaded, sensor, light, variant, dict(defines or {}), str(sensor_path))
 
 
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:

@@ -42,6 +42,14 @@ class Exposure:
         if not 0 < self.fraction <= 1:
             raise MitsimError(f"exposure fraction {self.fraction} of full well: give a number above 0, up to 1")
 
+    def check(self, bench: Bench) -> None:
+        """MitsimError when the time is to follow from a full well that the camera does not have."""
+        if self.seconds is None and not np.isfinite(bench.sensor.full_well_e):
+            raise MitsimError(
+                f"camera {bench.camera_file}: full_well_e is inf, so there is no full well to fill; "
+                "give a finite one, or an exposure in seconds"
+            )
+
     def choose(self, bench: Bench, peak_irradiance: float) -> float:
         """Exposure time [s] for frames whose brightest expected pixel has this irradiance [W m^-2]."""
         if self.seconds is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import Channel, Value, checksum, read_frame, write_frame
-from mitsim.core.manifest import prepare_output, read_json, write_json
+from mitsim.core.manifest import output_folder, read_json, write_json
 
 MANIFEST = "manifest.json"
 TRUTH = "truth.exr"
@@ -95,19 +95,11 @@ def claimed(path: Path, digest: str, configuration: Mapping[str, Any], resume: b
         for a place that cannot be written, that holds something else, or, with ``resume``, another configuration.
     """
     known: Mapping[str, str] = {}
-    new = not path.exists()
-    if resume and (path / MANIFEST).is_file():
+    again = resume and (path / MANIFEST).is_file()
+    if again:
         known = _checked(path, digest, configuration)
-        prepare_output(path, overwrite=True)
-    else:
-        prepare_output(path)
-    try:
-        yield RunFolder(path, digest, configuration, known)
-    except BaseException:
-        if new:
-            with suppress(OSError):
-                path.rmdir()
-        raise
+    with output_folder(path, overwrite=again) as folder:
+        yield RunFolder(folder, digest, configuration, known)
 
 
 def _checked(path: Path, digest: str, configuration: Mapping[str, Any]) -> Mapping[str, str]:

@@ -68,6 +68,7 @@ def capture(
         for patterns that do not fit, an output that cannot be written or holds something else.
     """
     exposure = exposure or Exposure()
+    exposure.check(bench)
     family = bench.family(patterns, seed)
     configuration = {
         **bench.provenance(),

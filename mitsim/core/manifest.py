@@ -6,7 +6,8 @@ import math
 import os
 import platform
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -80,6 +81,20 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
     else:
         _prepare_folder(path, overwrite)
     return path
+
+
+@contextmanager
+def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """`prepare_output` for the time of a work: a folder made for nothing is taken away when the work fails."""
+    new = not Path(path).exists()
+    folder = prepare_output(path, overwrite)
+    try:
+        yield folder
+    except BaseException:
+        if new:
+            with suppress(OSError):  # not empty: what was written stays
+                folder.rmdir()
+        raise
 
 
 def versions() -> dict[str, str]:

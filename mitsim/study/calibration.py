@@ -11,11 +11,12 @@ import numpy.typing as npt
 from mitsim.calibrate.hadamard import Calibration, estimate_factors
 from mitsim.capture.bench import Bench, SessionRecipe, load_recipe
 from mitsim.capture.clock import Clock
+from mitsim.capture.exposer import Exposure
 from mitsim.capture.light import Progress, silent
 from mitsim.capture.run import digital_block
 from mitsim.capture.session import Session
 from mitsim.core.frames import checksum, write_frame
-from mitsim.core.manifest import prepare_output, versions, write_json
+from mitsim.core.manifest import output_folder, versions, write_json
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -59,49 +60,51 @@ def calibrate(
     """
     recipe = recipe or load_recipe()
     clock = Clock()
-    folder = prepare_output(output)
-    session = Session(bench, recipe, accuracy, seed, clock, progress)
-    noisy = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
-    with clock.stage("noise-free check"):
-        clean = estimate_factors(*session.noise_free(), session.signs, centre=session.centre)
-    warnings = session.plan.warnings + (() if noisy.ok else (noisy.status,))
-    # (left, right) and (-left, -right) are one camera; centred factors have no sum that would tell which it is.
-    sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
-    for name, factor in (("left", noisy.left), ("right", noisy.right)):
-        write_frame(
-            folder / f"{name}.exr",
-            {"factor": factor.astype(np.float32)},
-            {"unit": "sqrt(e-/s)", "reflectance": recipe.board_reflectance},
+    Exposure(None, recipe.exposure_fraction).check(bench)
+    with output_folder(output) as folder:
+        session = Session(bench, recipe, accuracy, seed, clock, progress)
+        noisy = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
+        with clock.stage("noise-free check"):
+            clean = estimate_factors(*session.noise_free(), session.signs, centre=session.centre)
+        warnings = session.plan.warnings + (() if noisy.ok else (noisy.status,))
+        # (left, right) and (-left, -right) are one camera; centred factors have no sum that would tell which it is.
+        sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
+        error = float(np.hypot(_relative(sign * noisy.left, clean.left), _relative(sign * noisy.right, clean.right)))
+        for name, factor in (("left", noisy.left), ("right", noisy.right)):
+            write_frame(
+                folder / f"{name}.exr",
+                {"factor": factor.astype(np.float32)},
+                {"unit": "sqrt(e-/s)", "reflectance": recipe.board_reflectance},
+            )
+        result = CalibrationResult(
+            n=bench.n,
+            frames=session.captures,
+            separability_residual=noisy.separability_residual,
+            unexplained_residual=noisy.unexplained,
+            noise_free_residual=clean.separability_residual,
+            phi_error=error,
+            condition=noisy.condition,
+            exposure_s=session.exposure_s,
+            seconds=clock.seconds(),
+            output=str(folder),
+            warnings=warnings,
         )
-    result = CalibrationResult(
-        n=bench.n,
-        frames=session.captures,
-        separability_residual=noisy.separability_residual,
-        unexplained_residual=noisy.unexplained,
-        noise_free_residual=clean.separability_residual,
-        phi_error=float(np.hypot(_relative(sign * noisy.left, clean.left), _relative(sign * noisy.right, clean.right))),
-        condition=noisy.condition,
-        exposure_s=session.exposure_s,
-        seconds=clock.seconds(),
-        output=str(folder),
-        warnings=warnings,
-    )
-    write_json(
-        folder / "manifest.json",
-        {
-            "kind": "calibration",
-            "status": "complete",
-            "configuration": {**bench.provenance(), "accuracy": accuracy, "seed": seed, "recipe": recipe},
-            "camera": bench.identity(),
-            "centre": session.centre,
-            "board_reflectance": recipe.board_reflectance,
-            "digital": digital_block(bench, session.exposure_s),
-            "checksums": {name: checksum(folder / name) for name in ("left.exr", "right.exr")},
-            "result": {key: value for key, value in vars(result).items() if key != "output"},
-            "versions": versions(),
-        },
-    )
-    return result, noisy
+        write_json(
+            folder / "manifest.json",
+            {
+                "kind": "calibration",
+                "status": "complete",
+                "configuration": {**bench.provenance(), "accuracy": accuracy, "seed": seed, "recipe": recipe},
+                "camera": bench.identity(),
+                "centre": session.centre,
+                "board_reflectance": recipe.board_reflectance,
+                "digital": digital_block(bench, session.exposure_s),
+                "checksums": {name: checksum(folder / name) for name in ("left.exr", "right.exr")},
+                "result": {key: value for key, value in vars(result).items() if key != "output"},
+                "versions": versions(),
+            },
+        )
+        return result, noisy
 
 
 def _relative(a: FloatArray, b: FloatArray) -> float:
