@@ -169,7 +169,7 @@ def _report(
             calibrated.separability_residual,
             calibrated.phi_error,
             calibrated.condition,
-            factors.status,
+            f"{factors.status} Beyond the sensor's noise, {calibrated.unexplained_residual:.1e} of them is left.",
         ),
         budget=tuple(_budget(captured, calibrated)),
         accuracy=captured.plan.accuracy,
