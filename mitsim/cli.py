@@ -51,6 +51,11 @@ def main() -> None:
         _fail(str(error))
     except (typer.Abort, KeyboardInterrupt):
         code = INTERRUPTED
+    except OSError as error:
+        # What no check foresees: a full disk, a name too long, a file taken away. Without a file it is a fault of ours.
+        if error.filename is None:
+            raise
+        _fail(f"{error.filename}: {error.strerror}; choose another place")
     except Exception as error:
         # Usage errors of click (wherever typer keeps it) carry their own one-line message.
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):

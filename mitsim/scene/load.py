@@ -7,18 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import mitsuba as mi
-from defusedxml import ElementTree as SafeTree
-from defusedxml.common import DefusedXmlException
 
 from mitsim.core.errors import MitsimError
+from mitsim.scene.check import check_file
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 
 SENSOR_PLUGIN = "mitsim_lensless"
-_DEEPEST = 16
-_RESERVED = ("path", "parallel", "update_scene", "variant")
 
 
 @dataclass(frozen=True)
@@ -42,42 +38,6 @@ class LoadedScene:
         if self.grid is None:
             raise MitsimError(f"{self.path}: the scene was opened without its projector")
         return self.grid
-
-
-def check_file(path: Path, defines: Mapping[str, str]) -> None:
-    """Refuse a file that is missing, is no well-formed scene XML, or lacks a parameter named by ``-D``."""
-    if not path.is_file():
-        raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
-    try:
-        _check_depth(path)
-        root = SafeTree.parse(path, forbid_dtd=True).getroot()
-    except ElementTree.ParseError as error:
-        line, column = error.position
-        raise MitsimError(
-            f"{path}:{line}: not well-formed XML (column {column}: {str(error).split(':')[0]}); mend the file"
-        ) from None
-    except DefusedXmlException as error:
-        raise MitsimError(f"{path}: DTDs and entities are not allowed in a scene ({error}); remove them") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise MitsimError(f"{path}: cannot be read ({error}); check the file") from None
-    if root.tag != "scene":
-        raise MitsimError(f"{path}:1: the root element is <{root.tag}>; a Mitsuba scene starts with <scene>")
-    known = {element.get("name", "") for element in root.iter("default")}
-    for name in defines:
-        if name not in known or name in _RESERVED:
-            raise MitsimError(
-                f"-D {name}={defines[name]}: {path} has no <default name={name!r}>; "
-                f"it knows {', '.join(sorted(known)) or 'none'}"
-            )
-
-
-def _check_depth(path: Path) -> None:
-    """Refuse deep nesting before anything recursive sees it: it overflows Mitsuba's stack, or takes for ever."""
-    depth = 0
-    for event, element in SafeTree.iterparse(path, events=("start", "end"), forbid_dtd=True):
-        depth += 1 if event == "start" else -1
-        if depth > _DEEPEST:
-            raise MitsimError(f"{path}: elements are nested over {_DEEPEST} deep (<{element.tag}>); flatten the scene")
 
 
 def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_projector: bool = True) -> LoadedScene:
