@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file
@@ -61,6 +62,10 @@ def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_proje
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
     emitters = list(scene.emitters())
     projectors = [emitter for emitter in emitters if emitter.class_name() == "Projector"]
+    for projector in projectors:
+        scale = float(np.array(mi.traverse(projector)["scale"]).ravel()[0])
+        if scale < 0:
+            raise MitsimError(f"{path}: the projector's scale: got {scale:g}; light is at least 0")
     if not needs_projector:
         return LoadedScene(path, scene, cameras[0], None, None, len(emitters))
     if len(projectors) != 1:
