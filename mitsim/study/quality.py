@@ -13,7 +13,7 @@ from matplotlib import image as matplotlib_image
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
-from mitsim.core.manifest import prepare_output, write_json
+from mitsim.core.manifest import output_folder, write_json
 from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run, solve, verify
 from mitsim.reconstruct.solver import Solution
 from mitsim.study.metrics import TRUTH_FILE, psnr, read_truth, ssim
@@ -63,26 +63,26 @@ def reconstruct(
         verify(Path(run), TRUTH_FILE, measurements.manifest.checksums, "remove it, or capture again with --resume")
         truth = read_truth(Path(run), factors.manifest.board_reflectance)
     # Only an earlier result is replaced: image.exr is the first file of one.
-    folder = prepare_output(output, overwrite=(Path(output) / IMAGE_FILE).is_file())
-    read = time.perf_counter()
-    prepared, frames = load(measurements, factors)
-    added = time.perf_counter()
-    solution = solve(prepared, frames, lam, method)
-    solved = time.perf_counter()
-    result = ReconstructionResult(
-        image=solution.image,
-        psnr=psnr(solution.image, truth) if truth is not None else None,
-        ssim=ssim(solution.image, truth) if truth is not None else None,
-        lam=solution.lam if isinstance(solution, Solution) else solution.weight,
-        rank=prepared.rank,
-        condition=prepared.condition,
-        residual=solution.residual,
-        ok=solution.ok,
-        status=solution.status,
-        seconds={"read": read - started, "accumulate": added - read, "solve": solved - added},
-        output=str(folder),
-    )
-    _write(folder, result, method)
+    with output_folder(output, overwrite=(Path(output) / IMAGE_FILE).is_file()) as folder:
+        read = time.perf_counter()
+        prepared, frames = load(measurements, factors)
+        added = time.perf_counter()
+        solution = solve(prepared, frames, lam, method)
+        solved = time.perf_counter()
+        result = ReconstructionResult(
+            image=solution.image,
+            psnr=psnr(solution.image, truth) if truth is not None else None,
+            ssim=ssim(solution.image, truth) if truth is not None else None,
+            lam=solution.lam if isinstance(solution, Solution) else solution.weight,
+            rank=prepared.rank,
+            condition=prepared.condition,
+            residual=solution.residual,
+            ok=solution.ok,
+            status=solution.status,
+            seconds={"read": read - started, "accumulate": added - read, "solve": solved - added},
+            output=str(folder),
+        )
+        _write(folder, result, method)
     return result
 
 
