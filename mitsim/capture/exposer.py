@@ -25,6 +25,7 @@ from mitsim.sensor.chain import (
 )
 
 FloatArray = npt.NDArray[np.float64]
+_LONGEST_S = 1e6
 FRAMES_AT_ONCE = 16
 """Frames held in memory at a time."""
 
@@ -37,8 +38,8 @@ class Exposure:
     fraction: float = 0.8
 
     def __post_init__(self) -> None:
-        if self.seconds is not None and not 0 < self.seconds < np.inf:
-            raise MitsimError(f"exposure {self.seconds} s: give a finite time above 0, or auto")
+        if self.seconds is not None and not 0 < self.seconds <= _LONGEST_S:
+            raise MitsimError(f"exposure {self.seconds} s: give a time above 0, up to {_LONGEST_S:g} s, or auto")
         if not 0 < self.fraction <= 1:
             raise MitsimError(f"exposure fraction {self.fraction} of full well: give a number above 0, up to 1")
 

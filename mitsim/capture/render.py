@@ -27,6 +27,7 @@ FloatArray = npt.NDArray[np.float64]
 ESTIMATORS = ("reference", "factored")
 _SAMPLES_A_PASS = 64
 _FEWEST_PASSES = 4
+_MOST_SAMPLES = 2**20
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,21 @@ def reference(loaded: LoadedScene, spp: int, seed: int, progress: Progress = sil
     """
     import mitsuba as mi
 
-    if spp < _FEWEST_PASSES:
-        raise MitsimError(f"--spp {spp}: give at least {_FEWEST_PASSES} samples a pixel")
+    if not _FEWEST_PASSES <= spp <= _MOST_SAMPLES:
+        raise MitsimError(f"--spp {spp}: give at least {_FEWEST_PASSES} samples a pixel, at most {_MOST_SAMPLES}")
     passes = max(_FEWEST_PASSES, math.ceil(spp / _SAMPLES_A_PASS))
     each = math.ceil(spp / passes)
     total: Any = 0.0
     squares: Any = 0.0
     for index in range(passes):
         child = integer(seed, "reference", index)
-        image = np.array(mi.render(loaded.scene, sensor=loaded.camera, spp=each, seed=child), dtype=np.float64)
+        try:
+            image = np.array(mi.render(loaded.scene, sensor=loaded.camera, spp=each, seed=child), dtype=np.float64)
+        except RuntimeError as error:
+            raise MitsimError(
+                f"{loaded.path}: the integrator cannot render this sensor ({' '.join(str(error).split())[-200:]}); "
+                "use path, direct or volpath"
+            ) from None
         total, squares = total + image, squares + image**2
         progress("reference", (index + 1) / passes)
     mean = total / passes
@@ -149,6 +156,8 @@ def render(
         irradiance = found.irradiance[..., None]
         frame = Rendered(irradiance, np.full_like(irradiance, math.sqrt(found.variance)))
     seconds = time.perf_counter() - started
+    if not frame.mean.any():
+        warnings += ("the frame is wholly dark; check the scene's light, the mask and the field stop",)
     names = ("Y",) if frame.mean.shape[2] == 1 else ("R", "G", "B")
     channels = {name: frame.mean[..., i].astype(np.float32) for i, name in enumerate(names)}
     channels |= {f"error.{name}": frame.error[..., i].astype(np.float32) for i, name in enumerate(names)}

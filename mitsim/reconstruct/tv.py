@@ -84,7 +84,10 @@ def solve_tv(
         updated = prepared.image((data + rho * target) / (squared + rho)) + kept
         before = smooth
         # skimage minimises |u - f|^2 / (2 weight) + TV(u).
-        smooth = denoise_tv_chambolle(updated + dual, weight=weight / rho, eps=1e-6, max_num_iter=60)
+        if weight:
+            smooth = denoise_tv_chambolle(updated + dual, weight=weight / rho, eps=1e-6, max_num_iter=60)
+        else:
+            smooth = updated + dual
         dual = dual + updated - smooth
         # Primal and dual residual (Boyd et al., section 3.3): one alone can be small far from the minimum.
         primal, moved = float(np.linalg.norm(updated - smooth)), float(np.linalg.norm(smooth - before))

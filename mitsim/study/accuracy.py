@@ -83,7 +83,8 @@ class AccuracyStudy:
 
 def study_accuracy(bench: Bench, output: Path | str, patterns: str, seed: int, progress: Progress) -> AccuracyStudy:
     """Measure error against time and write accuracy.json and accuracy.png to ``output``."""
-    folder = prepare_output(output, overwrite=True)
+    # Only an earlier study is replaced.
+    folder = prepare_output(output, overwrite=(Path(output) / "accuracy.json").is_file())
     family = bench.family(patterns, seed)
     labels, weights = family.classes()
     finest = min(ACCURACIES)

@@ -10,7 +10,6 @@ import pytest
 
 Refused = Callable[..., str]
 NEW = ("-o", "new")
-OVERFLOW = pytest.mark.xfail(reason="ValueError of the sensor chain, after the run has begun", strict=True)
 
 
 def mentions(line: str, *fragments: str) -> None:
@@ -170,7 +169,7 @@ def test_a_bad_define(refused: Refused, small_scene: Callable[..., Path], define
         (["--exposure", "0"], ["exposure 0", "above 0"]),
         (["--exposure", "nan"], ["nan"]),
         (["--exposure", "inf"], ["inf"]),
-        pytest.param(["--exposure", "1e300"], ["1e+300"], marks=OVERFLOW),
+        (["--exposure", "1e300"], ["1e+300"]),
         (["--exposure", "long"], ["'long'", "auto"]),
         (["--exposure-fraction", "0"], ["fraction 0", "above 0"]),
         (["--exposure-fraction", "1.5"], ["1.5", "up to 1"]),
