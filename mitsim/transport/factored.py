@@ -172,7 +172,6 @@ class Tracer:
         active = si.is_valid()
         ds, emitted = self.projector.emitter.sample_direction(si, mi.Point2f(0.5), active)
         active &= ds.pdf > 0
-        active &= dr.any(mi.unpolarized_spectrum(emitted) != 0)
         active &= ~self.scene.ray_test(si.spawn_ray_to(ds.p), active)
         bsdf = si.bsdf()
         reflected = bsdf.eval(mi.BSDFContext(), si, si.to_local(ds.d), active)
