@@ -10,13 +10,6 @@ LIGHT_SPEED = 299_792_458.0
 LUMINOUS_EFFICACY = 683.0
 """Luminous efficacy of light at 540 THz (555 nm), lm/W (exact, SI 2019)."""
 
-MM = 1.0
-"""One millimetre, in the length unit of mitsim."""
-UM = 1e-3
-"""One micrometre, in millimetres."""
-NM = 1e-6
-"""One nanometre, in millimetres."""
-
 
 def photon_energy(wavelength_nm: float) -> float:
     """Energy of one photon in joules, E = h c / lambda, for a vacuum wavelength in nanometres."""

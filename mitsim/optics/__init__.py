@@ -1,1 +1,1 @@
-"""Mask geometry and its shadow: from a coded mask and a sensor to separable linear operators."""
+"""Mask geometry and its shadow: from a coded mask and light per direction to irradiance on the sensor."""

@@ -23,6 +23,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.manifest import prepare_output, versions, write_json
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.study import plots
+from mitsim.study.metrics import relative_error
 
 FloatArray = npt.NDArray[np.float64]
 ACCURACIES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
@@ -126,7 +127,7 @@ def _factored(bench: Bench, family: PatternFamily, judge: FloatArray, seed: int,
             light = collect(bench, plan, labels, weights, seed, progress)
             frames, mc_error = _stack(light.frames(labels, weights, seed))
             seconds = time.perf_counter() - started
-        yield Row("factored", f"accuracy {accuracy:g}", seconds, _relative(frames, judge), mc_error)
+        yield Row("factored", f"accuracy {accuracy:g}", seconds, relative_error(frames, judge), mc_error)
 
 
 def _reference(bench: Bench, family: PatternFamily, judge: FloatArray, seed: int, progress: Progress) -> Iterator[Row]:
@@ -137,7 +138,7 @@ def _reference(bench: Bench, family: PatternFamily, judge: FloatArray, seed: int
             started = time.perf_counter()
             found = reference(bench.loaded, spp, seed, progress)
             seconds = (time.perf_counter() - started) * len(family.captures)
-            error = _relative(found.mean[..., 0], judge[index])
+            error = relative_error(found.mean[..., 0], judge[index])
             yield Row("reference", f"{spp} spp", seconds, error, found.mc_error)
 
 
@@ -149,7 +150,3 @@ def _stack(expected: ExpectedFrames) -> tuple[FloatArray, float]:
         raise MitsimError("all frames are dark; nothing can be compared")
     noise = sum(frame.variance * frame.irradiance.size for frame in found)
     return frames, float(np.sqrt(noise / np.square(frames).sum()))
-
-
-def _relative(a: FloatArray, b: FloatArray) -> float:
-    return float(np.linalg.norm(a - b) / np.linalg.norm(b))

@@ -17,6 +17,7 @@ from mitsim.capture.run import digital_block
 from mitsim.capture.session import Session
 from mitsim.core.frames import checksum, write_frame
 from mitsim.core.manifest import output_folder, versions, write_json
+from mitsim.study.metrics import relative_error
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -69,7 +70,9 @@ def calibrate(
         warnings = session.plan.warnings + (() if noisy.ok else (noisy.status,))
         # (left, right) and (-left, -right) are one camera; centred factors have no sum that would tell which it is.
         sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
-        error = float(np.hypot(_relative(sign * noisy.left, clean.left), _relative(sign * noisy.right, clean.right)))
+        error = float(
+            np.hypot(relative_error(sign * noisy.left, clean.left), relative_error(sign * noisy.right, clean.right))
+        )
         for name, factor in (("left", noisy.left), ("right", noisy.right)):
             write_frame(
                 folder / f"{name}.exr",
@@ -105,7 +108,3 @@ def calibrate(
             },
         )
         return result, noisy
-
-
-def _relative(a: FloatArray, b: FloatArray) -> float:
-    return float(np.linalg.norm(a - b) / np.linalg.norm(b))

@@ -43,6 +43,12 @@ def ssim(image: Image, truth: Image) -> float:
     return float(structural_similarity(image, truth, win_size=_SSIM_WINDOW, data_range=1.0))
 
 
+def relative_error(values: Image, reference: Image) -> float:
+    """||a - b|| / ||b|| over all entries of two arrays of one shape: what "relative error" means everywhere."""
+    b = np.asarray(reference, dtype=np.float64)
+    return float(np.linalg.norm(np.asarray(values, dtype=np.float64) - b) / np.linalg.norm(b))
+
+
 def contrast(region: Image, lines: Literal["vertical", "horizontal"] = "vertical", background: float = 0.0) -> float:
     """Contrast ratio (I_max - I_min) / (I_max + I_min) of one group of lines; the paper's MTF / 100.
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 # Okabe and Ito's palette: distinct in all common forms of colour blindness, and in grey.
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
-SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#1b1f24", "#6b7280"
+SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
 PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 _FONT = 11.0  # points

@@ -13,7 +13,3 @@ def test_photon_energy_of_green_light() -> None:
 def test_a_wavelength_must_be_positive(wavelength: float) -> None:
     with pytest.raises(ValueError, match="wavelength_nm"):
         units.photon_energy(wavelength)
-
-
-def test_lengths_are_millimetres() -> None:
-    assert units.MM == 1000 * units.UM == pytest.approx(1e6 * units.NM)

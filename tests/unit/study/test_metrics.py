@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
-from mitsim.study.metrics import contrast, psnr, read_truth, ssim
+from mitsim.study.metrics import contrast, psnr, read_truth, relative_error, ssim
 
 RNG = np.random.default_rng(11)
 TRUTH = RNG.uniform(0.05, 0.9, (24, 20))
@@ -92,3 +92,7 @@ def test_a_run_without_truth_says_so(tmp_path: Path) -> None:
     write_frame(tmp_path / "truth.exr", {"other": TRUTH.astype(np.float32)}, {})
     with pytest.raises(MitsimError, match="channels are other"):
         read_truth(tmp_path)
+
+
+def test_relative_error_is_a_ratio_of_norms() -> None:
+    assert relative_error(np.array([[3.0, 0.0]]), np.array([[3.0, 4.0]])) == pytest.approx(0.8)
