@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum
 from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.diffraction import Spectrum
 from mitsim.scene.load import LoadedScene, load_scene
 from mitsim.scene.patterns import PatternFamily, parse_patterns
+from mitsim.scene.projector import window_at
 from mitsim.sensor.model import SensorModel, load_sensor
 from mitsim.transport import lensless
-from mitsim.transport.factored import Projector
+from mitsim.transport.source import Projector
 
 __all__ = ["DEFAULT_VARIANT", "Bench", "PatternFamily", "ProjectorModel", "SessionRecipe", "load_recipe", "open_bench"]
 
@@ -35,6 +39,34 @@ class ProjectorModel(BaseModel):
     effective_wavelength_nm: float = Field(
         gt=0, allow_inf_nan=False, description="one wavelength that carries as many photons per watt [nm]"
     )
+    wavelengths_nm: tuple[float, ...] = Field((), description="spectral lines [nm]; none: the effective wavelength")
+    radiant_shares: tuple[float, ...] = Field((), description="part of the power in each line")
+    contrast_ratio: float = Field(math.inf, gt=1, description="light of a white pixel over that of a black one")
+    aperture_radius_mm: float = Field(0.0, ge=0, allow_inf_nan=False, description="radius of the lens [mm]; 0: pinhole")
+    focus_mm: float | None = Field(None, gt=0, description="distance of the sharp plane [mm]; none: scene_distance")
+    speckle_contrast: float = Field(0.0, ge=0, le=1, description="of one sensor pixel's light; see docs/physics.md")
+    blur_pixels: float = Field(0.0, ge=0, allow_inf_nan=False, description="spot's standard deviation [pixels]")
+
+    @model_validator(mode="after")
+    def _lines_have_shares(self) -> ProjectorModel:
+        if len(self.wavelengths_nm) != len(self.radiant_shares):
+            raise ValueError(
+                f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares; "
+                "give one share a line"
+            )
+        return self
+
+    @property
+    def black_level(self) -> float:
+        """Light of a black pixel, as a part of a white one's."""
+        return 1 / self.contrast_ratio
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """Photons at each line: power times wavelength."""
+        wavelengths = np.array(self.wavelengths_nm or (self.effective_wavelength_nm,))
+        photons = np.array(self.radiant_shares or (1.0,)) * wavelengths
+        return Spectrum(wavelengths, photons / photons.sum())
 
 
 class SessionRecipe(BaseModel):
@@ -76,13 +108,33 @@ class Bench:
     @property
     def source(self) -> Projector:
         """The projector as the tracer wants it."""
-        grid = self.loaded.pixels
-        return Projector(self.loaded.projector, grid.n, grid.first_row, grid.first_column, grid.canvas)
+        grid, model = self.loaded.pixels, self.projector
+        return Projector(
+            self.loaded.projector,
+            grid.n,
+            grid.first_row,
+            grid.first_column,
+            grid.canvas,
+            model.aperture_radius_mm,
+            model.focus_mm or self.geometry.scene_distance,
+            model.blur_pixels,
+        )
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """The projector's photons by wavelength."""
+        return self.projector.spectrum
 
     @property
     def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Row and column tan-angles of the projector's window on the aligned plane."""
         return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
+
+    def windows_at(self, depth: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The same on a plane at ``depth`` [mm]."""
+        if depth == self.geometry.scene_distance:
+            return self.windows
+        return window_at(str(self.loaded.path), self.loaded.projector, self.loaded.camera, self.loaded.pixels, depth)
 
     @property
     def field_stop_cuts(self) -> bool:
@@ -116,6 +168,10 @@ class Bench:
             "scene_sha256": checksum(self.loaded.path),
             "defines": self.defines,
             "variant": self.variant,
+            "projector_model": {
+                **self.projector.model_dump(mode="json", exclude={"contrast_ratio"}),
+                "black_level": self.projector.black_level,
+            },
         }
 
     def with_board(self, reflectance: float) -> Bench:
@@ -133,7 +189,7 @@ class Bench:
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
-        return replace(self, loaded=replace(self.loaded, scene=scene, other_emitters=0))
+        return replace(self, loaded=replace(self.loaded, scene=scene, lamps=()))
 
 
 def open_bench(

@@ -23,7 +23,8 @@ class LoadedScene:
     """A scene ready for transport.
 
     ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
-    pixels; both are None only when the file was opened for ``render``, which needs no projector.
+    pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all other
+    emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions.
     """
 
     path: Path
@@ -31,7 +32,8 @@ class LoadedScene:
     camera: Any
     projector: Any
     grid: ProjectorGrid | None
-    other_emitters: int
+    lamps: tuple[Any, ...]
+    mirrors: bool
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -67,13 +69,19 @@ def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_proje
         if scale < 0:
             raise MitsimError(f"{path}: the projector's scale: got {scale:g}; light is at least 0")
     if not needs_projector:
-        return LoadedScene(path, scene, cameras[0], None, None, len(emitters))
+        return LoadedScene(path, scene, cameras[0], None, None, tuple(emitters), _has_mirrors(scene))
     if len(projectors) != 1:
         raise MitsimError(
             f'{path}: {len(projectors)} emitters of type "projector"; coded illumination needs exactly one'
         )
     grid = locate_projector(str(path), projectors[0], cameras[0])
-    return LoadedScene(path, scene, cameras[0], projectors[0], grid, len(emitters) - 1)
+    lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
+    return LoadedScene(path, scene, cameras[0], projectors[0], grid, lamps, _has_mirrors(scene))
+
+
+def _has_mirrors(scene: Any) -> bool:
+    """Whether a surface of the scene has a delta component."""
+    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta) for shape in scene.shapes() if shape.bsdf())
 
 
 def _one_line(error: BaseException) -> str:

@@ -1,29 +1,33 @@
 """The effect plan: from measured evidence and an accuracy to what is simulated, why, and what it costs.
 
-Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels. The
-discretisations (anchors, cells, depth) may use most of that budget and sampling gets the rest; the cheapest combination
-that fits is taken. Effects that this version cannot simulate are listed too, so that no one takes their absence for a
-finding.
+Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels. An effect is
+simulated when leaving it out would change the frames by more than that. Discretisations of effects that are on (how many
+anchors, layers, cells) each take a part of the budget, and sampling gets what is left of its square.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 from typing import Literal
 
 from mitsim.core.errors import MitsimError
 
 State = Literal["exact", "approximate", "off"]
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
-_SYSTEMATIC_SHARE = 0.8
+PHYSICAL = (
+    *("interreflection", "mirrors", "ambient", "diffraction", "mask-thickness", "pixel-response"),
+    *("aperture", "blur", "black-level", "speckle"),
+)
+"""Effects that are simulated or not; ``anchors`` and ``layers`` are effects with a number."""
+SWITCHES = ("anchors", "layers", *PHYSICAL)
+_RESIDUAL = 0.5
+_FLOOR = 0.3
 _SAMPLING_MARGIN = 0.95
-_FEWEST_BATCHES = 8.0
-_NOMINAL_PACE = 5e-3, 8e-8
-"""Seconds a batch and a path, on two cores."""
-_SECONDS_PER_FRAME = 2.5e-3
+_FEWEST_SAMPLES = 1.0
+GROUPS = 8
+"""Independent estimates of the light, whose spread tells the Monte Carlo error."""
 
 
 @dataclass(frozen=True)
@@ -38,34 +42,118 @@ class Effect:
 
 
 @dataclass(frozen=True)
+class Settings:
+    """What is simulated, and how finely.
+
+    Attributes
+    ----------
+    depth
+        where the light is seen, 1 / mean(1/z) [mm]; the cells are aligned with the projector's pixels there.
+    anchors
+        points a side of the sensor from which radiance is evaluated.
+    layers
+        depths [mm], far to near, between which light is split; one for a flat scene.
+    subdivision, linear
+        cells a side of a projector pixel, and whether light is split between their corners.
+    effects
+        those of :data:`PHYSICAL` that are simulated.
+    """
+
+    depth: float
+    anchors: int = 1
+    layers: tuple[float, ...] = ()
+    subdivision: int = 1
+    linear: bool = False
+    effects: frozenset[str] = frozenset()
+
+    @property
+    def depths(self) -> tuple[float, ...]:
+        """Depth of each layer [mm]; the one depth of a flat scene."""
+        return self.layers or (self.depth,)
+
+
+@dataclass(frozen=True)
 class Plan:
     """Settings of the factored estimator for one capture, with their reasons.
 
-    ``anchors`` a side of the sensor, ``subdivision`` cells a side of a projector pixel, ``depth`` [mm] of the light,
-    ``sampling_target`` relative Monte Carlo error at which sampling stops, ``systematic_error`` what the
-    discretisations are predicted to leave. ``warnings`` say why a result will be flagged.
+    ``sampling_target`` is the relative Monte Carlo error at which sampling stops, ``systematic_error`` what everything
+    left out or made coarse is predicted to leave. ``warnings`` say why a result will be flagged.
     """
 
     accuracy: float
     effects: tuple[Effect, ...]
     predicted_seconds: float
-    anchors: int
-    subdivision: int
-    depth: float
+    settings: Settings
     sampling_target: float
     systematic_error: float
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class SceneFacts:
-    """What the plan must know of a scene besides the pilot's evidence."""
+class Noise:
+    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate."""
 
-    other_emitters: int
-    fresnel_number: float
-    wavelength_nm: float
+    error: float
+    samples: float
+    rate: float
+
+    def samples_for(self, target: float) -> float:
+        """Samples a cell at which the error is ``target``."""
+        return self.samples * (self.error / target) ** (1 / self.rate) if self.error > 0 else _FEWEST_SAMPLES
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a short look at the scene measured (:mod:`mitsim.capture.pilot`); all errors are relative.
+
+    Attributes
+    ----------
+    depth, layers
+        depth of the light [mm]; candidates for the layers' depths, by their number.
+    anchor_error, layer_error
+        error of the frames by anchors a side, and by number of layers.
+    cell_error
+        by (cells a side of a projector pixel, linear).
+    effect_error
+        error of leaving out each effect of :data:`PHYSICAL` that the scene or its devices have.
+    noise
+        of one estimate: of direct light, and of all other light.
+    cells
+        paths of one sample with one anchor.
+    seconds_per_path, seconds_per_bounced
+        pace of the tracer, without and with interreflection.
+    seconds_per_frame
+        of forming a frame with one anchor, one layer and a geometric shadow.
+    terms
+        terms of the shadow, wave-optical over geometric.
+    """
+
+    depth: float
+    layers: Mapping[int, tuple[float, ...]]
+    anchor_error: Mapping[int, float]
+    layer_error: Mapping[int, float]
+    cell_error: Mapping[tuple[int, bool], float]
+    effect_error: Mapping[str, float]
+    noise: tuple[Noise, Noise]
+    cells: int
+    seconds_per_path: float
+    seconds_per_bounced: float
+    seconds_per_frame: float
+    terms: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What the plan must know of the devices besides the pilot's evidence.
+
+    ``absent`` gives the reason why an effect has nothing to act on; ``notes`` what to say of one that has.
+    """
+
+    absent: Mapping[str, str]
+    notes: Mapping[str, str]
     keystone: float
-    field_stop_cuts: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 def check_accuracy(accuracy: float) -> float:
@@ -77,135 +165,195 @@ def check_accuracy(accuracy: float) -> float:
     return accuracy
 
 
+def parse_effects(text: str) -> dict[str, bool]:
+    """``+ambient,-diffraction`` as {name: on}; MitsimError for a name that is no effect, or a missing sign."""
+    chosen: dict[str, bool] = {}
+    for word in filter(None, (part.strip() for part in text.split(","))):
+        if word[0] not in "+-" or word[1:] not in SWITCHES:
+            raise MitsimError(
+                f"--effects {text!r}: {word!r} is not +NAME or -NAME; the names are {', '.join(SWITCHES)}"
+            )
+        if chosen.get(word[1:], word[0] == "+") != (word[0] == "+"):
+            raise MitsimError(f"--effects {text!r}: {word[1:]} is switched both on and off; keep one")
+        chosen[word[1:]] = word[0] == "+"
+    return chosen
+
+
 def decide(
-    accuracy: float,
-    anchor_error: Mapping[int, float],
-    cell_error: Mapping[int, float],
-    sampling_error: Mapping[int, float],
-    cells: Mapping[int, int],
-    seconds_per_batch: float,
-    seconds_per_path: float,
-    depth: float,
-    depth_error: float,
-    captures: int,
-    facts: SceneFacts,
+    accuracy: float, evidence: Evidence, captures: int, facts: SceneFacts, forced: Mapping[str, bool] | None = None
 ) -> Plan:
-    """Choose anchors and cells for ``accuracy``.
-
-    ``anchor_error`` by anchors a side; ``cell_error``, ``sampling_error`` (one path a cell) and ``cells`` (number in
-    the grid) by cells a side of a projector pixel; ``captures`` is the number of frames.
-    """
+    """Choose effects, anchors, layers and cells for ``accuracy``; ``forced`` overrides effects by name."""
     check_accuracy(accuracy)
-
-    def systematic(anchors: int, subdivision: int) -> float:
-        return math.hypot(anchor_error[anchors], cell_error[subdivision])
-
-    def room(anchors: int, subdivision: int) -> float:
-        """What is left of the squared budget for sampling."""
-        left = systematic(anchors, subdivision)
-        # Where the discretisation alone breaks the budget, sampling far below it would buy nothing.
-        return max(accuracy**2 - left**2, (0.5 * left) ** 2)
-
-    def batches(anchors: int, subdivision: int) -> float:
-        return max(_FEWEST_BATCHES, sampling_error[subdivision] ** 2 / room(anchors, subdivision))
-
-    def seconds(anchors: int, subdivision: int, batch: float, path: float) -> float:
-        work = batches(anchors, subdivision) * (batch + anchors**2 * cells[subdivision] * path)
-        return work + captures * anchors * _SECONDS_PER_FRAME
-
-    # Chosen by a nominal pace: the measured one differs from run to run, and settings must not.
-    choices = sorted(
-        product(anchor_error, cell_error), key=lambda choice: seconds(choice[0], choice[1], *_NOMINAL_PACE)
+    forced = forced or {}
+    on = frozenset(name for name in PHYSICAL if forced.get(name, evidence.effect_error.get(name, 0.0) > accuracy))
+    anchors = _count(evidence.anchor_error, accuracy, forced.get("anchors"))
+    layers = _count(evidence.layer_error, accuracy, forced.get("layers"))
+    cells = next(
+        (choice for choice, error in evidence.cell_error.items() if error <= _RESIDUAL * accuracy),
+        min(evidence.cell_error, key=lambda choice: evidence.cell_error[choice]),
     )
-    fitting = [choice for choice in choices if systematic(*choice) <= _SYSTEMATIC_SHARE * accuracy]
-    anchors, subdivision = fitting[0] if fitting else min(choices, key=lambda choice: systematic(*choice))
-    left = systematic(anchors, subdivision)
-    measured = seconds_per_batch, seconds_per_path
-    extra = batches(anchors, subdivision) * (anchors**2 - 1) * cells[subdivision] * seconds_per_path
-    warnings = _warnings(accuracy, left, depth_error, facts)
+    settings = Settings(
+        depth=evidence.depth,
+        anchors=anchors,
+        layers=evidence.layers[layers] if layers > 1 else (),
+        subdivision=cells[0],
+        linear=cells[1],
+        effects=on,
+    )
+    left_out = {name: error for name, error in evidence.effect_error.items() if name not in on}
+    left = math.hypot(
+        evidence.anchor_error[anchors],
+        evidence.layer_error[layers],
+        evidence.cell_error[cells],
+        *left_out.values(),
+    )
+    target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - left**2, (_FLOOR * accuracy) ** 2))
+    cost = _Cost(evidence, settings, captures, target)
     effects = (
-        _anchor_effect(anchors, anchor_error, accuracy, extra),
-        Effect(
-            "tan-angle cells",
-            "approximate",
-            f"{subdivision}x{subdivision} cells a projector pixel leave {cell_error[subdivision]:.1e}",
-            cell_error[min(cell_error)],
-            0.0,
-        ),
-        _depth_effect(depth, depth_error, accuracy),
-        *_keystone_effect(facts),
-        *_fixed_effects(facts),
+        _anchors(anchors, evidence, accuracy, cost),
+        _layers(layers, evidence, accuracy, cost),
+        _cells(cells, evidence),
+        *(_physical(name, name in on, evidence, facts, accuracy, cost, forced) for name in PHYSICAL),
+        *_fixed(facts),
     )
     return Plan(
         accuracy=accuracy,
         effects=effects,
-        predicted_seconds=seconds(anchors, subdivision, *measured),
-        anchors=anchors,
-        subdivision=subdivision,
-        depth=depth,
-        sampling_target=_SAMPLING_MARGIN * math.sqrt(room(anchors, subdivision)),
-        systematic_error=math.hypot(left, depth_error),
-        warnings=warnings,
+        predicted_seconds=cost.total,
+        settings=settings,
+        sampling_target=target,
+        systematic_error=left,
+        warnings=facts.warnings + _warnings(accuracy, left, evidence, left_out, anchors, layers, cells),
     )
 
 
-def _anchor_effect(anchors: int, errors: Mapping[int, float], accuracy: float, seconds: float) -> Effect:
+class _Cost:
+    """Seconds of a capture with some settings, by the paces that the pilot measured."""
+
+    def __init__(self, evidence: Evidence, settings: Settings, captures: int, target: float) -> None:
+        self.evidence, self.settings, self.captures = evidence, settings, captures
+        single = target * math.sqrt(GROUPS)
+        noisy = evidence.noise if settings.effects & {"interreflection", "ambient"} else evidence.noise[:1]
+        # Every anchor's paths help: a pixel's light is interpolated between them.
+        needed = max(noise.samples_for(single / math.sqrt(len(noisy))) for noise in noisy)
+        self.samples = max(_FEWEST_SAMPLES, needed / settings.anchors**2)
+
+    @property
+    def total(self) -> float:
+        return self.tracing(self.settings.anchors, self.bounced) + self.forming(
+            self.settings.anchors, len(self.settings.depths), "diffraction" in self.settings.effects
+        )
+
+    @property
+    def bounced(self) -> bool:
+        return "interreflection" in self.settings.effects
+
+    def tracing(self, anchors: int, bounced: bool) -> float:
+        pace = self.evidence.seconds_per_bounced if bounced else self.evidence.seconds_per_path
+        return GROUPS * self.samples * anchors**2 * self.evidence.cells * pace
+
+    def forming(self, anchors: int, layers: int, waves: bool) -> float:
+        terms = self.evidence.terms if waves else 1.0
+        return self.captures * anchors * layers * terms * self.evidence.seconds_per_frame
+
+
+def _count(errors: Mapping[int, float], accuracy: float, forced: bool | None) -> int:
+    """One when that is good enough, else the fewest that leave a part of the accuracy (the most known, failing that)."""
+    if forced is False or (forced is None and errors[1] <= accuracy):
+        return 1
+    several = [count for count in sorted(errors) if count > 1]
+    return next((count for count in several if errors[count] <= _RESIDUAL * accuracy), several[-1] if several else 1)
+
+
+def _anchors(anchors: int, evidence: Evidence, accuracy: float, cost: _Cost) -> Effect:
+    errors = evidence.anchor_error
     if anchors == 1:
-        reason = f"one anchor leaves {errors[1]:.1e}, within {accuracy:g}"
-        return Effect("anchors (falloff, gloss, parallax)", "off", reason, errors[1], 0.0)
-    reason = f"{anchors}x{anchors} anchors leave {errors[anchors]:.1e}; one would leave {errors[1]:.1e}"
-    return Effect("anchors (falloff, gloss, parallax)", "approximate", reason, errors[1], seconds)
+        reason = f"falloff, gloss and parallax over the sensor: one anchor leaves {errors[1]:.1e}"
+        return Effect("anchors", "off", f"{reason} of {accuracy:g} allowed", errors[1], 0.0)
+    reason = f"falloff, gloss and parallax: {anchors}x{anchors} anchors leave {errors[anchors]:.1e}"
+    seconds = cost.tracing(anchors, cost.bounced) * (1 - 1 / anchors**2)
+    return Effect("anchors", "approximate", reason, errors[1], seconds)
 
 
-def _depth_effect(depth: float, error: float, accuracy: float) -> Effect:
-    if error <= _SYSTEMATIC_SHARE * accuracy:
-        reason = f"the lit surface lies at {depth:.2f} mm; one layer leaves {error:.1e}"
-    else:
-        reason = f"the lit depth varies about {depth:.1f} mm and this version has one layer: about {error:.1e} wrong"
-    return Effect("depth layers", "off", reason, error, 0.0)
+def _layers(layers: int, evidence: Evidence, accuracy: float, cost: _Cost) -> Effect:
+    errors = evidence.layer_error
+    if layers == 1:
+        reason = f"the light is seen at {evidence.depth:.1f} mm; one layer leaves {errors[1]:.1e} of {accuracy:g} allowed"
+        return Effect("layers", "off", reason, errors[1], 0.0)
+    far, near = evidence.layers[layers][0], evidence.layers[layers][-1]
+    reason = f"the light is seen from {near:.0f} to {far:.0f} mm; {layers} layers leave {errors[layers]:.1e}"
+    seconds = cost.forming(cost.settings.anchors, layers, "diffraction" in cost.settings.effects)
+    return Effect("layers", "approximate", reason, errors[1], seconds * (1 - 1 / layers))
 
 
-def _keystone_effect(facts: SceneFacts) -> Sequence[Effect]:
-    if facts.keystone == 0:
-        return ()
-    reason = f"rendered; corners lie {facts.keystone:.1f} projector pixels off a square, so responses are not separable"
-    return (Effect("projector keystone", "exact", reason, None, 0.0),)
+def _cells(cells: tuple[int, bool], evidence: Evidence) -> Effect:
+    kind = "light split between cell corners" if cells[1] else "even light in a cell"
+    reason = f"{cells[0]}x{cells[0]} cells a projector pixel, {kind}: leave {evidence.cell_error[cells]:.1e}"
+    return Effect("cells", "approximate", reason, max(evidence.cell_error.values()), 0.0)
 
 
-def _fixed_effects(facts: SceneFacts) -> Sequence[Effect]:
-    ambient = (
-        f"{facts.other_emitters} other emitter(s) in the scene are left out: not in this version"
-        if facts.other_emitters
-        else "the projector is the only emitter"
+def _physical(
+    name: str,
+    on: bool,
+    evidence: Evidence,
+    facts: SceneFacts,
+    accuracy: float,
+    cost: _Cost,
+    forced: Mapping[str, bool],
+) -> Effect:
+    error = evidence.effect_error.get(name)
+    if error is None:
+        reason = facts.absent.get(name, "nothing in the scene calls for it")
+        return Effect(name, "exact" if on else "off", reason, 0.0, 0.0)
+    note = facts.notes.get(name, "")
+    reason = f"left out, the frames change by {error:.1e}; {accuracy:g} allowed"
+    if name in forced:
+        reason = f"by --effects; {reason}"
+    if note:
+        reason = f"{note}; {reason}"
+    state: State = "exact" if on else "off"
+    return Effect(name, state, reason, error, _seconds(name, cost) if on else 0.0)
+
+
+def _seconds(name: str, cost: _Cost) -> float:
+    anchors, layers = cost.settings.anchors, len(cost.settings.depths)
+    if name == "interreflection":
+        return max(cost.tracing(anchors, True) - cost.tracing(anchors, False), 0.0)
+    if name == "diffraction":
+        return cost.forming(anchors, layers, True) - cost.forming(anchors, layers, False)
+    return 0.0
+
+
+def _fixed(facts: SceneFacts) -> tuple[Effect, ...]:
+    keystone = (
+        f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
+        if facts.keystone
+        else "the projector faces the aligned plane squarely"
     )
-    fresnel = (
-        f"not in this version; a mask feature's Fresnel number is {facts.fresnel_number:.1f} "
-        f"at {facts.wavelength_nm:.0f} nm, so the real shadow differs"
-    )
-    missing = "not in this version"
     return (
-        Effect("ambient light", "off", ambient, None if facts.other_emitters else 0.0, 0.0),
-        Effect("interreflection", "off", "not in this version: light is followed over one reflection", None, 0.0),
-        Effect("mask diffraction", "off", fresnel, None, 0.0),
-        Effect("projector aperture, blur, black level", "off", missing, None, 0.0),
-        Effect("mask thickness, pixel angular response", "off", missing, None, 0.0),
-        Effect("sensor noise", "exact", "Poisson, full well, read noise, quantisation drawn for each frame", None, 0.0),
+        Effect("keystone", "exact", keystone, None, 0.0),
+        Effect("spectrum", "off", "one panchromatic reflectance; wavelengths differ in the mask's shadow only", None, 0.0),
+        Effect("sensor-noise", "exact", "Poisson, full well, read noise and quantisation of each frame", None, 0.0),
     )
 
 
-def _warnings(accuracy: float, left: float, depth_error: float, facts: SceneFacts) -> tuple[str, ...]:
-    found = []
-    if left > accuracy:
-        found.append(f"anchors and cells leave {left:.1e}, more than the accuracy {accuracy:g} asked for")
-    if depth_error > _SYSTEMATIC_SHARE * accuracy:
-        found.append(f"the scene has depth: one layer leaves about {depth_error:.1e}; layers are not in this version")
-    if facts.field_stop_cuts:
-        found.append(
-            "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred over "
-            "the anchors, so open it or accept an error there"
-        )
-    if facts.other_emitters:
-        found.append(
-            f"{facts.other_emitters} emitter(s) beside the projector are left out; ambient light is not in this version"
-        )
-    return tuple(found)
+def _warnings(
+    accuracy: float,
+    left: float,
+    evidence: Evidence,
+    left_out: Mapping[str, float],
+    anchors: int,
+    layers: int,
+    cells: tuple[int, bool],
+) -> tuple[str, ...]:
+    if left <= accuracy:
+        return ()
+    parts = {
+        f"{anchors}x{anchors} anchors": evidence.anchor_error[anchors],
+        f"{layers} layer{'s' if layers > 1 else ''}": evidence.layer_error[layers],
+        "cells": evidence.cell_error[cells],
+        **{f"no {name}": error for name, error in left_out.items()},
+    }
+    worst = sorted(parts, key=lambda name: -parts[name])[:2]
+    said = " and ".join(f"{name} ({parts[name]:.1e})" for name in worst)
+    return (f"what is left out or made coarse adds up to {left:.1e}, above the accuracy {accuracy:g}: mostly {said}",)

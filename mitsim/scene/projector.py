@@ -74,7 +74,8 @@ def locate_projector(where: str, projector: Any, camera: Any) -> ProjectorGrid:
             f"{where}: the lit texels of the projector's bitmap span {height}x{width} and must fill a square; "
             "paint the window white"
         )
-    corners = _window_corners(where, projector, camera, lit.shape, (int(rows[0]), int(columns[0])), width)
+    z = camera.geometry.scene_distance
+    corners = _window_corners(where, projector, camera, lit.shape, (int(rows[0]), int(columns[0])), width, z)
     low, high = corners.min(axis=0), corners.max(axis=0)
     ideal = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
     keystone = float(np.abs((corners - ideal) / (high - low)).max()) * width
@@ -89,14 +90,23 @@ def locate_projector(where: str, projector: Any, camera: Any) -> ProjectorGrid:
     )
 
 
+def window_at(
+    where: str, projector: Any, camera: Any, grid: ProjectorGrid, depth: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Row and column tan-angles of the window on the plane at ``depth`` [mm] from the camera."""
+    first = grid.first_row, grid.first_column
+    corners = _window_corners(where, projector, camera, grid.canvas, first, grid.n, depth)
+    (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
+    return (float(top), float(bottom)), (float(left), float(right))
+
+
 def _window_corners(
-    where: str, projector: Any, camera: Any, canvas: tuple[int, ...], first: tuple[int, int], n: int
+    where: str, projector: Any, camera: Any, canvas: tuple[int, ...], first: tuple[int, int], n: int, z: float
 ) -> FloatArray:
-    """(4, 2) tan-angles (row, column) of the window's corners on the aligned plane, in index coordinates.
+    """(4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
 
     Between that plane and the projector's image lies a homography; four probes of the emitter determine it.
     """
-    z = camera.geometry.scene_distance
     half = 0.25 * z
     probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(probes))
@@ -111,7 +121,7 @@ def _window_corners(
     points = mapped[:, :2] / mapped[:, 2:]
     if not np.isfinite(points).all():
         raise MitsimError(
-            f"{where}: the projector does not light the plane at scene_distance {z} mm; aim it at the scene"
+            f"{where}: the projector does not light the plane at {z:g} mm from the camera; aim it at the scene"
         )
     return np.stack([-points[:, 1] / z, -points[:, 0] / z], axis=1)
 

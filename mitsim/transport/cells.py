@@ -24,6 +24,10 @@ class CellAxis:
         """(count + 1,) tan-angles of the cell edges."""
         return np.asarray(self.start + self.size * np.arange(self.count + 1), dtype=np.float64)
 
+    def centre(self, index: npt.NDArray[np.int64]) -> FloatArray:
+        """Tan-angle of the centre of each cell."""
+        return np.asarray(self.start + self.size * (index + 0.5), dtype=np.float64)
+
 
 @dataclass(frozen=True)
 class CellGrid:

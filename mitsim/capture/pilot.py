@@ -1,0 +1,345 @@
+"""A short look at a scene before the real work: the error that each effect and each coarseness would leave, and the pace.
+
+Numbers in, numbers out: the effect plan (:mod:`mitsim.scene.plan`) reads them and decides. Every error is relative,
+``||a - b|| / ||b||``, over up to four captures of the family. Two independent halves A and B see the same change with
+independent noise, so ``<a_A - b_A, a_B - b_B>`` estimates ``||a - b||^2`` without the noise's own energy.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.simulation import Simulation
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.scene.plan import GROUPS, PHYSICAL, Evidence, Noise, Settings
+from mitsim.transport.histogram import Deposits
+
+FloatArray = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
+Halves = tuple[FloatArray, FloatArray]
+ANCHOR_LADDER = (1, 2, 3, 5, 8)
+LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)
+CELL_CHOICES = ((1, False), (2, False), (2, True), (3, True), (4, True))
+_FIRST_JUDGE = 5
+_RATIO_PIXELS, _RATIO_SAMPLES = 4, 32
+_CAPTURES = 4
+_CELL_SAMPLES = 16
+_EFFECT_SAMPLES = 2
+_TRACED_ANEW = ("mirrors", "aperture", "blur", "pixel-response")
+
+
+@dataclass(frozen=True)
+class _Family:
+    """The captures that the pilot looks at."""
+
+    labels: Labels
+    weights: FloatArray
+
+
+def applicable(bench: Bench) -> tuple[str, ...]:
+    """Effects that the scene or its devices have anything to do with."""
+    geometry, projector = bench.geometry, bench.projector
+    there = {
+        "interreflection": True,
+        "mirrors": bench.loaded.mirrors,
+        "ambient": bool(bench.loaded.lamps),
+        "diffraction": True,
+        "mask-thickness": geometry.mask_thickness > 0,
+        "pixel-response": geometry.pixel_fill_factor < 1 or geometry.angular_exponent > 0,
+        "aperture": projector.aperture_radius_mm > 0,
+        "blur": projector.blur_pixels > 0,
+        "black-level": projector.black_level > 0,
+        "speckle": projector.speckle_contrast > 0,
+    }
+    return tuple(name for name in PHYSICAL if there[name])
+
+
+def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, seed: int) -> Evidence:
+    """Trace a few small batches and compare effects and discretisations on a handful of the family's captures.
+
+    ``labels`` and ``weights`` describe the family as in :class:`mitsim.optics.frames.ExpectedFrames`; ``accuracy`` is
+    where the search for enough anchors and layers may stop.
+
+    Raises
+    ------
+    MitsimError
+        when no light of the projector reaches the camera.
+    """
+    started = time.perf_counter()
+    family = _Family(labels, _some(weights, _CAPTURES))
+    names = applicable(bench)
+    direct = frozenset(names) & {"mirrors", "aperture", "blur", "diffraction"}
+    depth = _depth(bench, direct, seed)
+    base = Settings(depth=depth, effects=direct)
+    fine = _Fine(bench, base, family, accuracy, seed)
+    layer_error = fine.layer_errors()
+    cell_error = fine.cell_errors()
+    effects = _Effects(bench, replace(base, effects=frozenset(names), linear=True), family, seed)
+    effect_error = effects.errors(names)
+    if "speckle" in names:
+        effect_error["speckle"] = bench.projector.speckle_contrast
+    return Evidence(
+        depth=depth,
+        layers=fine.layers,
+        anchor_error=_Anchors(fine, accuracy).errors(),
+        layer_error=layer_error,
+        cell_error=cell_error,
+        effect_error=effect_error,
+        noise=(fine.noise(), effects.noise()),
+        cells=fine.simulation.tracer.lanes,
+        seconds_per_path=fine.seconds_per_path,
+        seconds_per_bounced=max(effects.seconds_per_path, fine.seconds_per_path),
+        seconds_per_frame=fine.seconds_per_frame,
+        terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _depth(bench: Bench, effects: frozenset[str], seed: int) -> float:
+    """Where the light is seen, 1 / mean(1/z) [mm], from one path through each projector pixel."""
+    settings = Settings(depth=bench.geometry.scene_distance, effects=effects)
+    found = Simulation(bench, settings).tracer.trace(integer(seed, "pilot", "depth"))
+    total = float(found.value.sum())
+    if not total and not bench.loaded.mirrors:
+        raise MitsimError(
+            "no light of the projector reaches the camera; check the scene, the window and the field stop"
+        )
+    mean = float(found.inverse_depth @ found.value) / total if total else 0.0
+    # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.
+    flat = abs(mean * bench.geometry.scene_distance - 1) < 1e-6
+    return bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean
+
+
+class _Fine:
+    """Direct light in many samples a cell, filed in different ways."""
+
+    def __init__(self, bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int) -> None:
+        self.bench, self.base, self.family, self.accuracy, self.seed = bench, base, family, accuracy, seed
+        self.simulation = Simulation(bench, base)
+        tracer = self.simulation.tracer
+        seeds = [integer(seed, "pilot", "fine", half) for half in range(2)]
+        first = tracer.trace(seeds[0], 0, _CELL_SAMPLES)
+        started = time.perf_counter()
+        second = tracer.trace(seeds[1], 0, _CELL_SAMPLES)
+        self.seconds_per_path = (time.perf_counter() - started) / (tracer.lanes * _CELL_SAMPLES)
+        few = [tracer.trace(one, 0, _CELL_SAMPLES // 4) for one in seeds]
+        shown = np.append(family.weights.any(axis=0)[family.labels], False)
+        first, second, *few = (found.where(shown[found.source]) for found in (first, second, *few))
+        self.deposits, self.few = (first, second), (few[0], few[1])
+        near, far = self._range()
+        self.layers: dict[int, tuple[float, ...]] = {1: (base.depth,)}
+        if far > near * (1 + 1e-4):
+            for count in LAYER_LADDER[1:]:
+                nodes = 1 / np.linspace(1 / far, 1 / near, count)
+                self.layers[count] = tuple(float(node) for node in nodes)
+        self.seconds_per_frame = 0.0
+
+    def _range(self) -> tuple[float, float]:
+        """Nearest and farthest depth that the light is seen at [mm]."""
+        inverse = np.concatenate([found.inverse_depth for found in self.deposits])
+        if not inverse.size:
+            return self.base.depth, self.base.depth
+        limit = 1e-4 / self.base.depth  # light from beyond ten thousand times the scene counts as infinitely far
+        return 1 / float(inverse.max()), 1 / max(float(inverse.min()), limit)
+
+    def layer_errors(self) -> dict[int, float]:
+        """Error by number of layers, judged by the most; the search stops where it is good enough."""
+        if len(self.layers) == 1:
+            return {1: 0.0}
+        frames = partial(self._frames, subdivision=1, linear=True)
+        return _ladder(self.layers, lambda count: frames(layers=self.layers[count]), 3, self.accuracy)
+
+    def cell_errors(self) -> dict[tuple[int, bool], float]:
+        """Error by cells, judged by the finest."""
+        frames = {choice: self._frames((), *choice) for choice in CELL_CHOICES}
+        judge = CELL_CHOICES[-1]
+        errors = {choice: _difference(frames[choice], frames[judge]) for choice in CELL_CHOICES[:-1]}
+        # Splitting between corners is of second order: cells half as large leave a quarter.
+        return {**errors, judge: errors[CELL_CHOICES[-2]] / 3}
+
+    def noise(self) -> Noise:
+        """Monte Carlo error of one estimate, and how fast it falls."""
+        many = _noise(self._frames((), 1, True))
+        few = _noise(self._frames((), 1, True, self.few, _CELL_SAMPLES // 4))
+        rate = math.log(few / many) / math.log(4) if many > 0 and few > 0 else 1.0
+        return Noise(many, _CELL_SAMPLES, min(max(rate, 0.5), 1.0))
+
+    def _frames(
+        self,
+        layers: tuple[float, ...],
+        subdivision: int,
+        linear: bool,
+        deposits: tuple[Deposits, Deposits] | None = None,
+        samples: int = _CELL_SAMPLES,
+    ) -> Halves:
+        settings = replace(self.base, layers=layers, subdivision=subdivision, linear=linear)
+        simulation = Simulation(self.bench, settings)
+        found = deposits or self.deposits
+        halves = tuple(_form(simulation, one, samples, self.family) for one in found)
+        self.seconds_per_frame = self.seconds_per_frame or _pace(simulation, found[0], samples, self.family)
+        return halves[0], halves[1]
+
+
+class _Effects:
+    """All effects at once, and each of them switched off."""
+
+    def __init__(self, bench: Bench, everything: Settings, family: _Family, seed: int) -> None:
+        self.bench, self.everything, self.family = bench, everything, family
+        self.seeds = tuple(integer(seed, "pilot", "effects", half) for half in range(2))
+        self.simulation = Simulation(bench, everything)
+        self._trace(self.simulation)
+        started = time.perf_counter()
+        self.deposits = self._trace(self.simulation)
+        self.seconds_per_path = (time.perf_counter() - started) / (2 * self.simulation.tracer.lanes * _EFFECT_SAMPLES)
+        self.frames = self._form(self.simulation, self.deposits)
+
+    def errors(self, names: tuple[str, ...]) -> dict[str, float]:
+        """Change of the frames when each effect is left out."""
+        return {name: _difference(self._without(name), self.frames) for name in names if name != "speckle"}
+
+    def noise(self) -> Noise:
+        """Monte Carlo error of one estimate of all that is not direct light, relative to all light."""
+        n = self.bench.n**2
+        other = tuple(found.where((found.order > 1) | (found.source == n)) for found in self.deposits)
+        first, second = self._form(self.simulation, other)
+        energy = float(np.vdot(*self.frames))
+        spread = float(np.square(first - second).sum()) / 2
+        return Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, _EFFECT_SAMPLES, 0.5)
+
+    def _without(self, name: str) -> Halves:
+        simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {name}))
+        deposits = self._trace(simulation) if name in _TRACED_ANEW else self.deposits
+        if name == "interreflection":
+            deposits = tuple(found.where(found.order == 1) for found in deposits)
+        if name == "ambient":
+            deposits = tuple(found.where(found.source < self.bench.n**2) for found in deposits)
+        return self._form(simulation, deposits)
+
+    def _trace(self, simulation: Simulation) -> tuple[Deposits, ...]:
+        return tuple(simulation.tracer.trace(seed, 0, _EFFECT_SAMPLES) for seed in self.seeds)
+
+    def _form(self, simulation: Simulation, deposits: tuple[Deposits, ...]) -> Halves:
+        first, second = (_form(simulation, found, _EFFECT_SAMPLES, self.family) for found in deposits)
+        return first, second
+
+
+class _Anchors:
+    """Error of the frames with fewer anchors.
+
+    The light of each class, seen from the sensor's centre, is scaled by how the light of all classes differs between an
+    anchor and the centre; both come from the same random paths. So the noise of single projector pixels is alike in all
+    answers and leaves their differences. Frames, not radiance: the falloff's error is odd in the scene's coordinates
+    and mostly cancels in a frame.
+    """
+
+    def __init__(self, fine: _Fine, accuracy: float) -> None:
+        self.fine, self.accuracy = fine, accuracy
+        self.coarse = Simulation(fine.bench, replace(fine.base, linear=True), coarse=_RATIO_PIXELS)
+        self.centre = tuple(self._light(1, half) for half in range(2))
+        self.classes = tuple(
+            fine.simulation.file(one, fine.family.labels, _CELL_SAMPLES).tocoo() for one in fine.deposits
+        )
+
+    def errors(self) -> dict[int, float]:
+        """By anchors a side; the last one's is extrapolated."""
+        return _ladder(ANCHOR_LADDER, self._frames, ANCHOR_LADDER.index(_FIRST_JUDGE), self.accuracy)
+
+    def _light(self, anchors: int, half: int) -> FloatArray:
+        """(anchors, rows, anchors, columns) light of all classes at the corners of coarse cells."""
+        settings = replace(self.fine.base, anchors=anchors, linear=True)
+        simulation = Simulation(self.fine.bench, settings, common=True, coarse=_RATIO_PIXELS)
+        found = simulation.tracer.trace(integer(self.fine.seed, "pilot", "anchors", half), 0, _RATIO_SAMPLES)
+        light = simulation.bundle.file(found, np.zeros(self.fine.bench.n**2, dtype=np.int64))[[0]].toarray()
+        rows, columns = simulation.bundle.cells
+        return np.asarray(light).reshape(anchors, rows, anchors, columns)
+
+    def _frames(self, anchors: int) -> Halves:
+        settings = replace(self.fine.base, anchors=anchors)
+        simulation = Simulation(self.fine.bench, settings)
+        first, second = (self._half(simulation, half) for half in range(2))
+        return first, second
+
+    def _half(self, simulation: Simulation, half: int) -> FloatArray:
+        anchors, bundle, found = simulation.settings.anchors, simulation.bundle, self.classes[half]
+        centre = np.broadcast_to(self.centre[half], (anchors, *self.centre[half].shape[1:2], anchors, self.centre[half].shape[3]))
+        ratio = np.divide(self._light(anchors, half), centre, out=np.zeros(centre.shape), where=centre > 0)
+        row, column = np.divmod(found.col, bundle.cells[1])
+        beside = self.coarse.bundle.shares(bundle.grid.rows.centre(row), bundle.grid.columns.centre(column))
+        lines, places, values = [], [], []
+        for a, b in np.ndindex(anchors, anchors):
+            scale = sum(share * ratio[a, y, b, x] for y, x, share in beside)
+            line = a * bundle.cells[0] + row
+            lines.append(found.row)
+            places.append((line * anchors + b) * bundle.cells[1] + column)
+            values.append(found.data * scale)
+        entries = np.concatenate(values), (np.concatenate(lines), np.concatenate(places))
+        light = sparse.coo_array(entries, shape=(found.shape[0], bundle.size)).tocsr()
+        rows = np.arange(self.fine.family.weights.shape[1])
+        frames = ExpectedFrames(simulation.optics, [light[: len(rows)]], rows, self.fine.family.weights, 0)
+        return np.stack([frame.irradiance for frame in frames])
+
+
+def _ladder(
+    steps: Mapping[int, object] | tuple[int, ...], frames: Callable[[int], Halves], first: int, accuracy: float
+) -> dict[int, float]:
+    """Error of each step against the last one tried; more are tried until the one before the judge is good enough."""
+    counts = list(steps)
+    made = {count: frames(count) for count in counts[: first + 1]}
+    while True:
+        judge, before = list(made)[-1], list(made)[-2]
+        errors = {count: _difference(found, made[judge]) for count, found in made.items() if count != judge}
+        if errors[before] <= 0.3 * accuracy or judge == counts[-1]:
+            break
+        following = counts[counts.index(judge) + 1]
+        made[following] = frames(following)
+    # The judge's own error: what the last step gained, once more.
+    earlier = list(made)[-3]
+    gain = errors[before] / errors[earlier] if errors[earlier] > 0 else 1.0
+    return {**errors, judge: errors[before] * min(gain, 1.0)}
+
+
+def _form(simulation: Simulation, found: Deposits, samples: int, family: _Family) -> FloatArray:
+    """(captures, pixels, pixels) frames of some deposits."""
+    light = simulation.file(found, family.labels, samples)
+    rows = np.arange(family.weights.shape[1])
+    exact = simulation.mirrored(family.labels)
+    expected = simulation.expected([light], rows, family.weights, 0, exact)
+    return np.stack([frame.irradiance for frame in expected])
+
+
+def _pace(simulation: Simulation, found: Deposits, samples: int, family: _Family) -> float:
+    """Seconds to form one frame, with its share of the eight groups' errors."""
+    light = simulation.file(found, family.labels, samples)
+    started = time.perf_counter()
+    rows = np.arange(family.weights.shape[1])
+    list(ExpectedFrames(simulation.optics, [light[: len(rows)]] * GROUPS, rows, family.weights, 0))
+    return (time.perf_counter() - started) / len(family.weights)
+
+
+def _some(weights: FloatArray, most: int) -> FloatArray:
+    """Up to ``most`` captures, evenly spread over the family."""
+    return weights[np.unique(np.linspace(0, len(weights) - 1, min(len(weights), most)).astype(int))]
+
+
+def _difference(changed: Halves, judge: Halves) -> float:
+    """||changed - judge|| / ||judge||, from two independent halves."""
+    energy = float(np.vdot(judge[0], judge[1]))
+    product = float(np.vdot(changed[0] - judge[0], changed[1] - judge[1]))
+    return math.sqrt(max(product, 0.0) / energy) if energy > 0 else 0.0
+
+
+def _noise(halves: Halves) -> float:
+    """Relative error of one of two independent halves."""
+    energy = float(np.vdot(*halves))
+    return math.sqrt(float(np.square(halves[0] - halves[1]).sum()) / 2 / energy) if energy > 0 else 0.0

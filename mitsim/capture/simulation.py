@@ -1,0 +1,139 @@
+"""One bench under one choice of settings: what is traced, how light is filed, which shadow the mask casts.
+
+An effect that is off takes its neutral value here and nowhere else: a pinhole for the lens, a thin mask, a geometric
+shadow. :mod:`mitsim.capture.pilot` switches effects on and off to see what they are worth; :mod:`mitsim.capture.light`
+samples the choice that the plan made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.capture.bench import Bench
+from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
+from mitsim.optics.diffraction import Spectrum
+from mitsim.optics.frames import Ambient, ClassFrames, ExpectedFrames, FrameOptics
+from mitsim.scene.plan import Settings
+from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.transport.factored import Paths, Tracer
+from mitsim.transport.histogram import Bundle, Deposits
+
+FloatArray = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
+AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
+"""Ambient light: a flat spectrum of photons over this range, in so many bands."""
+
+
+class Simulation:
+    """A bench with settings; its parts are prepared when they are first asked for."""
+
+    def __init__(self, bench: Bench, settings: Settings, common: bool = False, coarse: int = 0) -> None:
+        """``common``: anchors share their random numbers; ``coarse``: cells of so many projector pixels a side."""
+        self.bench, self.settings, self.common = bench, settings, common
+        on = settings.effects
+        neutral: dict[str, float] = {}
+        if "mask-thickness" not in on:
+            neutral["mask_thickness"] = 0.0
+        if "pixel-response" not in on:
+            neutral |= {"pixel_fill_factor": 1.0, "angular_exponent": 0.0}
+        self.geometry: CameraGeometry = bench.geometry.model_copy(update=neutral)
+        self.black = bench.projector.black_level if "black-level" in on else 0.0
+        pixels = max(bench.n // coarse, 1) if coarse else bench.n
+        self.aim = self._grid(pixels, 1)
+        self.bundle = Bundle(self._grid(pixels, settings.subdivision), settings.anchors, settings.depths, settings.linear)
+
+    def _grid(self, pixels: int, subdivision: int) -> CellGrid:
+        windows = self.bench.windows_at(self.settings.depth)
+        stop = self.geometry.tan_half_fov
+        return aligned_grid(*windows, pixels, subdivision, stop, multiple=subdivision)
+
+    @cached_property
+    def tracer(self) -> Tracer:
+        """Follows the paths that the settings ask for."""
+        on, bench = self.settings.effects, self.bench
+        source = bench.source
+        if "aperture" not in on:
+            source = replace(source, aperture=0.0)
+        if "blur" not in on:
+            source = replace(source, blur=0.0)
+        paths = Paths(
+            mirrors="mirrors" in on,
+            interreflection="interreflection" in on,
+            emitters=bench.loaded.lamps if self.lit_by_lamps else (),
+        )
+        return Tracer(
+            bench.loaded.scene,
+            bench.loaded.camera,
+            source,
+            self.aim,
+            self.settings.anchors,
+            self.settings.depth,
+            paths,
+            self.common,
+            self.geometry,
+        )
+
+    @cached_property
+    def optics(self) -> FrameOptics:
+        """The mask's shadow in the projector's light."""
+        return self._optics(self.bench.spectrum)
+
+    @cached_property
+    def ambient_optics(self) -> FrameOptics:
+        """The mask's shadow in the light of other lamps."""
+        return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS))
+
+    def _optics(self, spectrum: Spectrum) -> FrameOptics:
+        waves = spectrum if "diffraction" in self.settings.effects else None
+        bundle = self.bundle
+        return FrameOptics(self.geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, waves)
+
+    def file(self, found: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
+        """(classes + 1, places) light of every class, and ambient light [W m^-2]."""
+        return self.bundle.file(found, labels, samples)
+
+    def flux(self, found: Deposits, samples: int) -> FloatArray:
+        """(n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask."""
+        edges = self.geometry.pixel_edges
+        centres = (edges[:-1] + edges[1:]) / 2
+        positions = anchor_positions(self.settings.anchors, self.geometry.half_width)
+        mean = anchor_weights(positions, centres).mean(axis=0)
+        value = found.value * mean[found.anchor_row] * mean[found.anchor_column] * (found.order == 1) / samples
+        return np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1]
+
+    def mirrored(self, labels: Labels) -> ClassFrames | None:
+        """Frames of light that comes from the projector over mirrors alone, by class; None without such light."""
+        return None
+
+    def expected(
+        self,
+        groups: Sequence[sparse.csr_array],
+        rows: Labels,
+        weights: FloatArray,
+        seed: int,
+        exact: ClassFrames | None = None,
+    ) -> ExpectedFrames:
+        """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' first rows to classes."""
+        first = len(rows)
+        emitted = self.black + (1 - self.black) * weights
+        ambient = None
+        if self.lit_by_lamps:
+            ambient = Ambient(self.ambient_optics, tuple(group[first:] for group in groups))
+        return ExpectedFrames(self.optics, [group[:first] for group in groups], rows, emitted, seed, ambient, exact)
+
+    @property
+    def lit_by_lamps(self) -> bool:
+        """Whether ambient light is simulated."""
+        return "ambient" in self.settings.effects and bool(self.bench.loaded.lamps)
+
+
+def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:
+    """Equal photons in ``count`` bands between two wavelengths, each taken at its centre."""
+    edges = np.linspace(low_nm, high_nm, count + 1)
+    return Spectrum((edges[:-1] + edges[1:]) / 2, np.full(count, 1 / count))

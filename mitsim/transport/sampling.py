@@ -1,0 +1,52 @@
+"""Random numbers of the factored estimator: from a seed, a stream and a sample's index to points of the unit square.
+
+The first two dimensions (where a path leaves its cell) follow a scrambled Sobol sequence: the samples of one cell
+stratify, so an average over a cell that several projector pixels share converges faster than 1/sqrt(samples). Owen's
+scrambling (hashed, Laine and Karras 2011) is seeded for each stream, so streams are independent and every estimate is
+unbiased. The other dimensions are plain random numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+SEQUENCE_BITS = 20
+"""Samples a cell may get: 2^20."""
+
+
+def generator(seed: Any, stream: Any) -> Any:
+    """An independent PCG32 for each stream; neighbouring streams are scattered by the cipher TEA, as in Mitsuba."""
+    state, sequence = mi.sample_tea_32(seed, stream)
+    return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+
+
+def stratified(index: Any, rng: Any) -> Any:
+    """Point ``index`` of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
+    first = _scrambled(dr.brev(index), rng.next_uint32())
+    second = _scrambled(_second_dimension(index), rng.next_uint32())
+    return mi.Point2f(_unit(first), _unit(second))
+
+
+def _second_dimension(index: Any) -> Any:
+    """Dimension 2 of Sobol's sequence, 32-bit fixed point: direction numbers of the polynomial x + 1."""
+    result, direction = mi.UInt32(0), 1 << 31
+    for bit in range(SEQUENCE_BITS):
+        result = dr.select((index & (1 << bit)) != 0, result ^ direction, result)
+        direction ^= direction >> 1
+    return result
+
+
+def _scrambled(bits: Any, seed: Any) -> Any:
+    """Nested uniform scrambling: each bit is flipped by a hash of those above it."""
+    x = dr.brev(bits) + seed
+    for multiplier in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
+        x ^= x * multiplier
+    return dr.brev(x)
+
+
+def _unit(bits: Any) -> Any:
+    """[0, 1) from the upper 24 bits, all that a float32 holds."""
+    return mi.Float(bits >> 8) * (1 / 2**24)
