@@ -15,9 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pictures
+from drawing import Grey, glyph
 from numpy.typing import NDArray
 
-Grey = NDArray[np.uint8]
 Reflectance = NDArray[np.float64]
 
 SHEET_MM = 128.0
@@ -40,20 +41,6 @@ TARGET_GROUPS: tuple[tuple[tuple[str, int, int], ...], ...] = (
     (("5", 15, 9), ("4", 12, 11), ("3", 9, 15)),
     (("2", 6, 22), ("1.7", 5, 26)),
 )
-
-_FONT = {  # 5 x 7 dots, a row per number, most significant bit left
-    "0": (14, 17, 19, 21, 25, 17, 14),
-    "1": (4, 12, 4, 4, 4, 4, 14),
-    "2": (14, 17, 1, 2, 4, 8, 31),
-    "3": (31, 2, 4, 2, 1, 17, 14),
-    "4": (2, 6, 10, 18, 31, 2, 2),
-    "5": (31, 16, 30, 1, 1, 17, 14),
-    "6": (6, 8, 16, 30, 17, 17, 14),
-    "7": (31, 1, 2, 4, 8, 8, 8),
-    "8": (14, 17, 17, 14, 17, 17, 14),
-    "9": (14, 17, 17, 15, 1, 2, 12),
-    ".": (0, 0, 0, 0, 0, 12, 12),
-}
 
 
 def projector_window() -> Grey:
@@ -135,11 +122,9 @@ def _round_up(value: int, step: int) -> int:
 def _draw_text(sheet: NDArray[np.bool_], text: str, row: int, column: int, dot: int) -> None:
     """Set `text` in `sheet`, in place: dots of `dot` texels, top left corner at (row, column)."""
     for position, character in enumerate(text):
-        for line, bits in enumerate(_FONT[character]):
-            for bit in range(5):
-                if bits >> (4 - bit) & 1:
-                    y, x = row + line * dot, column + (6 * position + bit) * dot
-                    sheet[y : y + dot, x : x + dot] = True
+        for line, bit in np.argwhere(glyph(character)):
+            y, x = row + line * dot, column + (6 * position + bit) * dot
+            sheet[y : y + dot, x : x + dot] = True
 
 
 def _to_grey(reflectance: Reflectance) -> Grey:
@@ -169,6 +154,13 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "colour_chart/reflectance.png": colour_chart,
     "resolution_target/projector.png": projector_window,
     "resolution_target/reflectance.png": resolution_target,
+    "corner/projector.png": projector_window,
+    "cards/projector.png": projector_window,
+    "cards/front.png": pictures.front_card,
+    "cards/back.png": pictures.back_card,
+    "mirror/projector.png": projector_window,
+    "lamp_bench/projector.png": projector_window,
+    "lamp_bench/reflectance.png": pictures.bench_chart,
 }
 
 
