@@ -1,5 +1,6 @@
-"""Recipes in, textures of the shipped scenes out: 8-bit grey PNGs whose value / 255 IS the reflectance
-(or the projector's window). `python scenes/generate.py` writes them, `--check` compares what is shipped.
+"""Recipes in, textures and meshes of the shipped scenes out: 8-bit grey PNGs whose value / 255 IS the reflectance
+(or the projector's window), and binary PLYs. `python scenes/generate.py` writes them, `--check` compares what is
+shipped.
 
 Rows run top (+y) to bottom, columns left (+x) to right, as one sees the sheet looking along +z. A sheet is
 128 mm a side; the projector's lit window is its central 120 mm. No resampling library and no font takes part,
@@ -14,6 +15,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import meshes
 import numpy as np
 import pictures
 from drawing import Grey, glyph
@@ -50,9 +52,24 @@ def projector_window() -> Grey:
     return canvas
 
 
+def toed_in_window() -> Grey:
+    """(128, 128) grey: the canvas of a projector without lens shift is its window, all lit."""
+    return np.full((PROJECTOR_GRID, PROJECTOR_GRID), 255, dtype=np.uint8)
+
+
 def photograph() -> Grey:
-    """(512, 512) grey: NASA's portrait of Eileen Collins (public domain, shipped with scikit-image), face
-    and shoulders, as linear luminance (Rec. 709) mapped linearly onto reflectances 0.03 to 0.90."""
+    """(512, 512) grey: the portrait, interpolated between texels."""
+    return _to_grey(_double(_portrait()))
+
+
+def small_photograph() -> Grey:
+    """(256, 256) grey: the portrait as it is, 0.5 mm a texel."""
+    return _to_grey(_portrait())
+
+
+def _portrait() -> Reflectance:
+    """(256, 256): NASA's portrait of Eileen Collins (public domain, shipped with scikit-image), face and
+    shoulders, as linear luminance (Rec. 709) mapped linearly onto reflectances 0.03 to 0.90."""
     from skimage.data import astronaut
 
     crop = astronaut()[0:256, 96:352].astype(np.float64) / 255.0
@@ -60,7 +77,7 @@ def photograph() -> Grey:
     luminance = linear @ np.array([0.2126, 0.7152, 0.0722])
     low, high = float(luminance.min()), float(luminance.max())
     dark, bright = REFLECTANCE_RANGE
-    return _to_grey(_double(dark + (bright - dark) * (luminance - low) / (high - low)))
+    return np.asarray(dark + (bright - dark) * (luminance - low) / (high - low))
 
 
 def colour_chart() -> Grey:
@@ -161,16 +178,36 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "mirror/projector.png": projector_window,
     "lamp_bench/projector.png": projector_window,
     "lamp_bench/reflectance.png": pictures.bench_chart,
+    "cookie_bag/projector.png": projector_window,
+    "cookie_bag/bag.png": pictures.cookie_bag,
+    "cookie_bag/box.png": pictures.cardboard_box,
+    "gift_card/projector.png": projector_window,
+    "gift_card/card.png": pictures.gift_card,
+    "metal_blade/projector.png": projector_window,
+    "metal_blade/etching.png": pictures.blade_etching,
+    "keystone/projector.png": toed_in_window,
+    "keystone/reflectance.png": small_photograph,
+}
+MESHES: dict[str, Callable[[], meshes.Mesh]] = {
+    "corner/walls.ply": meshes.corner,
+    "cookie_bag/bag.ply": meshes.cookie_bag,
+    "cookie_bag/box.ply": meshes.box,
+    "metal_blade/blade.ply": meshes.blade,
 }
 
 
 def difference(folder: Path, name: str) -> str | None:
-    """None when the PNG at folder/name has exactly the pixels of its recipe, else a sentence saying why."""
+    """None when the file at folder/name is exactly what its recipe makes, else a sentence saying why.
+
+    A PNG is compared by its pixels (packing differs between library versions), a mesh by its bytes.
+    """
     from PIL import Image
 
     path = folder / name
     if not path.is_file():
         return f"{path} is missing"
+    if name in MESHES:
+        return None if path.read_bytes() == MESHES[name]().ply() else f"{path} differs from its recipe"
     with Image.open(path) as image:
         mode, shipped = image.mode, np.asarray(image)
     expected = TEXTURES[name]()
@@ -181,26 +218,29 @@ def difference(folder: Path, name: str) -> str | None:
 
 
 def write(folder: Path, name: str) -> None:
-    """Write the PNG of `name` under `folder` (beside it first, then moved into place)."""
+    """Write the file of `name` under `folder` (beside it first, then moved into place)."""
     from PIL import Image
 
     path = folder / name
     part = path.with_suffix(".part")
-    Image.fromarray(TEXTURES[name]()).save(part, format="PNG", optimize=True)
+    if name in MESHES:
+        part.write_bytes(MESHES[name]().ply())
+    else:
+        Image.fromarray(TEXTURES[name]()).save(part, format="PNG", optimize=True)
     os.replace(part, path)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """0 when all is written, or with --check when all agrees; 1 when a shipped texture differs."""
-    parser = argparse.ArgumentParser(description="Make the textures of the shipped scenes.")
+    """0 when all is written, or with --check when all agrees; 1 when a shipped file differs."""
+    parser = argparse.ArgumentParser(description="Make the textures and meshes of the shipped scenes.")
     parser.add_argument("--check", action="store_true", help="compare, write nothing")
     check: bool = parser.parse_args(arguments).check
     folder = Path(__file__).resolve().parent
     if not check:
-        for name in TEXTURES:
+        for name in (*TEXTURES, *MESHES):
             write(folder, name)
         return 0
-    complaints = [text for name in TEXTURES if (text := difference(folder, name))]
+    complaints = [text for name in (*TEXTURES, *MESHES) if (text := difference(folder, name))]
     for text in complaints:
         sys.stderr.write(f"{text}; run: python scenes/generate.py\n")
     return 1 if complaints else 0

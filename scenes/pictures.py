@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from drawing import Grey, Sheet
+import numpy as np
+from drawing import Grey, Sheet, text_width
 
 INK, PAPER = 0.06, 0.85
 # A unit circle in steps of 22.5 degrees, tabulated: a platform's own sine may differ in the last bit.
@@ -96,3 +97,75 @@ def _diagram(sheet: Sheet) -> None:
     for start, end in pairwise(points):
         sheet.line(start, end, 2.0, 0.2)
     sheet.text("1/Z", 36, 22, 8, INK)
+
+
+def cookie_bag() -> Grey:
+    """(400, 304) grey, 76 x 100 mm: the bag's print. Ribbed seams, its name on a dark band, six cookies with chips, the
+    weight. Chips lie at random, seed 1."""
+    sheet = Sheet(76, 100, 4, 0.72)
+    for k in range(38):  # ribs of the two seams
+        for bottom, top in ((42, 50), (-50, -46)):
+            sheet.box(-38 + 2 * k, bottom, -37 + 2 * k, top, 0.45)
+    sheet.box(-38, 12, 38, 33, 0.08)
+    sheet.box(-38, 10.5, 38, 11.5, 0.08)
+    sheet.text("COOKIES", -text_width("COOKIES", 10) / 2, 17.5, 10, 0.88)
+    chips = np.random.default_rng(1)
+    for x, y, radius in ((-21, -4, 10.5), (1, -1, 9.5), (22, -6, 10.5), (-13, -26, 10), (9, -22, 9), (26, -27, 8)):
+        _cookie(sheet, x, y, radius, chips)
+    sheet.text("150 G", -30, -43.5, 5.5, INK)
+    return sheet.grey()
+
+
+def _cookie(sheet: Sheet, x: float, y: float, radius: float, chips: np.random.Generator) -> None:
+    sheet.disc(x, y, radius, 0.22)
+    sheet.disc(x, y, radius - 0.9, 0.48)
+    for _ in range(9):
+        while True:
+            dx, dy = (2 * chips.random(2) - 1) * radius
+            if dx * dx + dy * dy < (radius - 2.6) ** 2:
+                break
+        sheet.disc(x + dx, y + dy, 1.0 + 0.7 * chips.random(), INK)
+
+
+def cardboard_box() -> Grey:
+    """(336, 320) grey, 80 x 84 mm: the box's front, left side and top as `meshes.box` lays them out."""
+    sheet = Sheet(80, 84, 4, 0.42)
+    # Front: x from -40 to 4, y from -6 to 42.
+    sheet.box(-38, -4, 2, 40, 0.60)
+    sheet.text("TEA", -text_width("TEA", 11) / 2 - 18, 24, 11, INK)
+    sheet.disc(-18, 8, 9, 0.15)
+    sheet.disc(-18, 8, 6.5, 0.75)
+    sheet.polygon([(-23, 8), (-18, 13), (-13, 8), (-18, 3)], 0.15)
+    # Left side: x from 4 to 40, y from -6 to 42.
+    sheet.box(4, 28, 40, 34, 0.10)
+    sheet.text("NO 5", 8, 12, 9, 0.12)
+    for k, width in enumerate((1.5, 0.8, 2.2, 1.2, 0.8, 1.8, 1.0)):
+        sheet.box(10 + 3.6 * k, -2, 10 + 3.6 * k + width, 8, INK)
+    # Top: x from -40 to 4, y from -42 to -6.
+    sheet.box(-40, -27, 4, -21, 0.70)
+    sheet.polygon([(-34, -11), (-28, -11), (-31, -17)], 0.12)
+    return sheet.grey()
+
+
+def gift_card() -> Grey:
+    """(324, 514) grey, 85.6 x 54 mm (ISO/IEC 7810 ID-1 to 0.1 mm): ribbon and bow, a title, a value and a number."""
+    sheet = Sheet(85.6, 54, 6, 0.35)
+    sheet.box(14, -27, 22, 27, 0.75)
+    sheet.box(-42.8, -4, 42.8, 3, 0.75)
+    for side in (-1, 1):
+        sheet.polygon([(18, -0.5), (18 + side * 15, 9), (18 + side * 15, -10)], 0.55)
+    sheet.disc(18, -0.5, 4, 0.85)
+    sheet.text("GIFT CARD", -40, 11, 7, 0.85)
+    sheet.text("50", -38, -18.5, 10.5, 0.06)
+    sheet.text("1234 5678", -14, -22.5, 3.5, 0.85)
+    return sheet.grey()
+
+
+def blade_etching() -> Grey:
+    """(152, 368) grey, 92 x 38 mm: what etching leaves of the bare metal's reflection (1): 0.2 in letters."""
+    sheet = Sheet(92, 38, 4, 1.0)
+    sheet.text("MITSIM", -41, 2, 10, 0.2)
+    for k in range(13):
+        sheet.box(-41 + 5 * k, 14.5 if k % 5 else 13.5, -40.2 + 5 * k, 17.5, 0.2)
+    sheet.disc(18, 7, 5, 0.2, hole=3)
+    return sheet.grey()
