@@ -167,5 +167,5 @@ def blade_etching() -> Grey:
     sheet.text("MITSIM", -41, 2, 10, 0.2)
     for k in range(13):
         sheet.box(-41 + 5 * k, 14.5 if k % 5 else 13.5, -40.2 + 5 * k, 17.5, 0.2)
-    sheet.disc(18, 7, 5, 0.2, hole=3)
+    sheet.polygon([(13, 2), (22, 2), (22, 11)], 0.2)
     return sheet.grey()
