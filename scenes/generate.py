@@ -1,5 +1,6 @@
-"""Recipes in, textures of the shipped scenes out: 8-bit grey PNGs whose value / 255 IS the reflectance
-(or the projector's window). `python scenes/generate.py` writes them, `--check` compares what is shipped.
+"""Recipes in, textures and meshes of the shipped scenes out: 8-bit grey PNGs whose value / 255 IS the reflectance
+(or the projector's window), and binary PLYs. `python scenes/generate.py` writes them, `--check` compares what is
+shipped.
 
 Rows run top (+y) to bottom, columns left (+x) to right, as one sees the sheet looking along +z. A sheet is
 128 mm a side; the projector's lit window is its central 120 mm. No resampling library and no font takes part,
@@ -14,10 +15,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import meshes
 import numpy as np
+import pictures
+from drawing import Grey, glyph
 from numpy.typing import NDArray
 
-Grey = NDArray[np.uint8]
 Reflectance = NDArray[np.float64]
 
 SHEET_MM = 128.0
@@ -41,20 +44,6 @@ TARGET_GROUPS: tuple[tuple[tuple[str, int, int], ...], ...] = (
     (("2", 6, 22), ("1.7", 5, 26)),
 )
 
-_FONT = {  # 5 x 7 dots, a row per number, most significant bit left
-    "0": (14, 17, 19, 21, 25, 17, 14),
-    "1": (4, 12, 4, 4, 4, 4, 14),
-    "2": (14, 17, 1, 2, 4, 8, 31),
-    "3": (31, 2, 4, 2, 1, 17, 14),
-    "4": (2, 6, 10, 18, 31, 2, 2),
-    "5": (31, 16, 30, 1, 1, 17, 14),
-    "6": (6, 8, 16, 30, 17, 17, 14),
-    "7": (31, 1, 2, 4, 8, 8, 8),
-    "8": (14, 17, 17, 14, 17, 17, 14),
-    "9": (14, 17, 17, 15, 1, 2, 12),
-    ".": (0, 0, 0, 0, 0, 12, 12),
-}
-
 
 def projector_window() -> Grey:
     """(128, 256) grey: the projector's canvas, the 128 x 128 window at the right half lit, the rest black."""
@@ -63,9 +52,24 @@ def projector_window() -> Grey:
     return canvas
 
 
+def toed_in_window() -> Grey:
+    """(128, 128) grey: the canvas of a projector without lens shift is its window, all lit."""
+    return np.full((PROJECTOR_GRID, PROJECTOR_GRID), 255, dtype=np.uint8)
+
+
 def photograph() -> Grey:
-    """(512, 512) grey: NASA's portrait of Eileen Collins (public domain, shipped with scikit-image), face
-    and shoulders, as linear luminance (Rec. 709) mapped linearly onto reflectances 0.03 to 0.90."""
+    """(512, 512) grey: the portrait, interpolated between texels."""
+    return _to_grey(_double(_portrait()))
+
+
+def small_photograph() -> Grey:
+    """(256, 256) grey: the portrait as it is, 0.5 mm a texel."""
+    return _to_grey(_portrait())
+
+
+def _portrait() -> Reflectance:
+    """(256, 256): NASA's portrait of Eileen Collins (public domain, shipped with scikit-image), face and
+    shoulders, as linear luminance (Rec. 709) mapped linearly onto reflectances 0.03 to 0.90."""
     from skimage.data import astronaut
 
     crop = astronaut()[0:256, 96:352].astype(np.float64) / 255.0
@@ -73,7 +77,7 @@ def photograph() -> Grey:
     luminance = linear @ np.array([0.2126, 0.7152, 0.0722])
     low, high = float(luminance.min()), float(luminance.max())
     dark, bright = REFLECTANCE_RANGE
-    return _to_grey(_double(dark + (bright - dark) * (luminance - low) / (high - low)))
+    return np.asarray(dark + (bright - dark) * (luminance - low) / (high - low))
 
 
 def colour_chart() -> Grey:
@@ -135,11 +139,9 @@ def _round_up(value: int, step: int) -> int:
 def _draw_text(sheet: NDArray[np.bool_], text: str, row: int, column: int, dot: int) -> None:
     """Set `text` in `sheet`, in place: dots of `dot` texels, top left corner at (row, column)."""
     for position, character in enumerate(text):
-        for line, bits in enumerate(_FONT[character]):
-            for bit in range(5):
-                if bits >> (4 - bit) & 1:
-                    y, x = row + line * dot, column + (6 * position + bit) * dot
-                    sheet[y : y + dot, x : x + dot] = True
+        for line, bit in np.argwhere(glyph(character)):
+            y, x = row + line * dot, column + (6 * position + bit) * dot
+            sheet[y : y + dot, x : x + dot] = True
 
 
 def _to_grey(reflectance: Reflectance) -> Grey:
@@ -169,16 +171,43 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "colour_chart/reflectance.png": colour_chart,
     "resolution_target/projector.png": projector_window,
     "resolution_target/reflectance.png": resolution_target,
+    "corner/projector.png": projector_window,
+    "cards/projector.png": projector_window,
+    "cards/front.png": pictures.front_card,
+    "cards/back.png": pictures.back_card,
+    "mirror/projector.png": projector_window,
+    "lamp_bench/projector.png": projector_window,
+    "lamp_bench/reflectance.png": pictures.bench_chart,
+    "cookie_bag/projector.png": projector_window,
+    "cookie_bag/bag.png": pictures.cookie_bag,
+    "cookie_bag/box.png": pictures.cardboard_box,
+    "gift_card/projector.png": projector_window,
+    "gift_card/card.png": pictures.gift_card,
+    "metal_blade/projector.png": projector_window,
+    "metal_blade/etching.png": pictures.blade_etching,
+    "keystone/projector.png": toed_in_window,
+    "keystone/reflectance.png": small_photograph,
+}
+MESHES: dict[str, Callable[[], meshes.Mesh]] = {
+    "corner/walls.ply": meshes.corner,
+    "cookie_bag/bag.ply": meshes.cookie_bag,
+    "cookie_bag/box.ply": meshes.box,
+    "metal_blade/blade.ply": meshes.blade,
 }
 
 
 def difference(folder: Path, name: str) -> str | None:
-    """None when the PNG at folder/name has exactly the pixels of its recipe, else a sentence saying why."""
+    """None when the file at folder/name is exactly what its recipe makes, else a sentence saying why.
+
+    A PNG is compared by its pixels (packing differs between library versions), a mesh by its bytes.
+    """
     from PIL import Image
 
     path = folder / name
     if not path.is_file():
         return f"{path} is missing"
+    if name in MESHES:
+        return None if path.read_bytes() == MESHES[name]().ply() else f"{path} differs from its recipe"
     with Image.open(path) as image:
         mode, shipped = image.mode, np.asarray(image)
     expected = TEXTURES[name]()
@@ -189,26 +218,29 @@ def difference(folder: Path, name: str) -> str | None:
 
 
 def write(folder: Path, name: str) -> None:
-    """Write the PNG of `name` under `folder` (beside it first, then moved into place)."""
+    """Write the file of `name` under `folder` (beside it first, then moved into place)."""
     from PIL import Image
 
     path = folder / name
     part = path.with_suffix(".part")
-    Image.fromarray(TEXTURES[name]()).save(part, format="PNG", optimize=True)
+    if name in MESHES:
+        part.write_bytes(MESHES[name]().ply())
+    else:
+        Image.fromarray(TEXTURES[name]()).save(part, format="PNG", optimize=True)
     os.replace(part, path)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """0 when all is written, or with --check when all agrees; 1 when a shipped texture differs."""
-    parser = argparse.ArgumentParser(description="Make the textures of the shipped scenes.")
+    """0 when all is written, or with --check when all agrees; 1 when a shipped file differs."""
+    parser = argparse.ArgumentParser(description="Make the textures and meshes of the shipped scenes.")
     parser.add_argument("--check", action="store_true", help="compare, write nothing")
     check: bool = parser.parse_args(arguments).check
     folder = Path(__file__).resolve().parent
     if not check:
-        for name in TEXTURES:
+        for name in (*TEXTURES, *MESHES):
             write(folder, name)
         return 0
-    complaints = [text for name in TEXTURES if (text := difference(folder, name))]
+    complaints = [text for name in (*TEXTURES, *MESHES) if (text := difference(folder, name))]
     for text in complaints:
         sys.stderr.write(f"{text}; run: python scenes/generate.py\n")
     return 1 if complaints else 0
