@@ -122,7 +122,7 @@ def test_light_followed_forward_gives_what_importance_gives() -> None:
     corner, found = Corner(0.8, N, K), 0.0
     t_x, d_x = gauss(0.0, corner.tan_half, 24)
     z = 450 / (1 + t_x)
-    t_y, d_y = gauss(*(sign * np.minimum(corner.tan_half, 80 / z) for sign in (-1, 1)), 24)
+    t_y, d_y = gauss(*(sign * np.minimum(corner.tan_half, 80 / z) for sign in (-1, 1)), 60)
     weight = (d_x[:, None] * d_y / (1 + t_x[:, None] ** 2 + t_y**2) ** 2).ravel()
     a = np.broadcast_to((ROOT2 * (450 - z))[:, None], t_y.shape).ravel()
     for wall in WALLS:
@@ -160,11 +160,11 @@ def test_corner(small_scene: Callable[..., Path], name: str) -> None:
     check(found.more, found.more_error, more, JUDGE_ERROR, 0.01, "more reflections")
 
 
-@pytest.mark.parametrize("rho", [0.5, 0.9])
+@pytest.mark.parametrize(("rho", "spp"), [(0.5, 512), (0.9, 256)])
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_furnace(small_scene: Callable[..., Path], name: str, rho: float) -> None:
+def test_furnace(small_scene: Callable[..., Path], name: str, rho: float, spp: int) -> None:
     scene = write_scene(small_scene, "furnace", SPHERE.format(rho=rho))
-    found, furnace = ESTIMATORS[name](scene, 256, 11), Furnace(rho)
+    found, furnace = ESTIMATORS[name](scene, spp, 11), Furnace(rho)
     tan_half = float(np.tan(np.radians(10)))
     share = np.outer([8, 7], [8, 7]).ravel() / N**2  # of the window's pixels: rows and columns 0, 2, ... and 1, 3, ...
     expected = furnace.indirect(tan_half) * np.broadcast_to(share[:, None, None], (K**2, 2, 2))
