@@ -6,6 +6,7 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -160,13 +161,14 @@ def solver_costs(rows: Sequence[SolverRow], width: float = 8.6) -> Figure:
     figure, _ = _figure(width, 0.55 * width)
     figure.clear()
     panels: Any = figure.subplots(1, len(lambdas), sharex=True, sharey=True, squeeze=False)[0]
+    colours = (BLUE, ORANGE, VERMILION, GREEN)
     precisions = list(dict.fromkeys(row.precision for row in rows))
     forms = list(dict.fromkeys((row.method, row.layout) for row in rows))
     for axes, lam in zip(panels, lambdas, strict=True):
         here = [row for row in rows if row.lambda_rel == lam]
         for row in here:
-            colour = (BLUE, ORANGE, VERMILION)[precisions.index(row.precision) % 3]
-            marker = _MARKERS[forms.index((row.method, row.layout)) % len(_MARKERS)]
+            colour = colours[precisions.index(row.precision)]
+            marker = _MARKERS[forms.index((row.method, row.layout))]
             axes.plot([row.seconds], [row.error], marker, color=colour, ms=8, mec="white", mew=0.6, zorder=3)
         _draw_front(axes, pareto_front([(row.seconds, row.error) for row in here]))
         _log_log(axes)
@@ -175,14 +177,19 @@ def solver_costs(rows: Sequence[SolverRow], width: float = 8.6) -> Figure:
         axes.set_title(rf"relative $\lambda$ {lam:.0e}", fontsize=_FONT)
         axes.set_xlabel("wall time [s]", fontsize=_FONT)
     panels[0].set_ylabel("relative error of the image [1]", fontsize=_FONT)
-    shown: list[Any] = [Line2D([], [], ls="", marker="o", color=c, ms=8) for c in (BLUE, ORANGE, VERMILION)]
-    shown = shown[: len(precisions)] + [
-        Line2D([], [], ls="", marker=_MARKERS[index % len(_MARKERS)], color="#9ca3af", ms=8)
-        for index in range(len(forms))
+    grey = "#9ca3af"
+    entries = [(Line2D([], [], ls="", marker="o", color=colours[i], ms=8), name) for i, name in enumerate(precisions)]
+    entries.append((panels[0].lines[-1], _BEST))
+    marks = [
+        (Line2D([], [], ls="", marker=_MARKERS[i], color=grey, ms=8), f"{method}, {layout}")
+        for i, (method, layout) in enumerate(forms)
     ]
-    shown.append(panels[0].lines[-1])
-    names = [*precisions, *(f"{method}, {layout}" for method, layout in forms), _BEST]
-    figure.legend(shown, names, fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=4)
+    # A legend is filled column by column: one row for the colours, one for the markers.
+    empty = (Line2D([], [], ls=""), "")
+    both = [entry for pair in zip_longest(entries, marks, fillvalue=empty) for entry in pair]
+    figure.legend(
+        *zip(*both, strict=True), fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=len(both) // 2
+    )
     return figure
 
 

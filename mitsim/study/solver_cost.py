@@ -51,6 +51,7 @@ REPEATS = 3
 _SCENE_PIXELS, _DOTS, _SCENE_WIDTH = 128, 7, 120.0
 _DIGITS = 1e-18
 _FRACTION_BITS = 160
+_DIVERGED = 10.0
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,11 @@ class Problem:
     def patterns(self) -> FloatArray:
         """(n, k) pattern columns of both sides."""
         return dots(len(self.image), self.k)
+
+    @property
+    def largest_power(self) -> float:
+        """Largest squared singular value of the whole model, what lambda_rel is relative to; both sides are equal."""
+        return max(float(np.linalg.norm(self.factor[:, i :: self.k], 2)) for i in range(self.k)) ** 4
 
 
 def dots(n: int, k: int) -> FloatArray:
@@ -127,9 +133,7 @@ def solver_costs(
     with single_threaded_blas():
         problem = problem or make_problem(paper_factor(), _DOTS, seed)
         progress("solver", 0.05)
-        # (sigma_L sigma_R)^2 of the largest singular values: of the blocks' Gram matrices, which are the same on both
-        # sides.
-        scale = max(float(np.linalg.norm(problem.factor[:, i :: problem.k], 2)) for i in range(problem.k)) ** 4
+        scale = problem.largest_power
         judge = Judge(problem)
         answers = []
         for index, relative in enumerate(LAMBDAS):
@@ -239,8 +243,10 @@ class Judge:
         for _ in range(20):
             residual = whole_lam * (target - gap) - self._gram[i] @ gap @ self._gram[j]
             correction = left @ (left.T @ _double(residual, unit + _FRACTION_BITS) @ right / weight) @ right.T
-            gap = gap + _whole(correction, _FRACTION_BITS)
             found = float(np.linalg.norm(correction)) / size
+            if not found < _DIVERGED:
+                break
+            gap = gap + _whole(correction, _FRACTION_BITS)
             if found < _DIGITS:
                 return _double(target - gap, _FRACTION_BITS), found
         raise MitsimError(f"solver study: the exact image did not settle ({found:.1e} left); raise lambda ({lam:g})")
