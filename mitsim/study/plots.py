@@ -102,9 +102,7 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None, width: f
     return _error_dots(sorted(errors.items(), key=lambda item: item[1]), limit, width)
 
 
-def effect_costs(
-    rows: Sequence[tuple[str, float, float]], limit: float | None = None, unit: str = "s", width: float = 8.6
-) -> Figure:
+def effect_costs(rows: Sequence[tuple[str, float, float]], limit: float | None = None, width: float = 8.6) -> Figure:
     """What each effect buys and costs: rows (name, error when it is left out, seconds it takes), largest error on top.
 
     An error of 0 has no dot, and its row stands at the bottom. Error and seconds are columns beside the axes.
@@ -113,7 +111,7 @@ def effect_costs(
     figure = _error_dots([(name, error) for name, error, _ in ordered], limit, width)
     axes = figure.axes[0]
     for place, (_, _, seconds) in enumerate(ordered):
-        _beside(axes, place, 76, f"{seconds:.2g} {unit}")
+        _beside(axes, place, 76, f"{seconds:.2g} s")
     for points, heading in ((8, "error"), (76, "takes")):
         _beside(axes, len(ordered) - 0.2, points, heading, color="#6b7280")
     axes.set_xlabel("relative error of the frames if left out [1]", fontsize=_FONT)

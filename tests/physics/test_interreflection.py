@@ -152,23 +152,23 @@ def test_radiance_of_one_reflection_is_that_of_its_irradiance() -> None:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_corner(small_scene: Callable[..., Path], name: str) -> None:
     rho = 0.8
-    found = ESTIMATORS[name](write_corner(small_scene, rho), 512, 7)
+    found = ESTIMATORS[name](write_corner(small_scene, rho), 256, 7)
     corner, places = Corner(rho, N, K), np.array([1, -1]) * HALF / 2
     expected = np.array([[corner.expected(x, y) for x in places] for y in places])  # row 0 at +y, column 0 at +x
     one, more = expected.transpose(2, 3, 0, 1)
     check(found.one, found.one_error, one, 1e-5, 0.01, "one reflection")
-    check(found.more, found.more_error, more, JUDGE_ERROR, 0.01, "more reflections")
+    check(found.more, found.more_error, more, JUDGE_ERROR, 0.015, "more reflections")
 
 
-@pytest.mark.parametrize(("rho", "spp"), [(0.5, 512), (0.9, 256)])
+@pytest.mark.parametrize("rho", [0.5, 0.9])
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_furnace(small_scene: Callable[..., Path], name: str, rho: float, spp: int) -> None:
+def test_furnace(small_scene: Callable[..., Path], name: str, rho: float) -> None:
     scene = write_scene(small_scene, "furnace", SPHERE.format(rho=rho))
-    found, furnace = ESTIMATORS[name](scene, spp, 11), Furnace(rho)
+    found, furnace = ESTIMATORS[name](scene, 256, 11), Furnace(rho)
     tan_half = float(np.tan(np.radians(10)))
     share = np.outer([8, 7], [8, 7]).ravel() / N**2  # of the window's pixels: rows and columns 0, 2, ... and 1, 3, ...
     expected = furnace.indirect(tan_half) * np.broadcast_to(share[:, None, None], (K**2, 2, 2))
-    check(found.more, found.more_error, expected, 0.0, 0.02, "more reflections")
+    check(found.more, found.more_error, expected, 0.0, 0.03, "more reflections")
     # Of one reflection, all classes and the whole sensor together: quadrature at the centre, falloff is second order.
     one, error = found.one.mean(axis=(1, 2)).sum(), np.linalg.norm(found.one_error) / K**2
     assert abs(one - furnace.direct()) < SIGMAS * error + 1e-4 * one < 0.01 * one
