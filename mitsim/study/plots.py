@@ -6,20 +6,31 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from mitsim.study.solver_cost import SolverRow
 
 # Okabe and Ito's palette: distinct in all common forms of colour blindness, and in grey.
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
 PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+_GRID = "#e5e7eb"
 _FONT = 11.0  # points
+_BEST = "best for its time"
+Point = tuple[float, float]
+"""Wall seconds, relative error."""
 
 
 def frame(values: ArrayLike, unit: str = "DN", width: float = 3.6) -> Figure:
@@ -88,33 +99,95 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None, width: f
 
     The values stand in a column beside the axes, where no line can cross them.
     """
-    ordered = sorted(errors.items(), key=lambda item: item[1])
-    figure, axes = _figure(width, 0.7 + 0.36 * len(ordered))
-    values = np.array([value for _, value in ordered], dtype=np.float64)
-    reference = values if limit is None else np.append(values, limit)
-    left = 10.0 ** np.floor(np.log10(reference.min()) - 0.3)
-    axes.hlines(range(len(values)), left, values, color="#d1d5db", lw=2)
-    axes.plot(values, np.arange(len(values)), "o", color=BLUE, ms=8, zorder=3)
-    for row, value in enumerate(values):
-        axes.text(1.02, row, f"{value:.1e}", transform=axes.get_yaxis_transform(), va="center", fontsize=_FONT)
-    if limit is not None:
-        axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
-        axes.annotate(
-            f"accuracy asked for: {limit:g}",
-            (limit, 1.0),
-            (4, 3),
-            xycoords=("data", "axes fraction"),
-            textcoords="offset points",
-            color=VERMILION,
-            fontsize=_FONT - 1,
-        )
-    axes.set_xscale("log")
-    axes.set_xlim(left, 3.0 * reference.max())
-    axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=_FONT)
-    axes.set_ylim(-0.6, len(values) - 0.4)
-    axes.set_xlabel("relative error [1]", fontsize=_FONT)
-    axes.grid(True, axis="x", which="major", color="#e5e7eb")
-    axes.set_axisbelow(True)
+    return _error_dots(sorted(errors.items(), key=lambda item: item[1]), limit, width)
+
+
+def effect_costs(rows: Sequence[tuple[str, float, float]], limit: float | None = None, width: float = 8.6) -> Figure:
+    """What each effect buys and costs: rows (name, error when it is left out, seconds it takes), largest error on top.
+
+    An error of 0 has no dot, and its row stands at the bottom. Error and seconds are columns beside the axes.
+    """
+    ordered = sorted(rows, key=lambda row: row[1])
+    figure = _error_dots([(name, error) for name, error, _ in ordered], limit, width)
+    axes = figure.axes[0]
+    for place, (_, _, seconds) in enumerate(ordered):
+        _beside(axes, place, 76, f"{seconds:.2g} s")
+    for points, heading in ((8, "error"), (76, "takes")):
+        _beside(axes, len(ordered) - 0.2, points, heading, color="#6b7280")
+    axes.set_xlabel("relative error of the frames if left out [1]", fontsize=_FONT)
+    return figure
+
+
+def pareto_front(points: Sequence[Point]) -> list[Point]:
+    """Points that no other beats in both seconds and error, fastest first."""
+    front: list[Point] = []
+    for seconds, error in sorted(points):
+        if not front or error < front[-1][1]:
+            front.append((seconds, error))
+    return front
+
+
+def pareto(
+    series: Mapping[str, Sequence[Point]],
+    front: Sequence[Point] | None = None,
+    noise: float | None = None,
+    width: float = 8.6,
+) -> Figure:
+    """Error against wall seconds of several ways to the same result, log-log, {name: [(seconds, error), ...]}.
+
+    ``front`` are the points that nothing beats (found among all when not given), joined by a staircase: the best error
+    to be had in a given time. ``noise``: relative error that the sensor's noise makes anyway, a horizontal line.
+    """
+    figure, axes = _figure(width, 0.55 * width)
+    for index, (name, points) in enumerate(series.items()):
+        seconds, error = zip(*sorted(points), strict=True)
+        colour, marker = PALETTE[index % len(PALETTE)], _MARKERS[index % len(_MARKERS)]
+        axes.plot(seconds, error, marker + "-", color=colour, lw=1.2, ms=7, label=name, zorder=3)
+    _draw_front(axes, pareto_front([p for points in series.values() for p in points]) if front is None else front)
+    if noise is not None:
+        axes.axhline(noise, color="#6b7280", lw=1.8, ls="--", label=f"sensor noise, {noise:.1e}")
+    _log_log(axes)
+    axes.set_xlabel("wall time for all frames [s]", fontsize=_FONT)
+    axes.set_ylabel("relative error of the frames [1]", fontsize=_FONT)
+    axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    return figure
+
+
+def solver_costs(rows: Sequence[SolverRow], width: float = 8.6) -> Figure:
+    """Error of the image against seconds of the solver, a panel for each lambda; points that nothing beats ringed."""
+    lambdas = sorted({row.lambda_rel for row in rows}, reverse=True)
+    figure, _ = _figure(width, 0.55 * width)
+    figure.clear()
+    panels: Any = figure.subplots(1, len(lambdas), sharex=True, sharey=True, squeeze=False)[0]
+    colours = (BLUE, ORANGE, VERMILION, GREEN)
+    precisions = list(dict.fromkeys(row.precision for row in rows))
+    forms = list(dict.fromkeys((row.method, row.layout) for row in rows))
+    for axes, lam in zip(panels, lambdas, strict=True):
+        here = [row for row in rows if row.lambda_rel == lam]
+        for row in here:
+            colour = colours[precisions.index(row.precision)]
+            marker = _MARKERS[forms.index((row.method, row.layout))]
+            axes.plot([row.seconds], [row.error], marker, color=colour, ms=8, mec="white", mew=0.6, zorder=3)
+        _draw_front(axes, pareto_front([(row.seconds, row.error) for row in here]))
+        _log_log(axes)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=_FONT - 1)
+        axes.set_title(rf"relative $\lambda$ {lam:.0e}", fontsize=_FONT)
+        axes.set_xlabel("wall time [s]", fontsize=_FONT)
+    panels[0].set_ylabel("relative error of the image [1]", fontsize=_FONT)
+    grey = "#9ca3af"
+    entries = [(Line2D([], [], ls="", marker="o", color=colours[i], ms=8), name) for i, name in enumerate(precisions)]
+    entries.append((panels[0].lines[-1], _BEST))
+    marks = [
+        (Line2D([], [], ls="", marker=_MARKERS[i], color=grey, ms=8), f"{method}, {layout}")
+        for i, (method, layout) in enumerate(forms)
+    ]
+    # A legend is filled column by column: one row for the colours, one for the markers.
+    empty = (Line2D([], [], ls=""), "")
+    both = [entry for pair in zip_longest(entries, marks, fillvalue=empty) for entry in pair]
+    figure.legend(
+        *zip(*both, strict=True), fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=len(both) // 2
+    )
     return figure
 
 
@@ -143,6 +216,67 @@ def seconds_by_stage(seconds: Mapping[str, float], width: float = 8.6) -> Figure
     axes.grid(True, axis="x", color="#e5e7eb")
     axes.set_axisbelow(True)
     return figure
+
+
+def _error_dots(ordered: Sequence[tuple[str, float]], limit: float | None, width: float) -> Figure:
+    """Dots for values >= 0 in the order given, the last on top, each with its value beside the axes."""
+    figure, axes = _figure(width, 0.7 + 0.36 * len(ordered))
+    values = np.array([value for _, value in ordered], dtype=np.float64)
+    reference = np.append(values[values > 0], [] if limit is None else limit)
+    low, high = (reference.min(), reference.max()) if reference.size else (1e-3, 1e-3)
+    left = 10.0 ** np.floor(np.log10(low) - 0.3)
+    seen = np.flatnonzero(values > 0)
+    axes.hlines(seen, left, values[seen], color="#d1d5db", lw=2)
+    axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
+    for row, value in enumerate(values):
+        _beside(axes, row, 8, f"{value:.1e}" if value > 0 else "0")
+    if limit is not None:
+        axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
+        axes.annotate(
+            f"accuracy asked for: {limit:g}",
+            (limit, 1.0),
+            (4, 3),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            color=VERMILION,
+            fontsize=_FONT - 1,
+        )
+    axes.set_xscale("log")
+    axes.set_xlim(left, 3.0 * high)
+    axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=_FONT)
+    axes.set_ylim(-0.6, len(values) - 0.4)
+    axes.set_xlabel("relative error [1]", fontsize=_FONT)
+    axes.grid(True, axis="x", which="major", color=_GRID)
+    axes.set_axisbelow(True)
+    return figure
+
+
+def _beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> None:
+    """Text at a row, some points to the right of the axes."""
+    where: Any = axes.get_yaxis_transform()
+    axes.annotate(
+        text, (1.0, row), (points, 0), xycoords=where, textcoords="offset points", va="center", fontsize=_FONT, **style
+    )
+
+
+def _draw_front(axes: Axes, front: Sequence[Point]) -> None:
+    """Rings around the points of a Pareto front and the staircase that joins them."""
+    seconds, error = zip(*sorted(front), strict=True)
+    style: dict[str, Any] = {"color": "#6b7280", "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
+    axes.plot(seconds, error, "o", ms=13, mfc="none", mec="#6b7280", mew=1.3, label=_BEST, **style)
+
+
+def _log_log(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    low, high = axes.dataLim.intervalx
+    if high < 30 * low:
+        # Ticks at powers of ten alone would leave a short axis with one or none.
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(True, which="major", color=_GRID)
+    axes.set_axisbelow(True)
 
 
 def _figure(

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from itertools import product
 
 import numpy as np
 
 from mitsim.study import plots
+from mitsim.study.solver_cost import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
+
+SOLVER_ROWS = [
+    SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
+    for lam in LAMBDAS
+    for index, (method, precision, layout) in enumerate(product(METHODS, PRECISIONS, LAYOUTS))
+]
 
 
 def test_every_axis_has_a_unit() -> None:
@@ -17,6 +25,9 @@ def test_every_axis_has_a_unit() -> None:
         plots.error_bars({"a": 1e-3}, 1e-2),
         plots.seconds_by_stage({"a": 1.0}),
         plots.quality_bars(["a"], [20.0], [10.0]),
+        plots.pareto({"a": [(1.0, 0.1)]}),
+        plots.effect_costs([("a", 1e-3, 0.1)]),
+        plots.solver_costs(SOLVER_ROWS),
     )
     for figure in figures:
         axes = figure.axes[0]
@@ -72,6 +83,56 @@ def test_seven_families_can_be_told_apart() -> None:
     lines = plots.singular_values({str(k): np.ones(2) for k in range(7)}).axes[0].lines
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 7
     assert len({line.get_color() for line in lines}) == 7
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    points = [(3.0, 0.1), (1.0, 1.0), (2.0, 0.5), (2.5, 0.5), (1.0, 2.0), (4.0, 0.2)]
+    assert plots.pareto_front(points) == [(1.0, 1.0), (2.0, 0.5), (3.0, 0.1)]
+
+
+def test_pareto_rings_the_front_and_draws_the_noise() -> None:
+    series = {"a": [(1.0, 0.5), (3.0, 0.1)], "b": [(2.0, 0.6), (4.0, 0.05)]}
+    axes = plots.pareto(series, noise=0.2).axes[0]
+    lines = {str(line.get_label()): line for line in axes.lines}
+    ring = lines["best for its time"]
+    assert list(zip(*ring.get_data(), strict=True)) == [(1.0, 0.5), (3.0, 0.1), (4.0, 0.05)]
+    assert list(np.asarray(lines["sensor noise, 2.0e-01"].get_ydata())) == [0.2, 0.2]
+    given = plots.pareto(series, front=[(2.0, 0.6)]).axes[0]
+    assert [list(line.get_xdata()) for line in given.lines if line.get_label() == "best for its time"] == [[2.0]]
+
+
+def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
+    series = {f"a rather long name {index}": [(10.0**index, 10.0**-index)] for index in range(7)}
+    for figure in (plots.pareto(series, noise=0.2), plots.solver_costs(SOLVER_ROWS)):
+        figure.canvas.draw()
+        legend = (figure.legends or [figure.axes[0].get_legend()])[0]
+        box = legend.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
+        assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
+
+
+def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
+    figure = plots.solver_costs(SOLVER_ROWS)
+    for axes, lam in zip(figure.axes, LAMBDAS, strict=True):
+        assert axes.get_title().endswith(f"{lam:.0e}")
+        shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
+        assert sorted(shown) == sorted((row.seconds, row.error) for row in SOLVER_ROWS if row.lambda_rel == lam)
+    looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines[:-1]}
+    assert len(looks) == len(METHODS) * len(LAYOUTS) * len(PRECISIONS)
+
+
+def test_effects_are_sorted_and_columns_do_not_touch() -> None:
+    rows = [("nothing", 0.0, 0.0), ("a long name of an effect, with its parts", 1e-5, 0.0021), ("large", 0.4, 1.7)]
+    figure = plots.effect_costs(rows, limit=1e-3)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == [name for name, _, _ in rows]
+    written = {text.get_text(): text.get_window_extent() for text in axes.texts}
+    for error, seconds in (("0", "0 s"), ("1.0e-05", "0.0021 s"), ("4.0e-01", "1.7 s"), ("error", "takes")):
+        assert axes.get_window_extent().x1 < written[error].x0
+        assert written[error].x1 + 5 < written[seconds].x0 and written[seconds].x1 < figure.bbox.x1
+    assert list(axes.lines[0].get_xdata()) == [1e-5, 0.4], "an error of 0 has no place on a logarithmic axis"
+    plots.effect_costs([("only", 0.0, 0.0)]).canvas.draw()
 
 
 def test_no_pyplot_is_loaded() -> None:

@@ -1,0 +1,264 @@
+"""What the solver's accuracy costs: forms of the solution in, error of the image against seconds out.
+
+At the paper's geometry (49 dots, 49 frames of 512 x 512, an image of 128 x 128) the noise-free frames of a random image
+are solved in every combination of
+
+* method: ``svd`` of the stacked matrix, or the paper's ``gram`` matrices;
+* layout: ``block`` (each group of scene pixels that shares no pattern alone) or ``full``;
+* precision: ``float64``; ``float32 frames``, stored in single precision and summed in double; ``float32 products``,
+  where frames and slabs are multiplied in single precision as well (computed here: the solver does not offer it).
+
+Seconds count what one reconstruction takes: prepare, add all frames, solve; best of REPEATS, BLAS kept to one thread.
+
+The judge. For frames of the model without rounding, Y_ij = Phi (P_ij o X0) Phi^T, the Tikhonov image satisfies
+A E A + lambda E = lambda X0 with E = X0 - X, block by block, A = Phi_r^T Phi_r. E is refined from zero: residuals in
+exact integer arithmetic, corrections in double precision. Nothing of :mod:`mitsim.reconstruct` is in it. Its own error
+is the size of its last correction. Errors include the rounding of the frames, which are computed in double precision.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
+from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.mask import mls_mask
+from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.reconstruct.factors import Method, Structure
+from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.study.metrics import relative_error
+
+FloatArray = npt.NDArray[np.float64]
+Progress = Callable[[str, float], None]
+Precision = Literal["float64", "float32 frames", "float32 products"]
+Timed = list[tuple[float, FloatArray]]
+PRECISIONS: tuple[Precision, ...] = ("float64", "float32 frames", "float32 products")
+METHODS: tuple[Method, ...] = ("svd", "gram")
+LAYOUTS: tuple[Structure, ...] = ("block", "full")
+LAMBDAS = (1e-4, 1e-8, 1e-12)
+REPEATS = 3
+_SCENE_PIXELS, _DOTS, _SCENE_WIDTH = 128, 7, 120.0
+_DIGITS = 1e-18
+_FRACTION_BITS = 160
+_DIVERGED = 10.0
+
+
+@dataclass(frozen=True)
+class SolverRow:
+    """One form of the solution at one lambda.
+
+    ``lambda_rel`` is lambda over the largest squared singular value; ``seconds`` wall time of one reconstruction;
+    ``error`` relative, against the exact image; ``judge_error`` what that image is uncertain by, relative.
+    """
+
+    method: str
+    precision: str
+    layout: str
+    lambda_rel: float
+    seconds: float
+    error: float
+    judge_error: float
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Noise-free measurement of one image: ``factor`` Phi (m, n) of both sides, ``k`` x ``k`` shifting dots.
+
+    ``frames`` are (k * k, m, m), pattern (i, j) at i k + j.
+    """
+
+    factor: FloatArray
+    k: int
+    image: FloatArray
+    frames: FloatArray
+
+    @property
+    def patterns(self) -> FloatArray:
+        """(n, k) pattern columns of both sides."""
+        return dots(len(self.image), self.k)
+
+    @property
+    def largest_power(self) -> float:
+        """Largest squared singular value of the whole model, what lambda_rel is relative to; both sides are equal."""
+        return max(float(np.linalg.norm(self.factor[:, i :: self.k], 2)) for i in range(self.k)) ** 4
+
+
+def dots(n: int, k: int) -> FloatArray:
+    """(n, k) shifting dots."""
+    return np.asarray(np.arange(n)[:, None] % k == np.arange(k), dtype=np.float64)
+
+
+def paper_factor() -> FloatArray:
+    """Phi (512, 128) of the paper's camera and scene: both sides of its idealised model."""
+    camera = CameraGeometry.checked("the paper's camera")
+    scene = centred_edges(_SCENE_PIXELS, _SCENE_WIDTH / _SCENE_PIXELS)
+    mask = mls_mask(camera.mask, camera.mask_feature, camera.mask_order)
+    return scene_factor(
+        mask.terms[0][1], mask.feature_mm, camera.pixel_edges, scene, camera.mask_distance, camera.scene_distance
+    )
+
+
+def make_problem(factor: FloatArray, k: int, seed: int) -> Problem:
+    """A random image in 0..1 and its frames through ``factor``."""
+    image = stream(seed, "solver cost").random((factor.shape[1],) * 2)
+    sides = [factor[:, i::k] for i in range(k)]
+    frames = [sides[i] @ image[i::k, j::k] @ sides[j].T for i, j in product(range(k), repeat=2)]
+    return Problem(factor, k, image, np.stack(frames))
+
+
+def solver_costs(
+    seed: int, progress: Progress, problem: Problem | None = None, repeats: int = REPEATS
+) -> tuple[SolverRow, ...]:
+    """Error and seconds of every form at every lambda of LAMBDAS.
+
+    ``problem`` is the paper's geometry unless another is given.
+
+    Raises
+    ------
+    MitsimError
+        for a model too ill-conditioned for the judge to reach its own precision.
+    """
+    with single_threaded_blas():
+        problem = problem or make_problem(paper_factor(), _DOTS, seed)
+        progress("solver", 0.05)
+        scale = problem.largest_power
+        judge = Judge(problem)
+        answers = []
+        for index, relative in enumerate(LAMBDAS):
+            answers.append(judge.image(relative * scale))
+            progress("solver", 0.05 + 0.35 * (index + 1) / len(LAMBDAS))
+        single = problem.frames.astype(np.float32)
+        forms = list(product(METHODS, LAYOUTS, PRECISIONS))
+        measured: dict[tuple[Method, Structure, Precision], list[Timed]] = {form: [] for form in forms}
+        # Round by round rather than form by form, so that a busy moment does not fall on one form alone.
+        for index, (_, form) in enumerate(product(range(repeats), forms)):
+            frames = problem.frames if form[2] == "float64" else single
+            measured[form].append(_reconstruct(problem, frames, *form, scale))
+            progress("solver", 0.4 + 0.6 * (index + 1) / (repeats * len(forms)))
+    return tuple(
+        SolverRow(
+            method=method,
+            precision=precision,
+            layout=layout,
+            lambda_rel=relative,
+            seconds=min(timed[index][0] for timed in found),
+            error=relative_error(found[-1][index][1], answers[index][0]),
+            judge_error=answers[index][1],
+            seed=seed,
+        )
+        for (method, layout, precision), found in measured.items()
+        for index, relative in enumerate(LAMBDAS)
+    )
+
+
+def _reconstruct(
+    problem: Problem,
+    frames: npt.NDArray[Any],
+    method: Method,
+    layout: Structure,
+    precision: Precision,
+    scale: float,
+) -> Timed:
+    """(seconds, image) for every lambda: they share the factorisation and the sums, and each is charged with both."""
+    patterns, add = problem.patterns, _add_single if precision == "float32 products" else _add
+    started = time.perf_counter()
+    prepared = prepare(problem.factor, problem.factor, patterns, patterns, method=method, structure=layout)
+    solve = add(prepared, frames, problem.k)
+    shared = time.perf_counter() - started
+    found = []
+    for relative in LAMBDAS:
+        started = time.perf_counter()
+        image = solve(relative * scale)
+        found.append((shared + time.perf_counter() - started, image))
+    return found
+
+
+def _add(prepared: Prepared, frames: npt.NDArray[Any], k: int) -> Callable[[float], FloatArray]:
+    """The solver as it is: frames added, then lambda to image."""
+    sums = prepared.accumulator()
+    for index, frame in enumerate(frames):
+        sums.add(frame, *divmod(index, k))
+    return lambda lam: prepared.solve(sums, lam).image
+
+
+def _add_single(prepared: Prepared, frames: npt.NDArray[Any], k: int) -> Callable[[float], FloatArray]:
+    """The same with slabs and products in single precision; sums and what follows in double."""
+    slabs = [(slab.columns, slab.matrix.astype(np.float32)) for slab in prepared.left.slabs]
+    total = np.zeros((prepared.left.accumulated_size,) * 2)
+    for index, frame in enumerate(frames):
+        (rows, left), (columns, right) = (slabs[i] for i in divmod(index, k))
+        where: Any = (rows, columns)
+        if isinstance(rows, np.ndarray) and isinstance(columns, np.ndarray):
+            where = np.ix_(rows, columns)
+        total[where] += left.T @ (frame @ right)
+    sigma = np.outer(prepared.left.singular, prepared.right.singular)
+    if not prepared.left.projected:
+        # The paper's Q: rotated, it is sigma W.
+        rotated = prepared.left.basis.T @ total @ prepared.right.basis
+        total = np.divide(rotated, sigma, out=np.zeros_like(sigma), where=sigma > 0)
+    return lambda lam: prepared.image(np.where(sigma > 0, sigma * total / (np.square(sigma) + lam), 0.0))
+
+
+class Judge:
+    """The Tikhonov image of a problem's exact frames, by refinement with residuals in exact integer arithmetic."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._image, self._k = problem.image, problem.k
+        # A double is a whole number times a power of two: in units of the smallest such power, Phi is whole.
+        self._bits = 53 - int(np.frexp(problem.factor[problem.factor != 0])[1].min())
+        whole = _whole(problem.factor, self._bits)
+        blocks = [whole[:, i :: self._k] for i in range(self._k)]
+        self._gram = [block.T @ block for block in blocks]  # units of 2^(-2 bits)
+        self._eigen = [np.linalg.eigh(_double(gram, 2 * self._bits)) for gram in self._gram]
+
+    def image(self, lam: float) -> tuple[FloatArray, float]:
+        """X (n, n) for lambda > 0, rounded to double precision, and its relative error (that of X before rounding)."""
+        image, largest = np.empty_like(self._image), 0.0
+        for i, j in product(range(self._k), repeat=2):
+            here = (slice(i, None, self._k), slice(j, None, self._k))
+            image[here], error = self._block(i, j, self._image[here], lam)
+            largest = max(largest, error)
+        return image, largest
+
+    def _block(self, i: int, j: int, truth: FloatArray, lam: float) -> tuple[FloatArray, float]:
+        unit = 4 * self._bits
+        whole_lam = int(Fraction(lam) * 2**unit)
+        (left_values, left), (right_values, right) = self._eigen[i], self._eigen[j]
+        weight = np.outer(left_values, right_values) + lam
+        target = _whole(truth, _FRACTION_BITS)
+        gap: Any = np.zeros_like(target)  # E, units of 2^-160
+        size = float(np.linalg.norm(truth))
+        for _ in range(20):
+            residual = whole_lam * (target - gap) - self._gram[i] @ gap @ self._gram[j]
+            correction = left @ (left.T @ _double(residual, unit + _FRACTION_BITS) @ right / weight) @ right.T
+            found = float(np.linalg.norm(correction)) / size
+            if not found < _DIVERGED:
+                break
+            gap = gap + _whole(correction, _FRACTION_BITS)
+            if found < _DIGITS:
+                return _double(target - gap, _FRACTION_BITS), found
+        raise MitsimError(f"solver study: the exact image did not settle ({found:.1e} left); raise lambda ({lam:g})")
+
+
+def _whole(values: FloatArray, bits: int) -> Any:
+    """Object array of Python integers: values in units of 2^-bits, cut to whole ones."""
+    flat = [int(math.ldexp(value, bits)) for value in values.ravel().tolist()]
+    return np.array(flat, dtype=object).reshape(values.shape)
+
+
+def _double(values: Any, bits: int) -> FloatArray:
+    """Integers in units of 2^-bits, rounded to double precision."""
+    unit = 2**bits
+    return np.array([value / unit for value in values.ravel().tolist()], dtype=np.float64).reshape(values.shape)
