@@ -16,8 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError
+from mitsim.optics.diffraction import Spectrum, wave_terms
 from mitsim.optics.mask import Mask, MaskKind, mls_mask
-from mitsim.optics.shadow import centred_edges, shadow_factor
+from mitsim.optics.shadow import Directions, SeparableTerms, Setting, centred_edges, geometric_terms
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -32,15 +33,23 @@ class CameraGeometry(BaseModel):
     mask: MaskKind = Field("separable", description="mask construction")
     mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
     mask_feature: float = Field(0.06, gt=0, description="mask feature size [mm]")
-    mask_distance: float = Field(2.0, gt=0, description="sensor to mask [mm]")
+    mask_distance: float = Field(2.0, gt=0, description="sensor to the mask's near face [mm]")
+    mask_thickness: float = Field(0.0, ge=0, description="mask thickness [mm]; 0 is a thin mask")
     scene_distance: float = Field(400.0, gt=0, description="sensor to the plane that the rig is aligned to [mm]")
     fov: float = Field(20.0, gt=0, lt=180, description="full angle of the square field stop [degrees]")
+    pixel_fill_factor: float = Field(
+        1.0, gt=0, le=1, description="part of a pixel that is active, a centred square; 1 is the whole pixel"
+    )
+    angular_exponent: float = Field(
+        0.0, ge=0, le=100, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
+    )
 
     @model_validator(mode="after")
     def _mask_lies_before_the_scene(self) -> CameraGeometry:
-        if self.mask_distance >= self.scene_distance:
+        if self.mask_distance + self.mask_thickness >= self.scene_distance:
             raise ValueError(
-                f"mask_distance {self.mask_distance} mm must be less than scene_distance {self.scene_distance} mm"
+                f"mask_distance {self.mask_distance} mm plus mask_thickness {self.mask_thickness} mm must be less than "
+                f"scene_distance {self.scene_distance} mm"
             )
         return self
 
@@ -72,25 +81,48 @@ class CameraGeometry(BaseModel):
         """a^2 / (lambda d) of one mask feature: well above 1 means that a geometric shadow is good."""
         return self.mask_feature**2 / (wavelength_nm * 1e-6 * self.mask_distance)
 
-    def shadow_terms(
-        self, row_edges: FloatArray, column_edges: FloatArray, depth: float
-    ) -> list[tuple[FloatArray, FloatArray]]:
-        """Geometric shadow of tan-angle cells at one depth as separable terms: [(left (m, r), right (m, c)), ...].
+    @property
+    def wall_shift_features(self) -> float:
+        """Largest shift between a mask's two faces along a ray that passes the field stop, in features.
 
-        The weight of each term is folded into its left factor. Edges are tan-angles x/z in index coordinates.
+        The two-face model of a thick mask needs it below 1: beyond, a ray may cross a wall between the faces.
         """
-        mask, edges = self.build_mask(), self.pixel_edges
-        cache: dict[tuple[int, int], FloatArray] = {}
+        return self.mask_thickness * self.tan_half_fov / self.mask_feature
 
-        def factor(profile: FloatArray, cells: FloatArray) -> FloatArray:
-            key = (hash(profile.tobytes()), hash(cells.tobytes()))
-            if key not in cache:
-                cache[key] = shadow_factor(profile, mask.feature_mm, edges, cells, self.mask_distance, depth)
-            return cache[key]
+    @property
+    def active_side(self) -> float:
+        """Side of a pixel's active square [mm]."""
+        return self.pixel_pitch * math.sqrt(self.pixel_fill_factor)
 
-        return [
-            (weight * factor(rows, row_edges), factor(columns, column_edges)) for weight, rows, columns in mask.terms
-        ]
+    def angular_response(self, squared_tan: FloatArray) -> FloatArray:
+        """A pixel's response, relative to normal incidence, to rays of the given tan^2(theta): cos^n(theta)."""
+        return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
+
+    def shadow_terms(
+        self, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None = None
+    ) -> SeparableTerms:
+        """Shadow on each pixel of directions at one depth, as separable terms: [(left (m, r), right (m, c)), ...].
+
+        Geometric, or with a ``spectrum`` wave-optical: then each wavelength has its own terms, weighted by its share.
+        The mean over a pixel's active area times the fill factor: irradiance is per pixel area. All weights are folded
+        into left. The angular response is not in here; it belongs to the light.
+        """
+        edges = self.pixel_edges
+        setting = Setting(
+            mask=self.build_mask(),
+            pixel_centres_mm=(edges[:-1] + edges[1:]) / 2,
+            active_mm=self.active_side,
+            distance_mm=self.mask_distance,
+            thickness_mm=self.mask_thickness,
+            depth_mm=depth,
+        )
+        if spectrum is None:
+            terms = geometric_terms(setting, rows, columns)
+        else:
+            terms = wave_terms(setting, rows, columns, spectrum)
+        if self.pixel_fill_factor == 1:
+            return terms
+        return [(self.pixel_fill_factor * left, right) for left, right in terms]
 
 
 def anchor_positions(count: int, half_width: float) -> FloatArray:

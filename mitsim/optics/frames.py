@@ -18,6 +18,7 @@ from scipy import sparse
 from mitsim.core.parallel import in_threads, workers
 from mitsim.core.seeds import stream
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
+from mitsim.optics.shadow import Directions
 
 FloatArray = npt.NDArray[np.float64]
 _AT_ONCE = 32
@@ -60,7 +61,7 @@ class FrameOptics:
         # Stored with the light's index first, so that picking lit rows copies contiguous memory.
         self._terms = [
             (_stack(left, weights), _stack(right, weights))
-            for left, right in geometry.shadow_terms(row_edges, column_edges, depth)
+            for left, right in geometry.shadow_terms(Directions.cells(row_edges), Directions.cells(column_edges), depth)
         ]
 
     def frame(self, flat: npt.NDArray[np.int64], light: FloatArray) -> FloatArray:

@@ -1,23 +1,178 @@
-"""Geometric shadow of a mask profile: from edges of sensor pixels and scene cells to mean transmissions.
+"""Geometric shadow of a mask: from sensor pixels and directions to mean transmissions, as separable terms.
 
 The ray from sensor coordinate u toward the direction tau = x/z, meeting the scene at depth z, crosses the
 mask plane (distance d) at s = u (1 - d/z) + d tau. The mean over a sensor pixel and a cell is the profile
 weighted by the density of s, the convolution of two boxes: a trapezoid. Its integral over each feature is a
 difference of a piecewise-quadratic distribution function, so the mean is exact. (Four corner values of the
 profile's second cumulative sum give the same number in exact arithmetic, but they cancel in float64: the
-sums reach N**2/2 features while the second difference is a hundredth of one.)
+sums reach N**2/2 features while the second difference is a hundredth of one.) Point directions leave the pixel's box.
+
+A thick mask has two faces, the entrance ``thickness`` further from the sensor than the exit. A ray of slope t (x/z seen
+from its sensor point) that leaves through s entered at s' = s + thickness t, and for a point source at (tau z, z) that
+is a function of s alone, whatever the sensor point::
+
+    s' = s (1 - thickness / (z - d)) + thickness tau / (1 - d/z)
+
+So each direction has its own clear profile M(s) M(s') on the exit face, and that profile's shadow is the thin mask's.
+A cell takes the clear profile of its centre.
 
 All coordinates are index coordinates, centred, in mm; tau is a pure number.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
+from mitsim.optics.aperture import Steps
+from mitsim.optics.mask import Mask
 
 FloatArray = npt.NDArray[np.float64]
+SeparableTerms = list[tuple[FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Directions along one axis, seen from the sensor's centre: equal cells, or points.
+
+    Attributes
+    ----------
+    centres
+        (c,) increasing tan-angles x/z (index coordinates), read-only.
+    width
+        width of each cell in tan-angle; 0 for point directions.
+    """
+
+    centres: FloatArray
+    width: float
+
+    def __post_init__(self) -> None:
+        centres = np.array(self.centres, dtype=np.float64)
+        if centres.ndim != 1 or centres.size == 0 or not np.isfinite(centres).all() or not (np.diff(centres) > 0).all():
+            raise MitsimError(f"directions of shape {centres.shape} are not finite increasing numbers; sort them")
+        if not (np.isfinite(self.width) and self.width >= 0):
+            raise MitsimError(f"width of directions is {self.width}; give a finite tan-angle, 0 for points")
+        centres.flags.writeable = False
+        object.__setattr__(self, "centres", centres)
+
+    @classmethod
+    def cells(cls, edges: npt.ArrayLike) -> Directions:
+        """The equal cells between ``edges`` (c + 1,); raises MitsimError for unequal ones."""
+        array = _checked_edges("cell edges", edges)
+        widths = np.diff(array)
+        width = float(array[-1] - array[0]) / len(widths)
+        if np.abs(widths - width).max() > 1e-6 * width:
+            raise MitsimError(f"cells of width {widths.min()} to {widths.max()} are not equal; give equal ones")
+        return cls((array[:-1] + array[1:]) / 2, width)
+
+    def same_as(self, other: Directions) -> bool:
+        """Whether the other directions are these, so that one shadow serves both axes."""
+        return self is other or (self.width == other.width and np.array_equal(self.centres, other.centres))
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """Sensor, mask and depth of one shadow.
+
+    Attributes
+    ----------
+    mask
+        the mask; both faces of a thick one carry it.
+    pixel_centres_mm
+        (m,) sensor coordinates.
+    active_mm
+        side of a pixel's active square [mm]; the shadow is averaged over it.
+    distance_mm, thickness_mm
+        sensor to the mask's exit face, d, and the mask's thickness [mm].
+    depth_mm
+        sensor to scene, z [mm], beyond the mask; ``inf`` is allowed.
+    """
+
+    mask: Mask
+    pixel_centres_mm: FloatArray
+    active_mm: float
+    distance_mm: float
+    thickness_mm: float
+    depth_mm: float
+
+    def __post_init__(self) -> None:
+        _require_beyond(self.depth_mm, self.distance_mm + self.thickness_mm)
+
+    @property
+    def shrink(self) -> float:
+        """d s / d u = 1 - d/z."""
+        return 1 - self.distance_mm / self.depth_mm
+
+    @property
+    def half_pixel(self) -> float:
+        """Half an active side seen on the mask [mm]."""
+        return self.active_mm * self.shrink / 2
+
+    def half_cell(self, directions: Directions) -> float:
+        """Half a cell seen on the mask [mm]."""
+        return self.distance_mm * directions.width / 2
+
+    def crossings(self, directions: Directions) -> FloatArray:
+        """(m, c) mask coordinates [mm] of rays from pixel centres toward the directions."""
+        return self.shrink * self.pixel_centres_mm[:, None] + self.distance_mm * directions.centres[None, :]
+
+    def weights(self) -> list[float]:
+        """Weight of each term of the clear aperture: the mask's own, or for a thick mask products of two of them."""
+        weights = [weight for weight, _, _ in self.mask.terms]
+        return [a * b for a in weights for b in weights] if self.thickness_mm else weights
+
+    def clear(self, profiles: Sequence[FloatArray], tau: float) -> list[Steps]:
+        """Clear profiles on the exit face toward ``tau``, in the order of :meth:`weights`."""
+        faces = [Steps.of(profile, self.mask.feature_mm) for profile in profiles]
+        if not self.thickness_mm:
+            return faces
+        scale = 1 - self.thickness_mm / (self.depth_mm - self.distance_mm)
+        shift = self.thickness_mm * tau / self.shrink
+        return [leaves.seen_through(enters, scale, shift) for leaves in faces for enters in faces]
+
+
+def both_axes(
+    setting: Setting,
+    rows: Directions,
+    columns: Directions,
+    axis: Callable[[list[FloatArray], Directions], FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """``axis(profiles, directions)`` of rows and columns; equal axes share one computation."""
+    terms = setting.mask.terms
+    row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
+    left = axis(row_profiles, rows)
+    if rows.same_as(columns) and np.array_equal(row_profiles, column_profiles):
+        return left, left
+    return left, axis(column_profiles, columns)
+
+
+def geometric_terms(setting: Setting, rows: Directions, columns: Directions) -> SeparableTerms:
+    """Geometric shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left."""
+    means = _thick_means if setting.thickness_mm else _thin_means
+    left, right = both_axes(setting, rows, columns, lambda profiles, at: means(setting, profiles, at))
+    return [(weight * a, b) for weight, a, b in zip(setting.weights(), left, right, strict=True)]
+
+
+def _thin_means(setting: Setting, profiles: list[FloatArray], directions: Directions) -> FloatArray:
+    """(terms, m, c) mean transmissions."""
+    feature = setting.mask.feature_mm
+    centre = setting.crossings(directions) / feature
+    half_pixel, half_cell = np.array(setting.half_pixel / feature), np.array(setting.half_cell(directions) / feature)
+    return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])
+
+
+def _thick_means(setting: Setting, profiles: list[FloatArray], directions: Directions) -> FloatArray:
+    """(terms, m, c) mean transmissions through both faces."""
+    crossings, half_cell = setting.crossings(directions), setting.half_cell(directions)
+    found = np.empty((len(setting.weights()), *crossings.shape))
+    for j, tau in enumerate(directions.centres):
+        for term, clear in enumerate(setting.clear(profiles, float(tau))):
+            found[term, :, j] = clear.box_means(crossings[:, j], setting.half_pixel, half_cell)
+    return found
 
 
 def centred_edges(count: int, pitch: float) -> FloatArray:
@@ -66,11 +221,11 @@ def shadow_factor(
         raise MitsimError(f"mask profile of shape {values.shape}; give a non-empty 1-D list of finite numbers")
     _require_positive("mask feature size", feature_mm)
     _require_positive("distance from sensor to mask", mask_distance_mm)
-    if not depth_mm > mask_distance_mm:
-        raise MitsimError(f"scene depth is {depth_mm} mm; it must lie beyond the mask at {mask_distance_mm} mm")
+    _require_beyond(depth_mm, mask_distance_mm)
     pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * (1 - mask_distance_mm / depth_mm) / feature_mm
     cells = _checked_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
-    return _trapezoid_mean(values, pixels, cells)
+    centre = (pixels[:-1] + pixels[1:])[:, None] / 2 + (cells[:-1] + cells[1:])[None, :] / 2
+    return _trapezoid_mean(values, centre, np.diff(pixels)[:, None] / 2, np.diff(cells)[None, :] / 2)
 
 
 def scene_factor(
@@ -87,14 +242,13 @@ def scene_factor(
     return shadow_factor(profile, feature_mm, pixel_edges_mm, tan_edges, mask_distance_mm, depth_mm)
 
 
-def _trapezoid_mean(profile: FloatArray, pixels: FloatArray, cells: FloatArray) -> FloatArray:
-    """Mean of the profile where s = (point of a pixel) + (point of a cell); both edge lists in features."""
-    half_pixel = np.diff(pixels)[:, None] / 2
-    half_cell = np.diff(cells)[None, :] / 2
-    pixel_centre = (pixels[:-1] + pixels[1:])[:, None] / 2
-    cell_centre = (cells[:-1] + cells[1:])[None, :] / 2
-    centre = pixel_centre + cell_centre + len(profile) / 2
-    reach = half_pixel + half_cell
+def _trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
+    """Mean of the profile around each crossing over two boxes of the given half-widths, which broadcast; in features.
+
+    ``half_b`` may be 0.
+    """
+    centre = crossing + len(profile) / 2
+    reach = half_a + half_b
     first = np.floor(centre - reach)
     feature = first.astype(np.intp)
     offset = first - centre
@@ -102,7 +256,7 @@ def _trapezoid_mean(profile: FloatArray, pixels: FloatArray, cells: FloatArray) 
     total = np.zeros_like(centre)
     below = np.zeros_like(centre)
     for step in range(int(np.ceil(2 * reach.max())) + 1):
-        upto = _trapezoid_cdf(offset + (step + 1), half_pixel, half_cell)
+        upto = _trapezoid_cdf(offset + (step + 1), half_a, half_b)
         total += padded[np.clip(feature + (step + 1), 0, len(profile) + 1)] * (upto - below)
         below = upto
     return total
@@ -112,10 +266,16 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
     """Distribution function at x of the sum of two centred uniform variables of the given half-widths."""
     short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
     distance = np.abs(x)
-    tail = np.square(np.maximum(short + long - distance, 0)) / (8 * short * long)
+    # The tail is used only where it is not empty, so the floor of its divisor changes no value.
+    tail = np.square(np.maximum(short + long - distance, 0)) / np.maximum(8 * short * long, np.finfo(float).tiny)
     centre = 0.5 - distance / (2 * long)
     upper = np.where(distance <= long - short, centre, tail)
     return np.asarray(np.where(x < 0, upper, 1 - upper))
+
+
+def _require_beyond(depth_mm: float, mask_mm: float) -> None:
+    if not depth_mm > mask_mm:
+        raise MitsimError(f"scene depth is {depth_mm} mm; it must lie beyond the mask at {mask_mm} mm")
 
 
 def _checked_edges(name: str, edges: npt.ArrayLike) -> FloatArray:

@@ -4,12 +4,14 @@ Plugin ``mitsim_lensless``
 --------------------------
 Irradiance at sensor point u, in the units of the scene's radiance times steradian (W m^-2 for W m^-2 sr^-1)::
 
-    E(u) = integral of  L(u, t) M(u + d t) (1 + |t|^2)^-2  dt
+    E(u) = integral of  L(u, t) M(u + d t) M(u + (d + h) t) cos^n(theta) (1 + |t|^2)^-2  dt
 
-over tan-angles t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, and the last factor
-is cos(theta) d omega written in t. A sample draws u inside its pixel and t uniformly over the field stop, traces the
-ray from u, and returns weight M (1 + |t|^2)^-2 (2 T)^2, T = tan(fov / 2). The mask is a factor, not geometry: thin
-geometry suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
+over tan-angles t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (a ray
+has to pass both faces; a thin mask has one), cos^n a pixel's angular response, and the last factor is
+cos(theta) d omega written in t. A sample draws u inside its pixel's active square and t uniformly over the field stop,
+traces the ray from u, and returns weight M M cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, T = tan(fov / 2):
+irradiance is per pixel area. The mask is a factor, not geometry: thin geometry suffers from Mitsuba's ray epsilon and
+blocks connections to delta lights. Diffraction is the factored estimator's: here light travels along rays.
 
 The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks
 along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.
@@ -21,9 +23,12 @@ parameter               unit      default     meaning
 ``mask``                -         separable   ``separable``, ``flatcam`` or ``open``
 ``mask_order``          -         9           order of the maximum length sequence (2^order - 1 features a side)
 ``mask_feature``        mm        0.06        feature size
-``mask_distance``       mm        2           sensor to mask
+``mask_distance``       mm        2           sensor to mask (the face next to the sensor)
+``mask_thickness``      mm        0           mask thickness; 0 is a thin mask
 ``scene_distance``      mm        400         plane to which the rig is aligned (calibration board, cell grid)
 ``fov``                 degrees   20          full angle of the square field stop, a baffle: no light beyond it
+``pixel_fill_factor``   -         1           active part of a pixel, a centred square
+``angular_exponent``    -         0           a pixel responds as cos(theta) to this power; 0 is no angular response
 ``to_world``            -         identity    rigid transform of the camera
 ======================  ========  ==========  =================================================================
 
@@ -112,11 +117,15 @@ def _sensor_class() -> type:
         ) -> tuple[Any, Any]:
             geometry = self.geometry
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
-            u = (1 - 2 * sample2) * geometry.half_width
+            u = (1 - 2 * self._active(sample2)) * geometry.half_width
             t = (1 - 2 * sample3) * geometry.tan_half_fov
             squared = 1 + dr.squared_norm(t)
-            passed = self._transmission(u + geometry.mask_distance * t, active)
-            weight = passed * (2 * geometry.tan_half_fov) ** 2 / dr.square(squared)
+            weight = self._transmission(u + geometry.mask_distance * t, active)
+            if geometry.mask_thickness:
+                weight *= self._transmission(u + (geometry.mask_distance + geometry.mask_thickness) * t, active)
+            if geometry.angular_exponent:
+                weight *= squared ** (-geometry.angular_exponent / 2)
+            weight *= geometry.pixel_fill_factor * (2 * geometry.tan_half_fov) ** 2 / dr.square(squared)
             to_world = self.world_transform()
             ray = mi.Ray3f(
                 to_world @ mi.Point3f(u.x, u.y, 0),
@@ -131,6 +140,14 @@ def _sensor_class() -> type:
         ) -> tuple[Any, Any]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
+
+        def _active(self, sample: Any) -> Any:
+            """Film points (0..1) drawn together into the active square of their pixels."""
+            geometry = self.geometry
+            if geometry.pixel_fill_factor == 1:
+                return sample
+            middle = (dr.floor(sample * geometry.pixels) + 0.5) / geometry.pixels
+            return middle + (sample - middle) * (geometry.active_side / geometry.pixel_pitch)
 
         def _transmission(self, point: Any, active: Any) -> Any:
             """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""

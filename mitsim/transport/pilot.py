@@ -18,6 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.camera import CameraGeometry
 from mitsim.optics.frames import ExpectedFrames, FrameOptics, relative_error
+from mitsim.optics.shadow import Directions
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.factored import LightSample, Projector, Tracer
 
@@ -212,7 +213,8 @@ def _depth_error(geometry: CameraGeometry, grid: CellGrid, depth: float, spread:
     if spread * depth < 1e-6:
         return 0.0
     nearer = 1 / (1 / depth + spread)
-    middle = geometry.shadow_terms(grid.rows.edges, grid.columns.edges, depth)
-    moved = geometry.shadow_terms(grid.rows.edges, grid.columns.edges, nearer)
+    rows, columns = Directions.cells(grid.rows.edges), Directions.cells(grid.columns.edges)
+    middle = geometry.shadow_terms(rows, columns, depth)
+    moved = geometry.shadow_terms(rows, columns, nearer)
     change = sum(float(np.square(a[0] - b[0]).sum()) for a, b in zip(middle, moved, strict=True))
     return float((2 * change / sum(float(np.square(a[0]).sum()) for a in middle)) ** 0.5)

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
-from mitsim.optics.shadow import shadow_factor
+from mitsim.optics.shadow import Directions, shadow_factor
 
 
 def test_the_defaults_are_the_papers_geometry() -> None:
@@ -56,8 +56,8 @@ def test_the_model_is_frozen() -> None:
 def test_shadow_terms_sum_to_the_masks_mean_transmission(kind: str) -> None:
     """Each entry against a plain average of the mask over 200 x 200 points, axis by axis."""
     geometry = CameraGeometry(pixels=3, pixel_pitch=0.05, mask=kind, mask_order=4, mask_distance=3.0)
-    rows, columns, depth = np.array([-0.11, -0.02, 0.05]), np.array([-0.06, 0.0, 0.09, 0.1]), 250.0
-    terms = geometry.shadow_terms(rows, columns, depth)
+    rows, columns, depth = np.array([-0.11, -0.02, 0.07]), np.array([-0.06, 0.0, 0.06, 0.12]), 250.0
+    terms = geometry.shadow_terms(Directions.cells(rows), Directions.cells(columns), depth)
     mask, edges = geometry.build_mask(), geometry.pixel_edges
     middle = (np.arange(200) + 0.5) / 200
 
@@ -78,10 +78,12 @@ def test_shadow_terms_sum_to_the_masks_mean_transmission(kind: str) -> None:
 def test_one_shadow_serves_both_axes_but_only_for_equal_edges() -> None:
     geometry = CameraGeometry(pixels=8)
     rows, columns = np.linspace(-0.1, 0.1, 9), np.linspace(-0.12, 0.1, 12)
-    (left, right), *_ = geometry.shadow_terms(rows, columns, 400.0)
+    (left, right), *_ = geometry.shadow_terms(Directions.cells(rows), Directions.cells(columns), 400.0)
     profile = geometry.build_mask().terms[0][1]
-    assert np.array_equal(left, shadow_factor(profile, 0.06, geometry.pixel_edges, rows, 2.0, 400.0))
-    assert np.array_equal(right, shadow_factor(profile, 0.06, geometry.pixel_edges, columns, 2.0, 400.0))
+    # The same numbers from edges: rounding of the edges only.
+    for factor, edges in ((left, rows), (right, columns)):
+        expected = shadow_factor(profile, 0.06, geometry.pixel_edges, edges, 2.0, 400.0)
+        assert np.allclose(factor, expected, rtol=0, atol=1e-12)
 
 
 def test_anchors_are_chebyshev_nodes() -> None:

@@ -1,0 +1,205 @@
+"""Wave-optical shadow of a mask: from sensor pixels, directions and wavelengths to irradiances, as separable terms.
+
+Scalar Fresnel diffraction (Goodman, Introduction to Fourier Optics, 4.2 and 4.5). A point source at tan-angle tau and
+depth z, a mask whose amplitude transmission is a sum of separable terms at distance d: the field of a term on the
+sensor is a product of two 1-D fields, each a function of s = u (1 - d/z) + d tau alone, of effective distance
+D = d (z - d) / z. A profile that jumps by J_k at e_k gives, relative to an unbounded open mask::
+
+    U(s) = sum_k J_k E(s - e_k),    E(x) = 1/2 + (1 - i)/2 (C + i S)(x sqrt(2 / (lambda D)))
+
+with Fresnel's integrals C and S. E is split into its geometric shadow, the unit step, and the wave from the edge,
+g = E - step, so U is the profile plus one convolution of the jumps with g on a fine grid. At |x| = R, lambda D / 2 over
+the grid's step, the edge wave oscillates faster than the grid resolves. It is faded out between R / 2 and R: what is lost went off at
+angles above about 0.5 (a step of a quarter micrometre), oscillates thirty times within a pixel, and is not paraxial.
+
+Intensity of ``t = sum_k w_k r_k c_k`` (real)::
+
+    |U|^2 = sum_k w_k^2 |R_k|^2 |C_k|^2 + sum_(k<l) 2 w_k w_l (Re[R_k R_l*] Re[C_k C_l*] - Im[R_k R_l*] Im[C_k C_l*])
+
+one separable term for one field, four for two (FlatCam). Through a thick mask the field is taken as that behind the
+clear aperture of both faces, propagated from the exit face: diffraction inside the mask is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+from scipy.special import fresnel
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import in_threads
+from mitsim.optics.aperture import Steps, sampled_box_means
+from mitsim.optics.shadow import Directions, SeparableTerms, Setting, both_axes
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+_STEP_MM = 2.5e-4
+_STEPS_PER_FRESNEL_LENGTH = 130
+"""Grid: a quarter micrometre, or this part of sqrt(lambda D) where that is finer. Half of both moves the anchor
+geometry's shadow by less than 1e-4 (tests/physics/test_diffraction.py)."""
+_LARGEST_GRID = 1 << 24
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Wavelengths and the share of the photons at each.
+
+    Attributes
+    ----------
+    wavelengths_nm
+        (w,) wavelengths [nm], above 0; read-only.
+    weights
+        (w,) shares, not negative, that sum to 1; read-only.
+    """
+
+    wavelengths_nm: FloatArray
+    weights: FloatArray
+
+    def __post_init__(self) -> None:
+        wavelengths, weights = (np.array(v, dtype=np.float64) for v in (self.wavelengths_nm, self.weights))
+        if wavelengths.ndim != 1 or wavelengths.size == 0 or wavelengths.shape != weights.shape:
+            raise MitsimError(
+                f"spectrum of {wavelengths.shape} wavelengths and {weights.shape} weights; give one weight a wavelength"
+            )
+        if not (np.isfinite(wavelengths).all() and (wavelengths > 0).all()):
+            raise MitsimError(f"spectrum has a wavelength of {wavelengths.min()} nm; give finite numbers above 0")
+        if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
+            raise MitsimError(
+                f"spectrum weights are at least {weights.min()} and sum to {weights.sum()}; "
+                "give shares of 0 or more that sum to 1"
+            )
+        for name, array in (("wavelengths_nm", wavelengths), ("weights", weights)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+
+class EdgeWaves:
+    """Fresnel fields of 1-D apertures on a grid; prepared once for a wavelength, a distance and a grid.
+
+    Attributes
+    ----------
+    step_mm
+        width of a grid cell.
+    """
+
+    def __init__(self, wavelength_nm: float, distance_mm: float, step_mm: float, count: int, span_mm: float) -> None:
+        """``distance_mm``: effective distance D; ``count``: grid cells of a result; ``span_mm``: the greatest
+        distance from a result to an edge that matters."""
+        product = wavelength_nm * 1e-6 * distance_mm
+        self.step_mm, self._count = step_mm, count
+        fade = product / (2 * step_mm)
+        self._reach = reach = max(int(np.ceil(min(fade, span_mm) / step_mm)), 1)
+        size = count + 2 * reach
+        if size > _LARGEST_GRID:
+            raise MitsimError(
+                f"diffraction over {product**0.5 * 1e3:.3g} um (sqrt of wavelength x distance) needs a grid of {size} "
+                f"points, more than {_LARGEST_GRID}; the geometric shadow is good here, leave diffraction off"
+            )
+        x = (np.arange(reach) + 0.5) * step_mm
+        sine, cosine = fresnel(x * (2 / product) ** 0.5)
+        wave = (0.5 - 0.5j) * (cosine + 1j * sine) - 0.5
+        wave *= np.square(np.cos(np.pi / 2 * np.clip(2 * x / fade - 1, 0, 1)))
+        self._size = fft.next_fast_len(size - 1)
+        self._kernel = fft.fft(np.concatenate((-wave[::-1], wave)), self._size)
+
+    def field(self, aperture: Steps, start_mm: float) -> ComplexArray:
+        """(count,) field at the centres of the grid cells from ``start_mm`` on, 1 for an unbounded open mask."""
+        reach, count = self._reach, self._count
+        profile = aperture.cell_means(start_mm - reach * self.step_mm, self.step_mm, count + 2 * reach)
+        spectrum = fft.fft(np.diff(profile), self._size)
+        spectrum *= self._kernel
+        # The first 2 reach - 1 values lack jumps on their left, or hold what wrapped around the end.
+        waves = fft.ifft(spectrum, overwrite_x=True)[2 * reach - 1 : 2 * reach - 1 + count]
+        return np.asarray(waves + profile[reach : reach + count])
+
+
+def wave_terms(setting: Setting, rows: Directions, columns: Directions, spectrum: Spectrum) -> SeparableTerms:
+    """Wave-optical shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left.
+
+    Wavelength by wavelength; the terms of one wavelength are in the order of the module's formula.
+    """
+    weights = _pair_weights(setting.weights())
+    means = _thick_means if setting.thickness_mm else _thin_means
+    found: SeparableTerms = []
+    for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
+
+        def axis(profiles: list[FloatArray], at: Directions, wavelength: float = float(wavelength)) -> FloatArray:
+            return means(setting, profiles, at, wavelength)
+
+        left, right = both_axes(setting, rows, columns, axis)
+        found += [(share * weight * a, b) for weight, a, b in zip(weights, left, right, strict=True)]
+    return found
+
+
+def grid_step(setting: Setting, wavelength_nm: float) -> float:
+    """Width of a grid cell [mm]; a feature holds a whole number of them."""
+    fresnel_length = (wavelength_nm * 1e-6 * setting.distance_mm * setting.shrink) ** 0.5
+    feature = setting.mask.feature_mm
+    return feature / float(np.ceil(feature / min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH)))
+
+
+def _prepare(setting: Setting, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
+    """Waves on a grid that holds each range of mask coordinates [mm], wherever the grid's start is rounded to."""
+    step = grid_step(setting, wavelength_nm)
+    span = setting.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max()))
+    count = int(np.ceil((highs - lows).max() / step)) + 3
+    return EdgeWaves(wavelength_nm, setting.distance_mm * setting.shrink, step, count, span)
+
+
+def _start(setting: Setting, step: float, low: float) -> float:
+    """A coordinate at least a cell below ``low`` from which the mask's edges fall between cells."""
+    first = -setting.mask.extent_mm / 2
+    return float(first + (np.floor((low - first) / step) - 1) * step)
+
+
+def _thin_means(
+    setting: Setting, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
+) -> FloatArray:
+    """(pairs, m, c) mean products of fields; one grid serves all directions."""
+    crossings, half_cell = setting.crossings(directions), setting.half_cell(directions)
+    reach = setting.half_pixel + half_cell
+    low, high = crossings.min() - reach, crossings.max() + reach
+    waves = _prepare(setting, wavelength_nm, low, high)
+    start = _start(setting, waves.step_mm, float(low))
+    products = _products([waves.field(clear, start) for clear in setting.clear(profiles, 0.0)])
+    return sampled_box_means(products, start, waves.step_mm, crossings, setting.half_pixel, half_cell)
+
+
+def _thick_means(
+    setting: Setting, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
+) -> FloatArray:
+    """(pairs, m, c) mean products of fields; each direction sees an aperture of its own."""
+    crossings, half_cell = setting.crossings(directions), setting.half_cell(directions)
+    reach = setting.half_pixel + half_cell
+    lows, highs = crossings.min(axis=0) - reach, crossings.max(axis=0) + reach
+    waves = _prepare(setting, wavelength_nm, lows, highs)
+
+    def one(j: int) -> FloatArray:
+        start = _start(setting, waves.step_mm, float(lows[j]))
+        clear = setting.clear(profiles, float(directions.centres[j]))
+        products = _products([waves.field(aperture, start) for aperture in clear])
+        return sampled_box_means(products, start, waves.step_mm, crossings[:, j], setting.half_pixel, half_cell)
+
+    return np.stack(in_threads(one, range(crossings.shape[1])), axis=-1)
+
+
+def _products(fields: list[ComplexArray]) -> FloatArray:
+    """(pairs, n): |U_k|^2 of each field, then Re and Im of U_k U_l* for each k < l."""
+    found = [np.square(field.real) + np.square(field.imag) for field in fields]
+    for k, one in enumerate(fields):
+        for other in fields[k + 1 :]:
+            product = one * other.conj()
+            found += [product.real, product.imag]
+    return np.stack(found)
+
+
+def _pair_weights(weights: list[float]) -> list[float]:
+    """Weights of the intensity's separable terms, in the order of :func:`_products`."""
+    found = [weight**2 for weight in weights]
+    for k, one in enumerate(weights):
+        for other in weights[k + 1 :]:
+            found += [2 * one * other, -2 * one * other]
+    return found
