@@ -65,7 +65,7 @@ class Steps:
         inside = self.edges[(self.edges > low) & (self.edges < high)]
         edges = np.concatenate(([low], inside, [high]))
         values = self.at((edges[:-1] + edges[1:]) / 2)
-        return _Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0]
+        return np.asarray(_Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0])
 
 
 def sampled_box_means(
