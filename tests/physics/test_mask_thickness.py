@@ -2,6 +2,8 @@
 
 Rationale: a ray of slope t that leaves a mask of thickness h through s entered at s + h t. So a slit of width a passes
 the part 1 - h |t| / a of a parallel beam, whatever the distance; everything else follows from where edges fall.
+
+The rendering of the last test uses fixed seeds; its gate is given there.
 """
 
 import numpy as np
@@ -77,6 +79,46 @@ def test_a_frame_equals_rays_counted_through_both_faces(kind: str) -> None:
     single = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms)
     if kind != "open":
         assert np.abs(single - counted).max() > 0.3, "the second face has to matter"
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_rendered_frames_are_the_closed_form(kind: str) -> None:
+    """Uniform sky seen through a thick mask by small pixels with an angular response, against the shadow's terms.
+
+    Sixteen passes of 64 x 64 x 64 rays. Two numbers: the mean, and the projection on the expected pattern. Gate: six
+    standard errors from 16 passes: chance 2e-5 each (Student, 15 degrees of freedom).
+    """
+    import mitsuba as mi
+
+    values = {"mask_order": 3, "mask_feature": 0.6, "pixel_pitch": 0.05, "mask_thickness": 0.6, "fov": 40.0}
+    effects = {"pixel_fill_factor": 0.5, "angular_exponent": 3.0}
+    geometry = CameraGeometry(pixels=64, mask=kind, **values, **effects)
+
+    def closed(camera: CameraGeometry) -> np.ndarray:
+        at = Directions.cells(np.linspace(-1, 1, 401) * camera.tan_half_fov)
+        squared = np.square(at.centres)[:, None] + np.square(at.centres)[None, :]
+        light = (1 + squared) ** -2 * camera.angular_response(squared) * at.width**2
+        return np.asarray(sum(left @ light @ right.T for left, right in camera.shadow_terms(at, at, np.inf)))
+
+    film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    camera = {"type": "mitsim_lensless", "mask": kind, **values, **effects, "film": film}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "sky": {"type": "constant"}, "path": {"type": "path"}})
+    passes = [np.array(mi.render(scene, spp=64, seed=seed), np.float64)[..., 0] for seed in range(16)]
+    expected = closed(geometry)
+    pattern = expected - expected.mean()
+
+    def numbers(frame: np.ndarray) -> np.ndarray:
+        return np.array([frame.mean() / expected.mean(), (frame * pattern).sum() / np.square(pattern).sum()])
+
+    found = np.array([numbers(frame) for frame in passes])
+    error = found.std(axis=0, ddof=1) / 4
+    assert (error < 0.002).all()
+    assert (np.abs(found.mean(axis=0) - 1) < 6 * error).all()
+    for name in ("mask_thickness", "pixel_fill_factor", "angular_exponent"):
+        neutral = CameraGeometry.model_fields[name].default
+        other = numbers(closed(geometry.model_copy(update={name: neutral})))
+        assert (np.abs(other - 1) > 12 * error).any(), f"{name} has to show"
 
 
 @pytest.mark.parametrize("kind", ["separable", "flatcam"])
