@@ -148,8 +148,8 @@ def grid_step(setting: Setting, wavelength_nm: float) -> float:
 def _prepare(setting: Setting, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
     """Waves on a grid that holds each range of mask coordinates [mm], wherever the grid's start is rounded to."""
     step = grid_step(setting, wavelength_nm)
-    span = setting.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max()))
     count = int(np.ceil((highs - lows).max() / step)) + 3
+    span = setting.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max())) + 3 * step
     return EdgeWaves(wavelength_nm, setting.distance_mm * setting.shrink, step, count, span)
 
 

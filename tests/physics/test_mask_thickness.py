@@ -136,6 +136,18 @@ def test_a_mask_of_next_to_no_thickness_is_a_thin_one(kind: str, spectrum: Spect
     assert error < (1e-8 if spectrum is None else 1e-3)
 
 
+@pytest.mark.parametrize("spectrum", [None, Spectrum([550.0], [1.0])])
+def test_each_direction_sees_an_aperture_of_its_own(spectrum: Spectrum | None) -> None:
+    geometry = CameraGeometry(mask="flatcam", pixels=32, mask_order=6, mask_thickness=0.1)
+    at = Directions([-0.14, 0.02, 0.13], 1e-3)
+    together = geometry.shadow_terms(at, at, 50.0, spectrum)
+    for j, tau in enumerate(at.centres):
+        alone = geometry.shadow_terms(Directions([tau], 1e-3), Directions([tau], 1e-3), 50.0, spectrum)
+        for (left, right), (one_left, one_right) in zip(together, alone, strict=True):
+            assert np.allclose(left[:, [j]], one_left, rtol=0, atol=1e-9)
+            assert np.allclose(right[:, [j]], one_right, rtol=0, atol=1e-9)
+
+
 def test_a_thick_flatcam_mask_has_four_products_or_sixteen_terms_of_waves() -> None:
     geometry = CameraGeometry(mask="flatcam", pixels=8, mask_order=4, mask_thickness=0.05)
     at = Directions([0.05], 0.0)
