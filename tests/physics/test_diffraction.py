@@ -237,7 +237,7 @@ def test_large_features_cast_the_geometric_shadow(kind: str) -> None:
     at = Directions(np.linspace(-0.5, 0.5, 5), 0.1)
     wave, rays = geometry.shadow_terms(at, at, 400.0, line()), geometry.shadow_terms(at, at, 400.0)
     images = [sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms) for terms in (wave, rays)]
-    assert relative(*images) < 6e-3
+    assert relative(*images) < 1e-3
 
 
 SCENE = Directions.cells((np.arange(129) - 64) * (120 / 128 / 400))
