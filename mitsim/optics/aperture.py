@@ -65,7 +65,7 @@ class Steps:
         inside = self.edges[(self.edges > low) & (self.edges < high)]
         edges = np.concatenate(([low], inside, [high]))
         values = self.at((edges[:-1] + edges[1:]) / 2)
-        return _Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0]
+        return np.asarray(_Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0])
 
 
 def sampled_box_means(
@@ -91,11 +91,17 @@ class _Antiderivative:
         self._first = self._sums(self._values * width)
         # A slope of the second antiderivative drops out of its second difference, its size does not.
         self._first -= self._first.mean(axis=1, keepdims=True)
-        self._second = self._sums((self._first[:, :-1] + self._values * width / 2) * width)
+        middle = self._first[:, :-1] + self._first[:, 1:]
+        middle *= width / 2
+        self._second = self._sums(middle)
 
     @staticmethod
     def _sums(parts: FloatArray) -> FloatArray:
-        return np.concatenate((np.zeros((len(parts), 1)), np.cumsum(parts, axis=1)), axis=1)
+        """(functions, n + 1) running sums of (functions, n), from 0 on."""
+        sums = np.empty((len(parts), parts.shape[1] + 1))
+        sums[:, 0] = 0
+        np.cumsum(parts, axis=1, out=sums[:, 1:])
+        return sums
 
     def means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
         """(functions, *centres.shape) means over a box of each half-width."""

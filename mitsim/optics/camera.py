@@ -41,7 +41,7 @@ class CameraGeometry(BaseModel):
         1.0, gt=0, le=1, description="part of a pixel that is active, a centred square; 1 is the whole pixel"
     )
     angular_exponent: float = Field(
-        0.0, ge=0, le=100, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
+        0.0, ge=0, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
     )
 
     @model_validator(mode="after")

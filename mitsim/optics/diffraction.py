@@ -9,8 +9,9 @@ D = d (z - d) / z. A profile that jumps by J_k at e_k gives, relative to an unbo
 
 with Fresnel's integrals C and S. E is split into its geometric shadow, the unit step, and the wave from the edge,
 g = E - step, so U is the profile plus one convolution of the jumps with g on a fine grid. At |x| = R, lambda D / 2 over
-the grid's step, the edge wave oscillates faster than the grid resolves. It is faded out between R / 2 and R: what is lost went off at
-angles above about 0.5 (a step of a quarter micrometre), oscillates thirty times within a pixel, and is not paraxial.
+the grid's step, the edge wave oscillates faster than the grid resolves, so it is faded out from 3 R / 4 to R. What is
+lost left the mask at tangents above 0.8 (a quarter micrometre, 550 nm), where nothing is paraxial any more: 4.5e-4 of
+the light, spread evenly.
 
 Intensity of ``t = sum_k w_k r_k c_k`` (real)::
 
@@ -38,8 +39,10 @@ FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4
 _STEPS_PER_FRESNEL_LENGTH = 130
-"""Grid: a quarter micrometre, or this part of sqrt(lambda D) where that is finer. Half of both moves the anchor
-geometry's shadow by less than 1e-4 (tests/physics/test_diffraction.py)."""
+"""Grid: a quarter micrometre, or this part of sqrt(lambda D) where that is finer. It leaves 3.2e-4 of the anchor
+geometry's shadow, half of it 1.4e-4, twice 7e-4 (against an eighth; tests/physics/test_diffraction.py)."""
+_THICK_STEPS = 2
+"""Grid of a thick mask, whose every direction needs fields of its own, in steps of the thin one's."""
 _LARGEST_GRID = 1 << 24
 
 
@@ -101,7 +104,7 @@ class EdgeWaves:
         x = (np.arange(reach) + 0.5) * step_mm
         sine, cosine = fresnel(x * (2 / product) ** 0.5)
         wave = (0.5 - 0.5j) * (cosine + 1j * sine) - 0.5
-        wave *= np.square(np.cos(np.pi / 2 * np.clip(2 * x / fade - 1, 0, 1)))
+        wave *= np.square(np.cos(np.pi / 2 * np.clip(4 * x / fade - 3, 0, 1)))
         self._size = fft.next_fast_len(size - 1)
         self._kernel = fft.fft(np.concatenate((-wave[::-1], wave)), self._size)
 
@@ -138,14 +141,15 @@ def grid_step(setting: Setting, wavelength_nm: float) -> float:
     """Width of a grid cell [mm]; a feature holds a whole number of them."""
     fresnel_length = (wavelength_nm * 1e-6 * setting.distance_mm * setting.shrink) ** 0.5
     feature = setting.mask.feature_mm
-    return feature / float(np.ceil(feature / min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH)))
+    widest = min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH) * (_THICK_STEPS if setting.thickness_mm else 1)
+    return feature / float(np.ceil(feature / widest))
 
 
 def _prepare(setting: Setting, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
     """Waves on a grid that holds each range of mask coordinates [mm], wherever the grid's start is rounded to."""
     step = grid_step(setting, wavelength_nm)
-    span = setting.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max()))
     count = int(np.ceil((highs - lows).max() / step)) + 3
+    span = setting.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max())) + 3 * step
     return EdgeWaves(wavelength_nm, setting.distance_mm * setting.shrink, step, count, span)
 
 

@@ -13,6 +13,7 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.capture.light import Light
 from mitsim.optics.frames import FrameOptics
+from mitsim.optics.shadow import Directions
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -35,7 +36,7 @@ def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -
     For a FlatCam mask these are the factors of the coded term; the constant one vanishes when frames are centred.
     ``electrons_per_joule`` turns W m^-2 into electrons a second.
     """
-    rows, columns = (np.linspace(*window, bench.n + 1) for window in bench.windows)
+    rows, columns = (Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows)
     left, right = bench.geometry.shadow_terms(rows, columns, bench.geometry.scene_distance)[-1]
     scale = np.sqrt(board_flux * electrons_per_joule)
     return left * scale, right * scale

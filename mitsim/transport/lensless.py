@@ -6,8 +6,8 @@ Irradiance at sensor point u, in the units of the scene's radiance times steradi
 
     E(u) = integral of  L(u, t) M(u + d t) M(u + (d + h) t) cos^n(theta) (1 + |t|^2)^-2  dt
 
-over tan-angles t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (a ray
-has to pass both faces; a thin mask has one), cos^n a pixel's angular response, and the last factor is
+over t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (both
+faces count, a thin mask has one), cos^n a pixel's angular response, and the last factor is
 cos(theta) d omega written in t. A sample draws u inside its pixel's active square and t uniformly over the field stop,
 traces the ray from u, and returns weight M M cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, T = tan(fov / 2):
 irradiance is per pixel area. The mask is a factor, not geometry: thin geometry suffers from Mitsuba's ray epsilon and

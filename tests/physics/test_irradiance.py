@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.shadow import Directions
 
 pytestmark = pytest.mark.usefixtures("variant")
 SCALE, Z, ALBEDO = 111000.0, 400.0, 0.5
@@ -101,7 +102,7 @@ def test_masked_mean_is_that_of_the_closed_form_shadow(small_scene: Callable[...
     edges = np.linspace(-WINDOW, WINDOW, 65)
     centre, size = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
     falloff = (1 + np.square(centre)[:, None] + np.square(centre)[None, :]) ** -2
-    terms = geometry.shadow_terms(edges, edges, Z)
+    terms = geometry.shadow_terms(Directions.cells(edges), Directions.cells(edges), Z)
     expected = RADIANCE * size**2 * sum((left @ falloff @ right.T).mean() for left, right in terms)
     # Two passes: half their difference is free of the mask's pattern on the sensor.
     assert 2 * SIGMAS * error < 0.03 * expected

@@ -14,6 +14,7 @@ from scipy import sparse
 from mitsim.optics.camera import CameraGeometry, anchor_positions
 from mitsim.optics.frames import ExpectedFrames, FrameOptics, relative_error
 from mitsim.optics.mask import Mask
+from mitsim.optics.shadow import Directions
 
 Z, WINDOW = 40.0, (-0.13, 0.17)
 CAMERA = CameraGeometry(
@@ -118,7 +119,7 @@ def test_orientation_of_rows_and_columns() -> None:
     """Light in one cell: its shadow is the outer product of the two factors, rows by rows."""
     rows, columns = np.linspace(-0.2, 0.2, 5), np.linspace(-0.1, 0.3, 8)
     optics = FrameOptics(CAMERA, rows, columns, Z, 1)
-    ((left, right),) = CAMERA.shadow_terms(rows, columns, Z)
+    ((left, right),) = CAMERA.shadow_terms(Directions.cells(rows), Directions.cells(columns), Z)
     frame = optics.frame(np.array([3 * 7 + 1]), np.array([2.0]))
     assert np.allclose(frame, 2 * np.outer(left[:, 3], right[:, 1]), rtol=1e-14)
     assert not np.allclose(frame, frame.T)
@@ -133,7 +134,9 @@ def test_both_orders_of_the_product_agree_with_the_dense_one(lit: str) -> None:
     place = (slice(2, 4), slice(None)) if lit == "few rows" else (slice(None), slice(7, 9))
     light[place] = rng.random(light[place].shape)
     flat = np.flatnonzero(light)
-    terms = CAMERA.model_copy(update={"mask": "flatcam"}).shadow_terms(rows, columns, Z)
+    terms = CAMERA.model_copy(update={"mask": "flatcam"}).shadow_terms(
+        Directions.cells(rows), Directions.cells(columns), Z
+    )
     dense = sum(left @ light @ right.T for left, right in terms)
     assert np.allclose(optics.frame(flat, light.ravel()[flat]), dense, rtol=1e-12)
 

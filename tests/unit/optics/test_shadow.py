@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor, shadow_factor
+from mitsim.optics.shadow import Directions, Setting, centred_edges, geometric_terms, scene_factor, shadow_factor
 
 ANCHOR = (0.06, centred_edges(512, 0.01172), centred_edges(128, 120 / 128), 2.0, 400.0)
 
@@ -119,3 +119,45 @@ def test_bad_arguments_are_refused_in_one_line(change):
     }
     with pytest.raises(MitsimError, match=r"^[^\n]+$"):
         shadow_factor(**(good | change))
+
+
+def test_point_directions_average_over_the_pixel_alone():
+    """Width 0: the share of each pixel's ray crossings that are open, from exact interval arithmetic."""
+    mask = mls_mask(order=5)
+    pixels = centred_edges(40, 0.017)
+    at = Directions([-0.31, 0.0, 0.0123], 0.0)
+    setting = Setting(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
+    ((left, _),) = geometric_terms(setting, at, at)
+    openings = (np.flatnonzero(mask.bits)[:, None] + [0, 1] - 31 / 2) * 0.06
+    for j, tau in enumerate(at.centres):
+        edges = pixels * (1 - 2 / 50) + 2 * tau
+        inside = np.minimum(edges[1:, None], openings[:, 1]) - np.maximum(edges[:-1, None], openings[:, 0])
+        expected = np.maximum(inside, 0).sum(axis=1) / np.diff(edges)
+        np.testing.assert_allclose(left[:, j], expected, rtol=0, atol=1e-12)
+
+
+def test_narrow_cells_tend_to_points():
+    mask, pixels = mls_mask(order=5), centred_edges(40, 0.017)
+    setting = Setting(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
+    factors = [geometric_terms(setting, at, at)[0][0] for at in (Directions([0.02], w) for w in (0.0, 1e-6, 1e-300))]
+    np.testing.assert_allclose(factors[1], factors[0], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(factors[2], factors[0], rtol=0, atol=1e-12)
+
+
+def test_equal_edges_make_directions_and_unequal_ones_are_refused():
+    at = Directions.cells([-0.2, -0.1, 0.0, 0.1])
+    np.testing.assert_allclose(at.centres, [-0.15, -0.05, 0.05], rtol=0, atol=1e-15)
+    assert at.width == pytest.approx(0.1)
+    assert at.same_as(Directions([*at.centres], at.width)) and not at.same_as(Directions(at.centres, 0.0))
+    with pytest.raises(ValueError, match="read-only"):
+        at.centres[0] = 1
+    with pytest.raises(MitsimError, match="are not equal"):
+        Directions.cells([0.0, 0.1, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("centres", "width"), [([], 0.1), ([0.1, 0.1], 0.0), ([np.nan], 0.0), ([0.0], -1), ([0.0], np.inf)]
+)
+def test_bad_directions_are_refused_in_one_line(centres, width):
+    with pytest.raises(MitsimError, match=r"^[^\n]+$"):
+        Directions(centres, width)

@@ -55,6 +55,33 @@ def test_a_ray_carries_the_masks_transmission_where_it_crosses(mask: str) -> Non
         assert not np.allclose(known, mirrored), "the check must be able to tell up from down"
 
 
+@pytest.mark.parametrize("mask", ["separable", "flatcam", "open"])
+def test_a_ray_has_to_pass_both_faces_and_hits_the_active_area_at_its_angle(mask: str) -> None:
+    """Every effect at once; each alone is told apart by what the last lines leave out."""
+    geometry = CameraGeometry(
+        mask=mask, mask_thickness=0.3, pixel_fill_factor=0.49, angular_exponent=4.0, mask_order=7, pixels=32
+    )
+    origin, direction, weight, samples = rays(geometry)
+    pixel, within = np.divmod(samples[:, :2] * 32, 1)
+    active = (pixel + 0.5 + (within - 0.5) * 0.7) / 32
+    assert np.allclose(origin[:, :2], (0.5 - active) * 2 * geometry.half_width, atol=1e-6)
+    t = direction[:, :2] / direction[:, 2:]
+    faces, clear = [], np.ones(len(t), bool)
+    for plane in (2.0, 2.3):
+        at_mask = origin[:, :2] + plane * t
+        faces.append(geometry.build_mask().transmission(-at_mask[:, 1], -at_mask[:, 0]))
+        clear &= (np.abs((at_mask / 0.06 + 127 / 2) % 1 - 0.5) < 0.499).all(axis=1)
+    assert clear.mean() > 0.98
+    cosine = direction[:, 2]
+    falloff = 0.49 * (2 * geometry.tan_half_fov) ** 2 * cosine**4
+    expected = faces[0] * faces[1] * cosine**4.0 * falloff
+    assert np.allclose(weight[clear], expected[clear], rtol=1e-5)
+    assert np.allclose(expected, faces[0] * faces[1] * geometry.angular_response(1 / cosine**2 - 1) * falloff)
+    assert not np.allclose(weight[clear], (faces[0] * faces[1] * falloff)[clear], rtol=1e-3)
+    if mask != "open":
+        assert not np.array_equal(faces[0], faces[1])
+
+
 @pytest.mark.parametrize(("mask", "open_part"), [("separable", (256 / 511) ** 2), ("flatcam", 0.5 + 0.5 / 511**2)])
 def test_how_much_of_the_mask_is_open(mask: str, open_part: float) -> None:
     # A field stop that sees the whole mask: tan(half fov) = 8, mask 30.66 mm wide at 2 mm distance.

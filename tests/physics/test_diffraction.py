@@ -1,0 +1,303 @@
+"""The wave-optical shadow against fields propagated by FFT, closed forms, and its limit of short waves.
+
+The package sums Fresnel integrals over a mask's edges and relies on the effective distance d (z - d) / z. Here light is
+propagated by the transfer function of free space on a grid of points, its own code throughout: numbers that the two
+share are the mask's code and the geometry. Expectation: 1e-3 of the norm for means over pixels (what the grid's highest
+frequency leaves on either side is 3e-4, measured by halving both).
+"""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from mitsim.core.errors import MitsimError
+from mitsim.optics.aperture import Steps
+from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.diffraction import EdgeWaves, Spectrum
+from mitsim.optics.shadow import Directions
+
+STEP = 2.5e-4
+LAMBDA_NM = 550.0
+PIXELS = 64
+NEAR = {"pixels": PIXELS, "mask_order": 5, "scene_distance": 40.0}
+"""A small mask (31 features of 60 um) so near that the source's distance matters: 1 - d/z = 0.95."""
+
+
+def line(nm: float = LAMBDA_NM) -> Spectrum:
+    return Spectrum(np.array([nm]), np.array([1.0]))
+
+
+def relative(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+def grid(count: int, step: float = STEP) -> np.ndarray:
+    return (np.arange(count) - count / 2 + 0.5) * step
+
+
+def code(order: int, signed: bool = False) -> np.ndarray:
+    from scipy.signal import max_len_seq
+
+    bits = max_len_seq(order)[0].astype(float)
+    return 2 * bits - 1 if signed else bits
+
+
+def pattern(bits: np.ndarray, feature: float, s: np.ndarray) -> np.ndarray:
+    """Transmission of a centred row of features at points, 0 outside."""
+    index = np.floor(s / feature + len(bits) / 2).astype(int)
+    return np.where((index >= 0) & (index < len(bits)), bits[np.clip(index, 0, len(bits) - 1)], 0.0)
+
+
+def propagated(field: np.ndarray, step: float, distance: float, paraxial: bool = True) -> np.ndarray:
+    """The field after ``distance`` along its last axis, without the common phase."""
+    f, wavelength = np.fft.fftfreq(field.shape[-1], step), LAMBDA_NM * 1e-6
+    if paraxial:
+        transfer = np.exp(-1j * np.pi * wavelength * distance * f**2)
+    else:
+        root = np.sqrt(np.asarray(1 - (wavelength * f) ** 2, complex))
+        transfer = np.exp(2j * np.pi * distance / wavelength * (root - 1))
+    return np.fft.ifft(np.fft.fft(field) * transfer)
+
+
+def pixel_means(values: np.ndarray, s: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Means of sampled values (their last axis lies on s) between coordinates."""
+    step = s[1] - s[0]
+    edges = np.append(s - step / 2, s[-1] + step / 2)
+    sums = np.concatenate((np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)), axis=-1) * step
+
+    def upto(x: np.ndarray) -> np.ndarray:
+        return np.apply_along_axis(lambda one: np.interp(x, edges, one), -1, sums)
+
+    return (upto(high) - upto(low)) / (high - low)
+
+
+def by_plane_wave(geometry: CameraGeometry, tau: float, depth: float) -> np.ndarray:
+    """(pixels,) means of |U|^2, by a plane wave over the effective distance, at s = u (1 - d/z) + d tau."""
+    d, s = geometry.mask_distance, grid(1 << 16)
+    shrink = 1 - d / depth
+    field = propagated(pattern(code(geometry.mask_order), geometry.mask_feature, s), STEP, d * shrink)
+    edges = geometry.pixel_edges * shrink + d * tau
+    return pixel_means(np.abs(field) ** 2, s, edges[:-1], edges[1:])
+
+
+def by_point_source(geometry: CameraGeometry, tau: float, depth: float, paraxial: bool = True) -> np.ndarray:
+    """(pixels,) means of |U|^2 for the source's own field on the mask, propagated by d; relative to an open mask."""
+    d, s = geometry.mask_distance, grid(1 << 16)
+    wavelength = LAMBDA_NM * 1e-6
+    if paraxial:
+        source = np.exp(1j * np.pi * (s - tau * depth) ** 2 / (wavelength * (depth - d)))
+    else:
+        source = np.exp(2j * np.pi / wavelength * np.hypot(s - tau * depth, depth - d))
+    mask = pattern(code(geometry.mask_order), geometry.mask_feature, s)
+    field = propagated(source * mask, STEP, d, paraxial)
+    # Energy spreads over z / (z - d) of the width that it had at the mask.
+    means = pixel_means(np.abs(field) ** 2, s, geometry.pixel_edges[:-1], geometry.pixel_edges[1:])
+    return means / (1 - d / depth)
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.013, -0.15])
+def test_a_point_source_equals_its_field_propagated_without_any_scaling(tau: float) -> None:
+    geometry = CameraGeometry(**NEAR)
+    ((left, right),) = geometry.shadow_terms(Directions([tau], 0.0), Directions([tau], 0.0), 40.0, line())
+    expected = by_point_source(geometry, tau, 40.0)
+    assert relative(left[:, 0], expected) < 1e-3
+    assert np.array_equal(left, right)
+
+
+@pytest.mark.parametrize("depth", [10.0, 40.0, 1e9])
+def test_a_point_source_equals_a_plane_wave_over_the_effective_distance(depth: float) -> None:
+    geometry = CameraGeometry(**NEAR)
+    tau = np.array([-0.1, 0.0, 0.07])
+    ((left, _),) = geometry.shadow_terms(Directions(tau, 0.0), Directions([0.0], 0.0), depth, line())
+    for j, one in enumerate(tau):
+        assert relative(left[:, j], by_plane_wave(geometry, one, depth)) < 1e-3
+
+
+@pytest.mark.parametrize(("tau", "left_over"), [(0.0, 0.006), (0.1, 0.016), (0.15, 0.035)])
+def test_what_the_paraxial_approximation_leaves(tau: float, left_over: float) -> None:
+    """Against the exact transfer function of free space and a true spherical wave, on one side (1-D).
+
+    Half a percent on the axis, 3.5 % where the paper's scene ends: an oblique beam diffracts as over a distance longer
+    by (1 + tau^2)^(3/2). That is a tenth of what diffraction does to the shadow there.
+    """
+    geometry = CameraGeometry(**NEAR)
+    at = Directions([tau], 0.0)
+    (((wave, _),), ((rays, _),)) = (geometry.shadow_terms(at, at, 40.0, light) for light in (line(), None))
+    exact = by_point_source(geometry, tau, 40.0, paraxial=False)
+    assert relative(wave[:, 0], exact) == pytest.approx(left_over, rel=0.2)
+    assert relative(rays[:, 0], exact) > 8 * relative(wave[:, 0], exact)
+
+
+def test_a_thick_mask_propagates_the_field_behind_its_clear_aperture() -> None:
+    """The model, not the whole truth: both faces multiply, then free space from the exit face."""
+    geometry = CameraGeometry(**NEAR, mask_thickness=0.2)
+    tau, depth, d = 0.15, 40.0, 2.0
+    ((left, _),) = geometry.shadow_terms(Directions([tau], 0.0), Directions([0.0], 0.0), depth, line())
+    s, bits = grid(1 << 16), code(5)
+    # The entrance's edges fall between points: the mean of 32 points in each step, or slits come out 0.5 % too wide.
+    leaves = (s[:, None] + (np.arange(32) - 15.5) / 32 * STEP).ravel()
+    enters = leaves + 0.2 * (tau * depth - leaves) / (depth - d)
+    clear = (pattern(bits, 0.06, leaves) * pattern(bits, 0.06, enters)).reshape(-1, 32).mean(axis=1)
+    field = propagated(clear, STEP, d * (1 - d / depth))
+    edges = geometry.pixel_edges * (1 - d / depth) + d * tau
+    expected = pixel_means(np.abs(field) ** 2, s, edges[:-1], edges[1:])
+    assert relative(left[:, 0], expected) < 1e-3
+    thin = CameraGeometry(**NEAR).shadow_terms(Directions([tau], 0.0), Directions([0.0], 0.0), depth, line())
+    assert relative(thin[0][0][:, 0], expected) > 0.1, "a wall shift of half a feature has to show"
+
+
+def test_the_four_terms_of_a_flatcam_mask_equal_a_field_propagated_in_two_dimensions() -> None:
+    """A 7 x 7 mask of 240 um at 30 mm, so that a grid of 2048 x 2048 points is fine enough: 0.004 of sqrt(lambda d)."""
+    d, feature, step = 30.0, 0.24, 2.5e-3
+    geometry = CameraGeometry(
+        mask="flatcam", mask_order=3, mask_feature=feature, mask_distance=d, pixels=24, pixel_pitch=0.06
+    )
+    tau_row, tau_column = 0.004, -0.007
+    depth = 300.0
+    terms = geometry.shadow_terms(Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth, line())
+    assert len(terms) == 4
+    got = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms)
+    s, signed = grid(2048, step), code(3, signed=True)
+    row, inside = pattern(signed, feature, s), pattern(np.ones(7), feature, s)
+    field = (np.outer(inside, inside) + np.outer(row, row)) / 2
+    distance = d * (1 - d / depth)
+    field = propagated(propagated(field, step, distance).T, step, distance).T
+    edges = geometry.pixel_edges * (1 - d / depth)
+    expected = np.abs(field) ** 2
+    for tau in (tau_column, tau_row):
+        expected = pixel_means(expected, s, edges[:-1] + d * tau, edges[1:] + d * tau).T
+    assert relative(got, expected) < 1e-3
+    without = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms[:3])
+    assert relative(without, expected) > 0.01, "every term has to matter here"
+
+
+def integral(low: float, high: float) -> complex:
+    """(1 - i)/2 times the integral of exp(i pi w^2 / 2), by quadrature."""
+    real = quad(lambda w: np.cos(np.pi * w * w / 2), low, high, limit=2000, epsabs=1e-10)[0]
+    imaginary = quad(lambda w: np.sin(np.pi * w * w / 2), low, high, limit=2000, epsabs=1e-10)[0]
+    return (1 - 1j) / 2 * (real + 1j * imaginary)
+
+
+def test_a_half_plane_has_a_quarter_at_its_geometric_edge_and_1_37_beside_it() -> None:
+    # The other edge is 5 mm away; its wave is faded out there.
+    waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 400, 6.0)
+    irradiance = np.abs(waves.field(Steps(np.array([0.0, 5.0]), np.ones(1)), -STEP / 2)) ** 2
+    assert irradiance[0] == pytest.approx(0.25, abs=1e-12)
+    # First maximum at w = 1.2172: 1.3704 times the open irradiance (Born & Wolf, Principles of Optics, 8.7.3).
+    unit = (LAMBDA_NM * 1e-6 * 2.0 / 2) ** 0.5
+    assert irradiance.max() == pytest.approx(1.3704, abs=1e-4)
+    assert irradiance.argmax() * STEP == pytest.approx(1.2172 * unit, abs=STEP)
+
+
+@pytest.mark.parametrize("s", [0.0, 0.021, 0.03, 0.055, -0.2])
+def test_a_slit_is_a_difference_of_two_fresnel_integrals(s: float) -> None:
+    unit = (LAMBDA_NM * 1e-6 * 2.0 / 2) ** 0.5
+    middle = s + STEP / 2
+    expected = integral((-0.03 - middle) / unit, (0.03 - middle) / unit)
+    # Both edges between cells, and the point in the middle of one: no rounding to the grid is left.
+    waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 1, 6.0)
+    got = waves.field(Steps(np.array([-0.03, 0.03]), np.ones(1)), s)
+    assert abs(got[0] - expected) < 1e-9
+
+
+def test_light_is_neither_made_nor_lost() -> None:
+    """The integral of |U|^2 over the sensor's plane is the open area, but for light that left past 4 mm."""
+    bits = code(5)
+    waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 40_000, 20.0)
+    got = float((np.abs(waves.field(Steps.of(bits, 0.06), -5.0)) ** 2).sum() * STEP)
+    # An edge sends lambda D / (4 pi^2 x) of the light per unit length past a distance x on either side; the fade-out
+    # from 1.65 mm to 2.2 mm takes that of about 2 mm.
+    edges = int(np.abs(np.diff(bits, prepend=0, append=0)).sum())
+    beyond = 2 * edges * LAMBDA_NM * 1e-6 * 2.0 / (4 * np.pi**2 * 2.0)
+    assert got == pytest.approx(bits.sum() * 0.06 - beyond, rel=3e-4)
+    assert beyond < 1e-3 * got
+
+
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_short_waves_cast_the_geometric_shadow(kind: str) -> None:
+    """The difference of means over a pixel and a cell falls with lambda D (its logarithm aside)."""
+    geometry = CameraGeometry(mask=kind, pixels=64, mask_order=5)
+    at = Directions(np.linspace(-0.05, 0.05, 9), 0.002)
+
+    def whole(spectrum: Spectrum | None) -> np.ndarray:
+        terms = geometry.shadow_terms(at, at, 400.0, spectrum)
+        return np.asarray(sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms))
+
+    geometric = whole(None)
+    found = [relative(whole(line(nm)), geometric) for nm in (550.0, 550 / 16, 550 / 64, 550 / 256)]
+    assert found[0] > 0.3
+    assert found[1] / found[2] > 3
+    assert found[2] / found[3] > 3.3
+    assert found[3] < 8e-3
+
+
+@pytest.mark.parametrize("kind", ["separable", "flatcam", "open"])
+def test_large_features_cast_the_geometric_shadow(kind: str) -> None:
+    geometry = CameraGeometry(mask=kind, pixels=64, pixel_pitch=0.5, mask_order=5, mask_feature=2.0, mask_distance=4.0)
+    at = Directions(np.linspace(-0.5, 0.5, 5), 0.1)
+    wave, rays = geometry.shadow_terms(at, at, 400.0, line()), geometry.shadow_terms(at, at, 400.0)
+    images = [sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms) for terms in (wave, rays)]
+    assert relative(*images) < 1e-3
+
+
+SCENE = Directions.cells((np.arange(129) - 64) * (120 / 128 / 400))
+
+
+@pytest.mark.parametrize(("nm", "a_side"), [(450.0, 0.231), (550.0, 0.265), (640.0, 0.297)])
+def test_at_the_papers_geometry_diffraction_is_no_detail(nm: float, a_side: float) -> None:
+    """23 to 30 % a side, averaged over a scene pixel: the figures of the feasibility study."""
+    geometry = CameraGeometry()
+    ((wave, _),), ((rays, _),) = (geometry.shadow_terms(SCENE, SCENE, 400.0, light) for light in (line(nm), None))
+    assert relative(wave, rays) == pytest.approx(a_side, abs=2e-3)
+
+
+@pytest.mark.parametrize("distance", [0.5, 2.0, 10.0])
+def test_a_finer_grid_changes_little(monkeypatch: pytest.MonkeyPatch, distance: float) -> None:
+    from mitsim.optics import diffraction
+
+    geometry = CameraGeometry(mask_distance=distance)
+    ((coarse, _),) = geometry.shadow_terms(SCENE, SCENE, 400.0, line())
+    monkeypatch.setattr(diffraction, "_STEP_MM", diffraction._STEP_MM / 4)
+    monkeypatch.setattr(diffraction, "_STEPS_PER_FRESNEL_LENGTH", diffraction._STEPS_PER_FRESNEL_LENGTH * 4)
+    ((fine, _),) = geometry.shadow_terms(SCENE, SCENE, 400.0, line())
+    assert 0 < relative(coarse, fine) < 4e-4
+
+
+def beyond_one_term(terms: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Relative distance of sum_k left_k (x) right_k from its best single separable term; left_k ~ right_k."""
+    vectors = np.array([right.ravel() for _, right in terms])
+    signs = np.array([np.vdot(left, right) / np.vdot(right, right) for left, right in terms])
+    size, turn = np.linalg.eigh(vectors @ vectors.T)
+    root = turn * np.sqrt(np.maximum(size, 0))
+    values = np.sort(np.abs(np.linalg.eigvalsh(root.T @ np.diag(signs) @ root)))
+    return float((1 - values[-1] ** 2 / np.square(values).sum()) ** 0.5)
+
+
+def test_broadband_light_stays_one_separable_term_to_four_thousandths() -> None:
+    white = Spectrum(np.linspace(400, 700, 13), np.full(13, 1 / 13))
+    terms = CameraGeometry().shadow_terms(SCENE, SCENE, 400.0, white)
+    assert len(terms) == 13
+    assert beyond_one_term(terms) == pytest.approx(4e-3, abs=5e-4)
+
+
+def test_flatcam_light_is_far_from_one_separable_term() -> None:
+    """Once frames are centred (each row and column of means taken off): 12 % at 450 nm to 18 % at 640 nm."""
+    for nm, expected in ((450.0, 0.12), (640.0, 0.178)):
+        terms = CameraGeometry(mask="flatcam").shadow_terms(SCENE, SCENE, 400.0, line(nm))
+        centred = [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
+        assert beyond_one_term(centred) == pytest.approx(expected, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "weights"),
+    [([], []), ([550.0], [0.5]), ([500.0, 600.0], [1.2, -0.2]), ([550.0, -1.0], [0.5, 0.5]), ([[550.0]], [[1.0]])],
+)
+def test_bad_spectra_are_refused_in_one_line(wavelengths: list, weights: list) -> None:
+    with pytest.raises(MitsimError, match=r"^spectrum [^\n]+$"):
+        Spectrum(wavelengths, weights)
+
+
+def test_a_hopeless_grid_is_refused() -> None:
+    geometry = CameraGeometry(pixels=64, mask_distance=1e-9)
+    with pytest.raises(MitsimError, match="leave diffraction off"):
+        geometry.shadow_terms(Directions([0.0], 0.0), Directions([0.0], 0.0), 400.0, line())
