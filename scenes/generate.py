@@ -167,6 +167,7 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "photograph/reflectance.png": photograph,
     "colour_chart/projector.png": projector_window,
     "colour_chart/reflectance.png": colour_chart,
+    "compact_disc/projector.png": projector_window,
     "resolution_target/projector.png": projector_window,
     "resolution_target/reflectance.png": resolution_target,
 }
