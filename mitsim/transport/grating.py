@@ -17,7 +17,7 @@ cos(theta) d omega is an area element of the unit disc of direction cosines and 
 order reflects eta_m times the part of its lobe inside the disc: never more than eta_m. f depends on w_i| + w_o| only,
 so it is reciprocal. J. Stam, Diffraction Shaders (SIGGRAPH 1999), derives the same dependence from Kirchhoff's
 integral; there the lobes follow from the shape of the grooves, here they are given. Light of orders that do not exist
-(|w_o|| > 1) is lost. No Fresnel term, no polarisation, no interference between orders or between reflections.
+(|w_o|| > 1) is lost. No Fresnel term, no interference between orders or between reflections.
 
 =========================  ====  ===============  ==================================================================
 parameter                  unit  default          meaning
@@ -38,9 +38,9 @@ parameter                  unit  default          meaning
                                                   ``wavelengths`` are given
 =========================  ====  ===============  ==================================================================
 
-The projector is calibration/mp_cl1.toml. Mono variants see the mean over the lines, weighted by shares. RGB variants
-want three lines: the red, green and blue channel see one each, shares are not used. Spectral variants diffract the
-wavelengths that are traced and use neither. Polarised variants see a depolariser. One-sided: black from behind.
+The projector is calibration/mp_cl1.toml. Mono variants see the mean over the lines, weighted by shares (a path over two
+gratings at each of them, where light would keep its line). RGB variants want three lines, one for each channel, and no
+shares. Spectral variants diffract the traced wavelengths and use neither. One-sided; no polarisation.
 
 Lists are texts in scene files and dictionaries ("0.3, 0.15"). ``mi.traverse`` shows ``pitch``, ``sigma``,
 ``sigma_groove``, ``diffuse``, ``reflectance`` and ``efficiencies`` (here from the lowest order to the highest); changes
