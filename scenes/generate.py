@@ -169,6 +169,7 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "photograph/reflectance.png": photograph,
     "colour_chart/projector.png": projector_window,
     "colour_chart/reflectance.png": colour_chart,
+    "compact_disc/projector.png": projector_window,
     "resolution_target/projector.png": projector_window,
     "resolution_target/reflectance.png": resolution_target,
     "corner/projector.png": projector_window,

@@ -21,7 +21,7 @@ from mitsim.scene.load import LoadedScene, load_scene
 from mitsim.scene.patterns import PatternFamily, parse_patterns
 from mitsim.scene.projector import window_at
 from mitsim.sensor.model import SensorModel, load_sensor
-from mitsim.transport import lensless
+from mitsim.transport import plugins
 from mitsim.transport.source import Projector
 
 __all__ = ["DEFAULT_VARIANT", "Bench", "PatternFamily", "ProjectorModel", "SessionRecipe", "load_recipe", "open_bench"]
@@ -212,7 +212,7 @@ def open_bench(
     """
     mi = load_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
-    lensless.register()
+    plugins.register()
     sensor_path = Path(camera) if camera is not None else shipped("calibration", "imx249.toml")
     sensor = load_sensor(sensor_path)
     projector_path = Path(projector) if projector is not None else shipped("calibration", "mp_cl1.toml")

@@ -21,7 +21,7 @@ from mitsim.core.frames import write_frame
 from mitsim.core.manifest import prepare_output, versions
 from mitsim.core.seeds import integer
 from mitsim.scene.load import LoadedScene, load_scene
-from mitsim.transport import lensless
+from mitsim.transport import plugins
 
 FloatArray = npt.NDArray[np.float64]
 ESTIMATORS = ("reference", "factored")
@@ -141,7 +141,7 @@ def render(
     if estimator == "reference":
         mi = load_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
-        lensless.register()
+        plugins.register()
         loaded = load_scene(scene, defines, needs_projector=False)
         started = time.perf_counter()
         frame = reference(loaded, spp, seed, progress)

@@ -32,7 +32,7 @@ from mitsim.optics.frames import ExpectedFrames
 from mitsim.scene.patterns import parse_patterns
 
 PASSES = 8
-FAMILY_ALPHA, CASES = 1e-3, 6
+FAMILY_ALPHA, CASES = 1e-3, 7
 BLOCK = 64
 SUMS = 5 + (512 // BLOCK) ** 2
 LIMIT = float(stats.norm.isf(FAMILY_ALPHA / CASES / SUMS / 2))
@@ -165,6 +165,7 @@ CASE_LIST = [
     PHOTOGRAPH,
     Case("colour_chart", "separable", "uniform", 0, 5e-4, 8),
     Case("resolution_target", "separable", "uniform", 0, 1e-3, 8),
+    Case("compact_disc", "separable", "uniform", 0, 1e-3, 8),
     FLATCAM,
     DOTS,
 ]

@@ -1,0 +1,17 @@
+"""All of mitsim's Mitsuba plugins: one call makes them known to the variant in use."""
+
+from __future__ import annotations
+
+from mitsim.transport import grating, lensless
+
+
+def register() -> None:
+    """Register every plugin for the current variant; calling it again does nothing.
+
+    Raises
+    ------
+    MitsimError
+        when no variant is selected.
+    """
+    lensless.register()
+    grating.register()

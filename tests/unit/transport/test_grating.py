@@ -1,0 +1,416 @@
+"""The grating BSDF against the grating equation, its own formula written again in float64, and its integrals.
+
+Directions are given by their cosines in the tangent plane. The grating vector is the local x axis unless
+said otherwise.
+"""
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+pytestmark = pytest.mark.usefixtures("variant")
+LINES, SHARES = (638.0, 520.0, 445.0), (0.4757, 0.3348, 0.1895)
+SIGNIFICANCE = 1e-4
+SETTINGS = [
+    {},
+    {"efficiencies": "0.2, 0.1", "negative_efficiencies": "0.5, 0.05, 0.02", "sigma": 0.03, "sigma_groove": 0.1},
+    {"efficiencies": "0.1, 0.3", "pitch": 900.0, "diffuse": 0.2, "reflectance": 0.7, "sigma_groove": 0.05},
+]
+
+
+def grating(**parameters: Any) -> Any:
+    import mitsuba as mi
+
+    return mi.load_dict({"type": "mitsim_grating", **parameters})
+
+
+def cosines(theta_degrees: float, phi_degrees: float) -> tuple[float, float]:
+    theta, phi = np.radians(theta_degrees), np.radians(phi_degrees)
+    return float(np.sin(theta) * np.cos(phi)), float(np.sin(theta) * np.sin(phi))
+
+
+def vector(flat: Any) -> Any:
+    """Directions of the upper hemisphere from cosines (2,) or (2, k)."""
+    import mitsuba as mi
+
+    x, y = np.atleast_1d(flat[0]), np.atleast_1d(flat[1])
+    return mi.Vector3f(np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))]))
+
+
+def interaction(wi: Any, count: int = 1) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(7, 0, 0), mi.Vector3f(0, 3, 0)
+    si.wi = vector(wi)
+    return si
+
+
+def evaluate(bsdf: Any, wi: Any, wo: Any) -> tuple[np.ndarray, np.ndarray]:
+    """f cos(theta_o) and pdf at directions given by cosines wi (2,) and wo (2, k)."""
+    import mitsuba as mi
+
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction(wi, np.shape(wo)[1]), vector(wo))
+    return np.array(value, dtype=np.float64)[0], np.array(pdf, dtype=np.float64)
+
+
+def draw(bsdf: Any, si: Any, count: int, seed: int) -> tuple[Any, np.ndarray]:
+    import mitsuba as mi
+
+    random = np.random.default_rng(seed).random((3, count)).astype(np.float32)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(random[0]), mi.Point2f(random[1], random[2]))
+    return bs, np.array(weight, dtype=np.float64)[0]
+
+
+def lobes(bsdf: Any) -> list[tuple[float, float]]:
+    """(part, shift) of every line and order, from the plugin's parameters."""
+    model = bsdf.model
+    share = np.array(model.shares) / sum(model.shares)
+    return [
+        (part * s, m * line / model.pitch)
+        for s, line in zip(share, model.wavelengths, strict=True)
+        for m, part in model.orders.items()
+    ]
+
+
+def widths(bsdf: Any) -> tuple[float, float]:
+    return bsdf.model.sigma, bsdf.model.sigma_groove or bsdf.model.sigma
+
+
+def formula(bsdf: Any, wi: Any, wo: np.ndarray) -> np.ndarray:
+    """f(wi, wo) without reflectance, in float64."""
+    sigma, along = widths(bsdf)
+    x, y = wi[0] + wo[0], wi[1] + wo[1]
+    density = sum(p * stats.norm.pdf(x, shift, sigma) * stats.norm.pdf(y, 0, along) for p, shift in lobes(bsdf))
+    return density + bsdf.model.diffuse / np.pi
+
+
+def reflected_part(bsdf: Any, wi: Any) -> float:
+    """Integral of f cos over the hemisphere: Gaussians over the unit disc, one axis in closed form, one by sums."""
+    sigma, along = widths(bsdf)
+    total = bsdf.model.diffuse
+    for part, shift in lobes(bsdf):
+        low, high = max(-1.0, shift - wi[0] - 9 * sigma), min(1.0, shift - wi[0] + 9 * sigma)
+        if low < high:
+            edges = np.linspace(low, high, 20_001)
+            x = (edges[1:] + edges[:-1]) / 2
+            half = np.sqrt(1 - x**2)
+            inside = stats.norm.cdf((half + wi[1]) / along) - stats.norm.cdf((-half + wi[1]) / along)
+            total += part * float((stats.norm.pdf(x, shift - wi[0], sigma) * inside).sum()) * (high - low) / len(x)
+    return float(bsdf.model.reflectance * total)
+
+
+# ---- directions of the orders
+
+
+@pytest.mark.parametrize("wi", [(0.0, 0.0), cosines(30, 0), cosines(40, 70), cosines(-20, 10)])
+@pytest.mark.parametrize("order", [-2, -1, 0, 1, 2])
+def test_an_order_goes_where_the_grating_equation_says(wi: tuple[float, float], order: int) -> None:
+    """One line and one order: mean of the samples and direction of the peak, in and out of the plane of incidence."""
+    parts = ["0"] * 3
+    parts[abs(order)] = "0.6"
+    below = ", ".join(parts[1:]) if order < 0 else "0"
+    above = ", ".join(parts) if order >= 0 else "0"
+    bsdf = grating(wavelengths=520.0, efficiencies=above, negative_efficiencies=below, sigma=1e-3)
+    expected = np.array([-wi[0] + order * 520 / 1600, -wi[1]])
+    count = 20_000
+    bs, weight = draw(bsdf, interaction(wi, count), count, seed=1)
+    if np.hypot(*expected) > 1.01:
+        assert not weight.any(), "this order does not exist"
+        return
+    assert np.allclose(weight, 0.6, rtol=1e-3)
+    mean = np.array([bs.wo.x, bs.wo.y], dtype=np.float64).mean(axis=1)
+    assert np.abs(mean - expected).max() < 5e-3 / np.sqrt(count) + 1e-6  # 5 standard errors
+    step = np.linspace(-5e-3, 5e-3, 101)
+    grid = expected[:, None, None] + np.stack(np.meshgrid(step, step, indexing="ij"))
+    value = evaluate(bsdf, wi, grid.reshape(2, -1))[0]
+    peak = grid.reshape(2, -1)[:, value.argmax()]
+    assert np.abs(peak - expected).max() < 1.5e-4
+
+
+def test_a_red_line_on_a_compact_disc() -> None:
+    """632.8 nm straight on 1.6 um: first order at 23.3, second at 52.3 degrees, the school experiment."""
+    bsdf = grating(wavelengths=632.8, efficiencies="0.4, 0.2, 0.1", sigma=1e-3)
+    angles = np.radians(np.arange(0.05, 80, 0.05))
+    value = evaluate(bsdf, (0, 0), np.stack([np.sin(angles), 0 * angles]))[0] / np.cos(angles)
+    peaks = (value[1:-1] > value[2:]) & (value[1:-1] >= value[:-2]) & (value[1:-1] > 1)
+    assert np.degrees(angles[1:-1][peaks]) == pytest.approx([23.3, 52.3], abs=0.06)
+
+
+@pytest.mark.parametrize("grooves", ["circular", "linear"])
+@pytest.mark.parametrize("azimuth", [0.0, 77.0, 200.0])
+def test_grooves_lie_as_said_on_a_turned_disc(grooves: str, azimuth: float) -> None:
+    """A tilted, flipped disc hit by a ray, all in world coordinates: order 1 leaves along the radius, or as said."""
+    import mitsuba as mi
+
+    direction = np.array([0.2, 1.0, 0.3])
+    bsdf = grating(
+        grooves=grooves, direction=direction.tolist(), wavelengths=520.0, efficiencies="0, 0.5",
+        negative_efficiencies="0", sigma=1e-3,
+    )  # fmt: skip
+    place = (
+        mi.ScalarAffineTransform4f().translate([3, -2, 400]).rotate([0.6, 0, 0.8], 20).rotate([0, 1, 0], 15).scale(60)
+    )
+    scene = mi.load_dict(
+        {"type": "scene", "disc": {"type": "disk", "to_world": place, "flip_normals": True, "b": bsdf}}
+    )
+    matrix = np.array(place.matrix)
+    radius = matrix[:3, :3] @ [np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0]
+    target = matrix[:3, 3] + 0.5 * radius
+    sight = target - [5, 1, 0]
+    ray = mi.Ray3f(mi.Point3f(5, 1, 0), mi.Vector3f((sight / np.linalg.norm(sight)).tolist()))
+    si = scene.ray_intersect(ray)
+    bs, _ = draw(bsdf, si, 5000, seed=2)
+    out = np.array(si.to_world(bs.wo), dtype=np.float64).mean(axis=1)
+    normal = -matrix[:3, 2] / 60
+    across = radius if grooves == "circular" else direction
+    across = across - normal * (across @ normal)
+    expected = np.array(ray.d, dtype=np.float64).ravel() + 520 / 1600 * across / np.linalg.norm(across)
+    tangential = np.eye(3) - np.outer(normal, normal)
+    assert np.abs(tangential @ (out - expected)).max() < 1e-4  # 5e-3 / sqrt(5000), float32 geometry
+
+
+# ---- values
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_values_are_those_of_the_formula(settings: dict[str, Any]) -> None:
+    bsdf = grating(**settings)
+    random = np.random.default_rng(3)
+    for wi in (0.0, 0.0), cosines(50, 130), cosines(85, 10):
+        shifts = random.choice([shift for _, shift in lobes(bsdf)], 5000)
+        wo = np.stack([shifts - wi[0], 0 * shifts - wi[1]]) + random.normal(0, 0.05, (2, 5000))
+        wo = wo[:, np.hypot(*wo) < 0.999]
+        value, pdf = evaluate(bsdf, wi, wo)
+        cosine = np.sqrt(1 - (wo**2).sum(axis=0))
+        f = formula(bsdf, wi, wo)
+        assert np.allclose(value, bsdf.model.reflectance * f * cosine, rtol=1e-4, atol=1e-4 * f.max())
+        total = bsdf.model.diffuse + sum(bsdf.model.orders.values())
+        assert np.allclose(pdf, f * cosine / total, rtol=1e-4, atol=1e-4 * f.max())
+
+
+def test_eval_and_pdf_alone_agree_with_both_at_once() -> None:
+    import mitsuba as mi
+
+    bsdf, wi, context = grating(diffuse=0.1), cosines(20, 40), mi.BSDFContext()
+    wo = np.random.default_rng(4).uniform(-0.6, 0.6, (2, 100))
+    value, pdf = evaluate(bsdf, wi, wo)
+    si = interaction(wi, 100)
+    assert np.array_equal(np.array(bsdf.eval(context, si, vector(wo)))[0], value.astype(np.float32))
+    assert np.array_equal(np.array(bsdf.pdf(context, si, vector(wo))), pdf.astype(np.float32))
+    sample = mi.Float(0.3), mi.Point2f(0.2, 0.8)
+    joint = bsdf.eval_pdf_sample(context, si, vector(wo), *sample)
+    bs, weight = bsdf.sample(context, si, *sample)
+    assert np.array_equal(np.array(joint[0])[0], value.astype(np.float32))
+    assert np.array_equal(np.array(joint[2].wo), np.array(bs.wo)) and np.array_equal(joint[3], weight)
+
+
+def test_nothing_from_behind_to_behind_or_for_another_kind_of_lobe() -> None:
+    import mitsuba as mi
+
+    bsdf, context = grating(diffuse=0.3), mi.BSDFContext()
+    si = interaction((0.0, 0.0))
+    assert bsdf.eval(context, si, mi.Vector3f(0, 0, 1))[0][0] > 0
+    assert bsdf.eval(context, si, mi.Vector3f(0, 0, -1))[0][0] == 0
+    assert bsdf.sample(context, si, 0.5, mi.Point2f(0.5))[1][0][0] > 0
+    context.type_mask = +mi.BSDFFlags.DeltaReflection
+    assert bsdf.eval(context, si, mi.Vector3f(0, 0, 1))[0][0] == 0
+    assert bsdf.sample(context, si, 0.5, mi.Point2f(0.5))[1][0][0] == 0
+    si.wi = mi.Vector3f(0, 0, -1)
+    assert bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, -1))[0][0] == 0
+    assert bsdf.sample(mi.BSDFContext(), si, 0.5, mi.Point2f(0.5))[1][0][0] == 0
+
+
+def test_mono_is_the_mean_over_the_lines_of_the_projector() -> None:
+    wo = np.random.default_rng(6).uniform(-0.6, 0.6, (2, 2000))
+    single = [evaluate(grating(wavelengths=line), (0.1, 0.2), wo)[0] for line in LINES]
+    assert np.allclose(evaluate(grating(), (0.1, 0.2), wo)[0], np.tensordot(SHARES, single, 1), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("other", ["llvm_ad_rgb", "llvm_ad_spectral"])
+def test_colour_variants_diffract_each_channel_by_its_own_wavelength(other: str) -> None:
+    """In a process of its own; the peak of each channel is where its line goes, and samples weigh what they should."""
+    program = f"""
+from mitsim.core.environment import load_variant
+mi = load_variant({other!r})
+mi.set_log_level(mi.LogLevel.Error)
+import drjit as dr, numpy as np
+from mitsim.transport import plugins
+plugins.register()
+bsdf = mi.load_dict({{"type": "mitsim_grating", "efficiencies": "0, 0.5", "negative_efficiencies": "0"}})
+si = dr.zeros(mi.SurfaceInteraction3f, 1)
+si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))
+si.wi, si.dp_du = mi.Vector3f(0, 0, 1), mi.Vector3f(1, 0, 0)
+lines = [638.0, 520.0, 445.0, 580.0][:len(mi.Spectrum())]
+if mi.is_spectral:
+    si.wavelengths = mi.UnpolarizedSpectrum(lines)
+x = np.linspace(0.2, 0.5, 3001)
+wo = mi.Vector3f(x, 0 * x, np.sqrt(1 - x**2))
+peaks = x[(np.array(bsdf.eval(mi.BSDFContext(), si, wo)) / np.sqrt(1 - x**2)).argmax(axis=1)]
+assert np.allclose(peaks, np.array(lines) / 1600, atol=1.1e-4), peaks
+random = mi.Float(np.random.default_rng(7).random((3, 100000)).astype(np.float32).ravel())
+u = dr.unravel(mi.Vector3f, random, order="F")
+bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))
+mean = np.array(weight).mean(axis=1)  # variance of weights is below (channels x 0.5)^2
+assert np.allclose(mean, 0.5, atol=5 * 2 / 100000**0.5), mean
+if mi.is_rgb:
+    try:
+        mi.load_dict({{"type": "mitsim_grating", "wavelengths": "500, 600"}})
+    except RuntimeError as error:
+        assert "wants three" in str(error)
+    else:
+        raise AssertionError("two lines for three channels")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+# ---- energy and sampling
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_drawn_directions_follow_the_density(settings: dict[str, Any]) -> None:
+    """Chi-square over cells of direction cosines, expectations in closed form: a million samples, significance 1e-4.
+
+    Cells on the rim and samples that left the hemisphere are one cell. A bug that moves 1 % of the light moves 10 000.
+    """
+    bsdf, count = grating(**settings), 1_000_000
+    sigma, along = widths(bsdf)
+    edges = np.linspace(-1, 1, 51)
+    total = bsdf.model.diffuse + sum(bsdf.model.orders.values())
+    far = np.maximum(np.abs(edges[1:]), np.abs(edges[:-1]))
+    inside = np.hypot(far[:, None], far[None, :]) < 1
+    for wi in (0.0, 0.0), cosines(35, 60):
+        chance = np.full((50, 50), bsdf.model.diffuse / total * 0.04**2 / np.pi)
+        for part, shift in lobes(bsdf):
+            across = np.diff(stats.norm.cdf(edges, shift - wi[0], sigma))
+            chance += part / total * np.outer(across, np.diff(stats.norm.cdf(edges, -wi[1], along)))
+        bs, weight = draw(bsdf, interaction(wi, count), count, seed=8)
+        valid = np.array(bs.pdf) > 0
+        assert np.allclose(weight[valid], bsdf.model.reflectance * total, rtol=1e-4) and not weight[~valid].any()
+        found = np.histogram2d(np.array(bs.wo.x)[valid], np.array(bs.wo.y)[valid], bins=(edges, edges))[0]
+        often = inside & (chance * count > 10)
+        observed = np.append(found[often], count - found[often].sum())
+        expected = count * np.append(chance[often], 1 - chance[often].sum())
+        statistic = (np.square(observed - expected) / expected).sum()
+        assert stats.chi2.sf(statistic, len(expected) - 1) > SIGNIFICANCE
+        # The rest of the lobes is lost beyond the rim.
+        kept = reflected_part(bsdf, wi) / bsdf.model.reflectance / total
+        assert abs(valid.mean() - kept) < 5 * np.sqrt(max(kept * (1 - kept), 0) / count) + 1e-5
+
+
+def test_the_furnace_in_a_render() -> None:
+    """A disc under uniform light of radiance 1, seen by a distant camera: `path` finds the reflected part, 512 pixels.
+
+    The weights of all samples are equal, so the only noise is which of them leave the hemisphere.
+    """
+    import mitsuba as mi
+
+    for angle in 0.0, 60.0, 80.0:
+        settings = {"grooves": "linear", "diffuse": 0.1, "efficiencies": "0.3, 0.2", "sigma_groove": 0.06}
+        view = mi.ScalarAffineTransform4f().look_at(
+            [4 * np.sin(np.radians(angle)), 0, 4 * np.cos(np.radians(angle))], [0, 0, 0], [0, 1, 0]
+        )
+        film = {"type": "hdrfilm", "width": 16, "height": 32, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+        size = mi.ScalarAffineTransform4f().scale([0.1, 0.1, 1])
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "path", "max_depth": 4},
+                "camera": {"type": "orthographic", "to_world": view @ size, "film": film},
+                "disc": {"type": "disk", "bsdf": {"type": "mitsim_grating", **settings}},
+                "light": {"type": "constant"},
+            }
+        )
+        image = np.array(mi.render(scene, spp=256, seed=9), dtype=np.float64)
+        expected = reflected_part(grating(**settings), cosines(angle, 0))
+        assert expected < 0.8 + 1e-9
+        # Half a sample's range of 0.8 bounds its deviation; 131 072 samples, 5 standard errors.
+        assert abs(image.mean() - expected) < 5 * 0.4 / np.sqrt(image.size * 256) + 1e-5
+
+
+def test_well_inside_the_hemisphere_all_efficiencies_come_back_and_none_are_added_at_grazing_light() -> None:
+    bsdf = grating(efficiencies="0.3, 0.35", wavelengths=445.0)
+    assert reflected_part(bsdf, (0.0, 0.0)) == pytest.approx(1.0, abs=1e-6)
+    step = 0.002
+    axis = np.arange(-1 + step / 2, 1, step)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij")).reshape(2, -1)
+    grid = grid[:, np.hypot(*grid) < 1]
+    cosine = np.sqrt(1 - (grid**2).sum(axis=0))
+    for theta, phi in [(0, 0), (20, 45), (45, 90), (60, 0), (80, 200), (89, 30), (89.9, 0), (89.9, 90)]:
+        wi = cosines(theta, phi)
+        found = (evaluate(bsdf, wi, grid)[0] / cosine).sum() * step**2
+        assert found <= 1 + 1e-4
+        # A lobe of density 0.35 / (2 pi 0.02^2) cut by the rim: half a cell along at most 0.1 of rim.
+        assert found == pytest.approx(reflected_part(bsdf, wi), abs=2e-3)
+        if theta < 45:
+            assert found == pytest.approx(1.0, abs=1e-4)
+
+
+# ---- parameters
+
+
+HOSTILE = {
+    "pitch of nothing": ({"pitch": 0.0}, "pitch"),
+    "pitch below nothing": ({"pitch": -1600.0}, "pitch"),
+    "pitch that is no number": ({"pitch": float("nan")}, "pitch"),
+    "too much light": ({"efficiencies": "0.4, 0.31"}, "sum of 1.02"),
+    "too much with the diffuse part": ({"efficiencies": "0.4, 0.3", "diffuse": 0.1}, "sum of 1.1"),
+    "too much below 0": ({"efficiencies": "0.4", "negative_efficiencies": "0.5, 0.2"}, "sum of 1.1"),
+    "negative light": ({"efficiencies": "0.4, -0.1"}, "efficiencies.1: got -0.1"),
+    "no order": ({"efficiencies": " "}, "efficiencies"),
+    "words": ({"efficiencies": "many"}, "numbers separated by commas"),
+    "too many orders": ({"efficiencies": ", ".join(["0.01"] * 18)}, "efficiencies"),
+    "no lobe": ({"sigma": 0.0}, "sigma"),
+    "no lobe along the grooves": ({"sigma_groove": -0.1}, "sigma_groove"),
+    "gain": ({"reflectance": 1.5}, "reflectance"),
+    "negative diffuse": ({"diffuse": -0.1}, "diffuse"),
+    "darkness": ({"wavelengths": "0, 500"}, "wavelengths"),
+    "too few shares": ({"wavelengths": "500, 600", "shares": "1"}, "one number for each line"),
+    "shares of nothing": ({"shares": "0, 0, 0"}, "not all 0"),
+    "no direction": ({"direction": [0.0, 0.0, 0.0]}, "direction"),
+    "other grooves": ({"grooves": "spiral"}, "'circular' or 'linear'"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_no_grating_can_have_is_refused_in_one_line(name: str) -> None:
+    settings, words = HOSTILE[name]
+    with pytest.raises(RuntimeError) as caught:
+        grating(**settings)
+    last = str(caught.value).strip().splitlines()[-1]
+    assert "MitsimError: mitsim_grating: " in last and words in last, last
+
+
+def test_parameters_can_be_changed_and_are_checked_again() -> None:
+    import mitsuba as mi
+
+    bsdf = grating(diffuse=0.1)
+    parameters = mi.traverse(bsdf)
+    parameters["pitch"] = 1000.0
+    parameters["efficiencies"] = mi.Float([0.05, 0.1, 0.4, 0.2, 0.0])
+    parameters.update()
+    wo = np.random.default_rng(10).uniform(-0.6, 0.6, (2, 500))
+    changed = grating(diffuse=0.1, pitch=1000.0, efficiencies="0.4, 0.2, 0", negative_efficiencies="0.1, 0.05")
+    assert np.allclose(evaluate(bsdf, (0.1, 0), wo), evaluate(changed, (0.1, 0), wo), rtol=1e-5, atol=1e-6)
+    parameters["sigma"] = 0.0
+    with pytest.raises(Exception, match="sigma: got 0"):
+        parameters.update()
+
+
+def test_orders_are_symmetric_unless_both_sides_are_given() -> None:
+    assert grating(efficiencies="0.3, 0.2, 0.1").model.orders == {-2: 0.1, -1: 0.2, 0: 0.3, 1: 0.2, 2: 0.1}
+    blazed = grating(efficiencies="0.3, 0.2", negative_efficiencies="0.05, 0.4").model
+    assert blazed.orders == {-2: 0.4, -1: 0.05, 0: 0.3, 1: 0.2}
+
+
+def test_registering_needs_a_variant() -> None:
+    program = "from mitsim.transport import grating; grating.register()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1 and "MitsimError: no Mitsuba variant is selected" in done.stderr
