@@ -40,6 +40,9 @@ Accuracy = Annotated[float, typer.Option(help="relative rms error of the expecte
 Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", metavar="FILE.toml")]
 ProjectorFile = Annotated[Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")]
 Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
+Effects = Annotated[
+    str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")
+]
 Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
 
 
@@ -124,29 +127,23 @@ def plan(
     camera: Camera = None,
     projector: ProjectorFile = None,
     define: Defines = None,
+    effects: Effects = "",
     variant: Variant = "llvm_ad_mono",
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.capture.light import make_plan
+    from mitsim.capture.run import plan_block
+    from mitsim.scene.plan import parse_effects
 
+    forced = parse_effects(effects)
     bench = _bench(scene, variant, camera, projector, define)
     labels, weights = bench.family(patterns, seed).classes()
-    made = make_plan(bench, labels, weights, accuracy, seed)
-    payload = {
-        "effects": [asdict(effect) for effect in made.effects],
-        "accuracy": made.accuracy,
-        "predicted_seconds": made.predicted_seconds,
-        "settings": {
-            "anchors": made.anchors,
-            "subdivision": made.subdivision,
-            "depth": made.depth,
-            "sampling_target": made.sampling_target,
-            "systematic_error": made.systematic_error,
-        },
-        "warnings": made.warnings,
-    }
+    made = make_plan(bench, labels, weights, accuracy, seed, forced)
+    block = plan_block(made)
+    payload = {key: block[key] for key in ("effects", "accuracy", "predicted_seconds", "settings", "warnings")}
+    payload |= {"sampling_target": made.sampling_target, "systematic_error": made.systematic_error}
     if not as_json:
         _print_plan(made)
     return _finish(as_json, payload, [], made.warnings)
@@ -162,6 +159,10 @@ def capture(
     projector: ProjectorFile = None,
     exposure: Annotated[str, typer.Option(help="seconds a frame, or auto", metavar="auto|SECONDS")] = "auto",
     exposure_fraction: Annotated[float, typer.Option(help="brightest pixel, as a part of full well")] = 0.8,
+    effects: Effects = "",
+    noise_fraction: Annotated[
+        float | None, typer.Option(help="stop sampling at this part of the sensor's noise", metavar="PART")
+    ] = None,
     seed: Seed = 0,
     define: Defines = None,
     resume: Annotated[bool, typer.Option("--resume", help="finish an interrupted run")] = False,
@@ -172,11 +173,15 @@ def capture(
     """Render, expose and write one frame for each pattern."""
     from mitsim.capture.exposer import Exposure
     from mitsim.capture.run import capture as run_capture
+    from mitsim.scene.plan import parse_effects
 
+    forced = parse_effects(effects)
     chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
     with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define)
-        result = run_capture(bench, patterns, output, accuracy, seed, chosen, resume, progress)
+        result = run_capture(
+            bench, patterns, output, accuracy, seed, chosen, resume, progress, forced, noise_fraction
+        )
     payload = {key: value for key, value in asdict(result).items() if key != "plan"}
     seconds = result.seconds
     lines = [
@@ -258,17 +263,30 @@ def render(
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
     define: Defines = None,
+    effects: Effects = "",
     variant: Variant = "llvm_ad_mono",
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
     from mitsim.capture.render import render as run_render
+    from mitsim.scene.plan import parse_effects
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
     with _work(output, quiet or as_json) as progress:
-        result = run_render(_scene(scene), output, estimator, spp, accuracy, seed, variant, _defines(define), progress)
+        result = run_render(
+            _scene(scene),
+            output,
+            estimator,
+            spp,
+            accuracy,
+            seed,
+            variant,
+            _defines(define),
+            progress,
+            parse_effects(effects),
+        )
     lines = [
         f"{result.estimator}: mean irradiance {result.mean:.4e} W/m^2, relative noise {result.mc_error:.1e}, "
         f"{result.seconds:.2f} s: {result.output}"

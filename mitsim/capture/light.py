@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.simulation import Simulation
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames, FrameOptics, relative_error
-from mitsim.scene.plan import Plan, SceneFacts, check_accuracy, decide
-from mitsim.transport import pilot
-from mitsim.transport.cells import CellGrid, aligned_grid
-from mitsim.transport.factored import LightSample, Tracer
+from mitsim.optics.frames import ExpectedFrames, relative_error
+from mitsim.scene.plan import GROUPS, Plan, SceneFacts, Settings, check_accuracy, decide
 
 __all__ = [
     "Light",
@@ -24,7 +23,6 @@ __all__ = [
     "Progress",
     "check_accuracy",
     "collect",
-    "grid_for",
     "make_plan",
     "pinhole_view",
     "silent",
@@ -34,10 +32,12 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 Progress = Callable[[str, float], None]
-GROUPS = 8
+Target = Callable[[ExpectedFrames], float]
 _CHECKED_CAPTURES = 8
 _MOST_PATHS = 2**32
 _LARGEST_GROWTH = 8.0
+_LANES_AT_ONCE = 2**21
+"""Paths whose light is held in memory at a time."""
 
 
 def silent(stage: str, fraction: float) -> None:
@@ -46,70 +46,97 @@ def silent(stage: str, fraction: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Sampled light of one scene: any pattern family on the same projector can be formed from it.
+    """Sampled light of one scene.
 
     Attributes
     ----------
     groups
-        independent estimates, (projector pixels, anchors x cells) each [W m^-2].
-    optics
-        the closed-form part that turns light into frames.
+        independent estimates, (rows + 1, places) each [W m^-2]; the last row is ambient light.
+    simulation
+        what was simulated; it turns light into frames.
+    labels
+        (n^2,) row of each projector pixel: its class, or the pixel itself when any family is to be formed.
+    flux
+        (n^2,) irradiance that each pixel's direct light casts on the sensor without the mask, mean over the sensor.
     paths
-        rays traced for them.
+        rays traced from the camera.
     sampling_error
-        relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the plan's target.
+        relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     """
 
     groups: tuple[sparse.csr_array, ...]
-    optics: FrameOptics
+    simulation: Simulation
+    labels: Labels
+    flux: FloatArray
     paths: int
     sampling_error: float
     reached: bool
 
     def frames(self, labels: Labels, weights: FloatArray, seed: int) -> ExpectedFrames:
-        """Expected frames of the captures that ``labels`` (n^2,) and ``weights`` (captures, classes) describe."""
-        return ExpectedFrames(self.optics, self.groups, labels, weights, seed)
+        """Expected frames of the captures that ``labels`` (n^2,) and ``weights`` (captures, classes) describe.
+
+        Light by pixel serves every family; light by class only families that never split one of its classes.
+        """
+        rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
+        rows[self.labels] = labels
+        if not np.array_equal(rows[self.labels], labels):
+            raise ValueError("the light was collected for another family of patterns")
+        exact = self.simulation.mirrored(labels)
+        return self.simulation.expected(self.groups, rows, weights, seed, exact)
 
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""
         return replace(self, groups=(sum(self.groups[1:], self.groups[0]) / len(self.groups),))
 
-    def flux(self) -> FloatArray:
-        """(projector pixels,) irradiance that each pixel's light casts toward the camera, without the mask."""
-        return np.asarray(sum(self.optics.total(group) for group in self.groups) / len(self.groups))
+
+def make_plan(
+    bench: Bench,
+    labels: Labels,
+    weights: FloatArray,
+    accuracy: float,
+    seed: int,
+    forced: Mapping[str, bool] | None = None,
+) -> Plan:
+    """Look at the scene for a moment and decide what to simulate; ``forced`` overrides effects by name."""
+    check_accuracy(accuracy)
+    evidence = pilot.measure(bench, labels, weights, accuracy, seed)
+    return decide(accuracy, evidence, len(weights), scene_facts(bench), forced)
 
 
-def make_plan(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, seed: int) -> Plan:
-    """Look at the scene for a moment and decide what to simulate."""
-    view = pilot.View(bench.loaded.scene, bench.loaded.camera, bench.source, bench.windows)
-    evidence = pilot.measure(view, labels, weights, seed)
-    wavelength = bench.projector.effective_wavelength_nm
-    facts = SceneFacts(
-        other_emitters=bench.loaded.other_emitters,
-        fresnel_number=bench.geometry.fresnel_number(wavelength),
-        wavelength_nm=wavelength,
+def scene_facts(bench: Bench) -> SceneFacts:
+    """What the plan says of a bench's devices."""
+    geometry, projector = bench.geometry, bench.projector
+    fresnel = geometry.fresnel_number(projector.effective_wavelength_nm)
+    warnings = []
+    if bench.field_stop_cuts:
+        warnings.append(
+            "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred over "
+            "the anchors, so open it or accept an error there"
+        )
+    if geometry.wall_shift_features >= 1:
+        warnings.append(
+            f"mask_thickness {geometry.mask_thickness} mm shifts the far face by {geometry.wall_shift_features:.1f} "
+            "features at the field stop; the two-face model holds below 1"
+        )
+    return SceneFacts(
+        absent={
+            "mirrors": "no surface reflects or transmits light in single directions",
+            "ambient": "the projector is the only emitter",
+            "mask-thickness": "the mask is thin",
+            "pixel-response": "pixels are fully sensitive, whatever the angle",
+            "aperture": "the projector is a pinhole: sharp at all distances",
+            "blur": "the projector's pixels are sharp",
+            "black-level": "the projector's black is black",
+            "speckle": "the projector file gives no speckle contrast",
+        },
+        notes={
+            "diffraction": f"a mask feature's Fresnel number is {fresnel:.1f} at "
+            f"{projector.effective_wavelength_nm:.0f} nm, {len(bench.spectrum.weights)} line(s)",
+            "ambient": f"{len(bench.loaded.lamps)} emitter(s) beside the projector",
+        },
         keystone=bench.loaded.pixels.keystone,
-        field_stop_cuts=bench.field_stop_cuts,
+        warnings=tuple(warnings),
     )
-    cells = {choice: math.prod(grid_for(bench, choice).shape) for choice in evidence.cell_error}
-    return decide(
-        accuracy,
-        evidence.anchor_error,
-        evidence.cell_error,
-        evidence.sampling_error,
-        cells,
-        evidence.seconds_per_batch,
-        evidence.seconds_per_path,
-        evidence.depth,
-        evidence.depth_spread_error,
-        len(weights),
-        facts,
-    )
-
-
-def grid_for(bench: Bench, subdivision: int) -> CellGrid:
-    """Cells aligned with the projector's pixels on the rig's plane, covering the field stop."""
-    return aligned_grid(*bench.windows, bench.n, subdivision, bench.geometry.tan_half_fov)
 
 
 def collect(
@@ -120,33 +147,76 @@ def collect(
     seed: int,
     progress: Progress = silent,
     purpose: str = "scene",
+    by_pixel: bool = True,
+    target: Target | None = None,
 ) -> Light:
     """Trace until the Monte Carlo error of the frames meets the plan's target, or the limit of 2^32 paths.
 
-    Each group gets the same number of batches; a few captures, evenly spread, are formed to see the error. ``purpose``
-    names the random streams: light for two purposes shares none.
+    Each group gets the same number of samples; a few captures, evenly spread, are formed to see the error. ``purpose``
+    names the random streams: light for two purposes shares none. ``by_pixel`` keeps the light of every projector pixel
+    apart, for other families than this one. ``target`` gives the error to stop at from the frames seen so far, where
+    the plan's own is not wanted.
     """
-    grid = grid_for(bench, plan.subdivision)
-    tracer = Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid, plan.anchors, plan.depth)
-    optics = FrameOptics(bench.geometry, grid.rows.edges, grid.columns.edges, plan.depth, plan.anchors)
+    simulation = Simulation(bench, plan.settings)
+    kept = np.arange(bench.n**2) if by_pixel else labels
     chosen = np.unique(np.linspace(0, len(weights) - 1, min(len(weights), _CHECKED_CAPTURES)).astype(int))
-    sums: list[sparse.csr_array | None] = [None] * GROUPS
-    done, wanted, error = 0, 1, math.inf
+    groups = [_Group(simulation, kept, integer(seed, "transport", purpose, group)) for group in range(GROUPS)]
+    wanted = 1
+    lanes = simulation.tracer.lanes
     while True:
-        for index in range(done, wanted):
-            for group in range(GROUPS):
-                sample = tracer.batch(integer(seed, "transport", purpose, group, index))
-                sums[group] = _add(sums[group], sample)
-        done = wanted
-        groups = tuple(total / done for total in sums if total is not None)
-        error = relative_error(ExpectedFrames(optics, groups, labels, weights[chosen], seed))
-        progress("transport", min(1.0, (plan.sampling_target / error) ** 2) if error > 0 else 1.0)
-        paths = done * GROUPS * tracer.lanes
-        if error <= plan.sampling_target or paths >= _MOST_PATHS:
-            return Light(groups, optics, paths, error, error <= plan.sampling_target)
-        growth = min(1.1 * (error / plan.sampling_target) ** 2, _LARGEST_GROWTH)
-        most = max(done + 1, _MOST_PATHS // (GROUPS * tracer.lanes))
-        wanted = min(max(done + 1, math.ceil(done * growth)), most)
+        for group in groups:
+            group.sample(wanted)
+        light = Light(
+            groups=tuple(group.light for group in groups),
+            simulation=simulation,
+            labels=kept,
+            flux=np.asarray(sum(group.flux for group in groups) / GROUPS),
+            paths=wanted * GROUPS * lanes,
+            sampling_error=math.inf,
+            reached=False,
+        )
+        expected = light.frames(labels, weights[chosen], seed)
+        error = relative_error(expected)
+        goal = target(expected) if target else plan.sampling_target
+        progress("transport", min(1.0, (goal / error) ** 2) if error > 0 else 1.0)
+        if error <= goal or light.paths >= _MOST_PATHS:
+            return replace(light, sampling_error=error, reached=error <= goal)
+        # The error falls at least with the square root of the samples; where it falls faster, less is needed.
+        growth = min(1.1 * (error / goal) ** (2 if "interreflection" in plan.settings.effects else 1.2), _LARGEST_GROWTH)
+        wanted = min(max(wanted + 1, math.ceil(wanted * growth)), max(wanted + 1, _MOST_PATHS // (GROUPS * lanes)))
+
+
+class _Group:
+    """One independent estimate of the light: the sum over its samples so far."""
+
+    def __init__(self, simulation: Simulation, labels: Labels, seed: int) -> None:
+        self.simulation, self.labels, self.seed = simulation, labels, seed
+        self.done = 0
+        self._light: sparse.csr_array | None = None
+        self._flux = np.zeros(simulation.bench.n**2)
+
+    def sample(self, wanted: int) -> None:
+        """Trace up to the sample number ``wanted`` of the sequence."""
+        at_once = max(1, _LANES_AT_ONCE // self.simulation.tracer.lanes)
+        while self.done < wanted:
+            count = min(at_once, wanted - self.done)
+            found = self.simulation.tracer.trace(self.seed, self.done, count)
+            light = self.simulation.file(found, self.labels, 1)
+            self._light = light if self._light is None else self._light + light
+            self._flux += self.simulation.flux(found, 1)
+            self.done += count
+
+    @property
+    def light(self) -> sparse.csr_array:
+        """(rows + 1, places) mean over the samples [W m^-2]."""
+        assert self._light is not None
+        return self._light / self.done
+
+    @property
+    def flux(self) -> FloatArray:
+        """(n^2,) mean over the samples."""
+        return self._flux / self.done
+
 
 
 def uniform_light(n: int) -> tuple[Labels, FloatArray]:
@@ -157,19 +227,16 @@ def uniform_light(n: int) -> tuple[Labels, FloatArray]:
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:
     """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
 
-    One path a cell, four cells a side of a projector pixel; 0 where the projector does not light the board.
+    Direct light, one path a cell, four cells a side of a projector pixel; 0 where the projector does not light the
+    board.
     """
-    grid = grid_for(bench, 4)
-    one = [
-        np.asarray(
-            Tracer(b.loaded.scene, b.loaded.camera, b.source, grid, anchors=1)
-            .batch(integer(seed, "view"))
-            .light.sum(axis=0)
-        ).reshape(grid.shape)
-        for b in (bench, bench.with_board(board_reflectance))
-    ]
-    return np.asarray(np.divide(one[0], one[1], out=np.zeros(grid.shape), where=one[1] > 0))
+    settings = Settings(depth=bench.geometry.scene_distance)
 
+    def seen(which: Bench) -> FloatArray:
+        simulation = Simulation(which, settings, pixels=4 * bench.n)
+        found = simulation.tracer.trace(integer(seed, "view"))
+        light = simulation.file(found, np.zeros(bench.n**2, dtype=np.int64), 1)[[0]].toarray()
+        return np.asarray(light).reshape(simulation.bundle.cells)
 
-def _add(total: sparse.csr_array | None, sample: LightSample) -> sparse.csr_array:
-    return sample.light if total is None else total + sample.light
+    scene, board = seen(bench), seen(bench.with_board(board_reflectance))
+    return np.asarray(np.divide(scene, board, out=np.zeros(scene.shape), where=board > 0))

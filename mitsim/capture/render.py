@@ -123,6 +123,7 @@ def render(
     variant: str = "llvm_ad_mono",
     defines: Mapping[str, str] | None = None,
     progress: Progress = silent,
+    effects: Mapping[str, bool] | None = None,
 ) -> RenderResult:
     """Write one frame of irradiance [W m^-2] and its standard error to ``output``.
 
@@ -149,8 +150,8 @@ def render(
         bench = open_bench(scene, variant, defines=defines, check_camera=False)
         started = time.perf_counter()
         uniform = uniform_light(bench.n)
-        plan = make_plan(bench, *uniform, accuracy, seed)
-        light = collect(bench, plan, *uniform, seed, progress)
+        plan = make_plan(bench, *uniform, accuracy, seed, effects)
+        light = collect(bench, plan, *uniform, seed, progress, by_pixel=False)
         warnings = plan.warnings
         found = next(iter(light.frames(*uniform, seed)))
         irradiance = found.irradiance[..., None]

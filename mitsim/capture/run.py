@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,17 @@ from mitsim.capture.clock import Clock
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
 from mitsim.capture.folder import RunFolder, claimed, frame_name
 from mitsim.capture.light import Light, Progress, collect, make_plan, silent, uniform_light
+from mitsim.core.errors import MitsimError
 from mitsim.core.frames import Channel
 from mitsim.core.manifest import versions
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import Capture, PatternFamily
-from mitsim.scene.plan import Plan
+from mitsim.scene.plan import Plan, Settings
 from mitsim.sensor.chain import Digital
 
 FloatArray = npt.NDArray[np.float64]
+_OF_PROJECTOR = frozenset({"aperture", "blur", "pixel-response"})
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ def capture(
     exposure: Exposure | None = None,
     resume: bool = False,
     progress: Progress = silent,
+    effects: Mapping[str, bool] | None = None,
+    noise_fraction: float | None = None,
 ) -> CaptureResult:
     """Render, expose and write every frame of a pattern family.
 
@@ -69,6 +73,8 @@ def capture(
     """
     exposure = exposure or Exposure()
     exposure.check(bench)
+    if noise_fraction is not None and not 0 < noise_fraction <= 1:
+        raise MitsimError(f"--noise-fraction {noise_fraction}: give a part of the sensor's noise above 0, up to 1")
     family = bench.family(patterns, seed)
     configuration = {
         **bench.provenance(),
@@ -77,15 +83,18 @@ def capture(
         "accuracy": accuracy,
         "seed": seed,
         "exposure": asdict(exposure),
+        "effects": dict(effects or {}),
+        "noise_fraction": noise_fraction,
     }
     digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
     clock = Clock()
     labels, weights = family.classes()
     with claimed(Path(output), digest, configuration, resume) as folder:
         with clock.stage("plan"):
-            plan = make_plan(bench, labels, weights, accuracy, seed)
+            plan = make_plan(bench, labels, weights, accuracy, seed, effects)
+        target = _NoiseTarget(bench, exposure, noise_fraction, seed) if noise_fraction is not None else None
         with clock.stage("transport"):
-            light = collect(bench, plan, labels, weights, seed, progress)
+            light = collect(bench, plan, labels, weights, seed, progress, by_pixel=False, target=target)
         with clock.stage("truth"):
             reflectance = truth(bench, plan, light, seed)
         expected = light.frames(labels, weights, seed)
@@ -113,6 +122,28 @@ def capture(
         )
         folder.finish(_manifest(bench, family, result, light.paths))
     return result
+
+
+@dataclass(frozen=True)
+class _NoiseTarget:
+    """Monte Carlo error at which more sampling buys nothing: a part of the sensor's own relative noise."""
+
+    bench: Bench
+    exposure: Exposure
+    fraction: float
+    seed: int
+
+    def __call__(self, expected: ExpectedFrames) -> float:
+        peak = max(float(frame.irradiance.max()) for frame in expected)
+        if peak <= 0:
+            return np.inf
+        exposer = Exposer(self.bench, self.exposure.choose(self.bench, peak), self.seed)
+        noise = energy = 0.0
+        for frame in expected:
+            electrons = exposer.electrons(frame)
+            noise += exposer.sensor_noise(electrons) ** 2 * electrons.size
+            energy += float(np.square(electrons).sum())
+        return self.fraction * float(np.sqrt(noise / energy))
 
 
 @dataclass(frozen=True)
@@ -226,12 +257,18 @@ def truth(bench: Bench, plan: Plan, light: Light, seed: int) -> FloatArray:
 
     The board is the session's, so a board of reflectance 0.99 counts as 1 (DESIGN section 5).
     """
-    board = collect(
-        bench.with_board(load_recipe().board_reflectance), plan, *uniform_light(bench.n), seed, purpose="board"
-    )
-    reference = board.flux()
-    ratio = np.divide(light.flux(), reference, out=np.zeros_like(reference), where=reference > 0)
+    reference = board_flux(bench, plan, seed)
+    ratio = np.divide(light.flux, reference, out=np.zeros_like(reference), where=reference > 0)
     return ratio.reshape(bench.n, bench.n)
+
+
+def board_flux(bench: Bench, plan: Plan, seed: int) -> FloatArray:
+    """(n^2,) direct light of each projector pixel on the sensor, over the calibration board [W m^-2]."""
+    settings = Settings(bench.geometry.scene_distance, plan.settings.anchors, effects=_OF_PROJECTOR & plan.settings.effects)
+    board = bench.with_board(load_recipe().board_reflectance)
+    return collect(
+        board, replace(plan, settings=settings), *uniform_light(bench.n), seed, purpose="board", by_pixel=False
+    ).flux
 
 
 def pattern_block(family: PatternFamily, files: Sequence[str]) -> dict[str, Any]:
@@ -246,6 +283,12 @@ def pattern_block(family: PatternFamily, files: Sequence[str]) -> dict[str, Any]
             for file, c in zip(files, family.captures, strict=True)
         ],
     }
+
+
+def plan_block(plan: Plan) -> dict[str, Any]:
+    """A plan as JSON."""
+    settings = {**asdict(plan.settings), "effects": sorted(plan.settings.effects)}
+    return {**asdict(plan), "settings": settings}
 
 
 def digital_block(bench: Bench, exposure_s: float) -> dict[str, float]:
@@ -264,7 +307,7 @@ def _manifest(bench: Bench, family: PatternFamily, result: CaptureResult, paths:
         "camera": bench.identity(),
         "digital": digital_block(bench, result.exposure_s),
         "patterns": pattern_block(family, [frame_name(index) for index in range(result.frames)]),
-        "plan": asdict(result.plan),
+        "plan": plan_block(result.plan),
         "mc_error": result.mc_error,
         "mc_to_sensor_noise": result.mc_to_sensor_noise,
         "paths": paths,

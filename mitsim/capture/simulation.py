@@ -33,8 +33,8 @@ AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 class Simulation:
     """A bench with settings; its parts are prepared when they are first asked for."""
 
-    def __init__(self, bench: Bench, settings: Settings, common: bool = False, coarse: int = 0) -> None:
-        """``common``: anchors share their random numbers; ``coarse``: cells of so many projector pixels a side."""
+    def __init__(self, bench: Bench, settings: Settings, common: bool = False, pixels: int | None = None) -> None:
+        """``common``: anchors share their random numbers; ``pixels``: cells a side of the window, instead of its own."""
         self.bench, self.settings, self.common = bench, settings, common
         on = settings.effects
         neutral: dict[str, float] = {}
@@ -44,7 +44,7 @@ class Simulation:
             neutral |= {"pixel_fill_factor": 1.0, "angular_exponent": 0.0}
         self.geometry: CameraGeometry = bench.geometry.model_copy(update=neutral)
         self.black = bench.projector.black_level if "black-level" in on else 0.0
-        pixels = max(bench.n // coarse, 1) if coarse else bench.n
+        pixels = pixels or bench.n
         self.aim = self._grid(pixels, 1)
         self.bundle = Bundle(self._grid(pixels, settings.subdivision), settings.anchors, settings.depths, settings.linear)
 

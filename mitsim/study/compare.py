@@ -6,9 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.calibrate.hadamard import Calibration
-from mitsim.capture.bench import Bench, PatternFamily, load_recipe
+from mitsim.capture.bench import Bench, PatternFamily
 from mitsim.capture.exposer import Exposer, Exposure
-from mitsim.capture.light import Light, Plan, Progress, collect, uniform_light
+from mitsim.capture.light import Light, Plan, Progress
+from mitsim.capture.run import board_flux
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solver import Prepared, prepare
@@ -42,8 +43,7 @@ class Comparison:
         """``light`` is the scene's, ``truth`` (n, n) its apparent reflectance; the board's light is sampled here."""
         self.bench, self.light, self.truth, self.seed, self.progress = bench, light, truth, seed, progress
         self.factors = factors.left, factors.right
-        board = bench.with_board(load_recipe().board_reflectance)
-        flux = float(collect(board, plan, *uniform_light(bench.n), seed, purpose="board").flux().mean())
+        flux = float(board_flux(bench, plan, seed).mean())
         self.ideal = ideal_light(bench, truth, flux)
         rate = float(electrons_from_irradiance(1.0, 1.0, bench.sensor, bench.projector.effective_wavelength_nm))
         self.ideal_factors = ideal_factors(bench, flux, rate)

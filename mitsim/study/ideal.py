@@ -12,7 +12,7 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.light import Light
-from mitsim.optics.frames import FrameOptics
+from mitsim.capture.simulation import Simulation
 from mitsim.optics.shadow import Directions
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,11 +23,14 @@ def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Lig
 
     ``reflectance`` is (n, n) relative to the calibration board, ``board_flux`` the board's mean flux a projector pixel.
     """
-    pixels = np.arange(bench.n**2)
-    light = sparse.csr_array((reflectance.ravel() * board_flux, (pixels, pixels)))
-    rows, columns = (np.linspace(*window, bench.n + 1) for window in bench.windows)
-    optics = FrameOptics(bench.geometry, rows, columns, bench.geometry.scene_distance, anchors=1)
-    return Light((light,), optics, paths=0, sampling_error=0.0, reached=True)
+    simulation = Simulation(bench, Settings(bench.geometry.scene_distance))
+    grid, pixels = simulation.bundle.grid, np.arange(bench.n**2)
+    first = [round((w[0] - axis.start) / axis.size) for w, axis in zip(bench.windows, (grid.rows, grid.columns), strict=True)]
+    row, column = np.divmod(pixels, bench.n)
+    places = (row + first[0]) * grid.columns.count + column + first[1]
+    flux = reflectance.ravel() * board_flux
+    light = sparse.csr_array((flux, (pixels, places)), shape=(bench.n**2 + 1, simulation.bundle.size))
+    return Light((light,), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True)
 
 
 def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -> tuple[FloatArray, FloatArray]:
