@@ -190,7 +190,7 @@ class MirrorTracer:
             np.zeros(count, dtype=np.uint64),
             np.ones((count, len(self._colour))),
         )
-        found: list[Crossings] = []
+        found = [Crossings(np.zeros(0, np.int64), rays.chain[:0], np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))]
         for depth in range(self._max_depth + 1):
             if not len(rays.index):
                 break

@@ -186,7 +186,7 @@ def test_dots_by_a_mirror(variant: str) -> None:
 
 
 def test_dots_by_a_mirror_that_casts_a_keystone(variant: str) -> None:
-    """Projector pixels lie askew on the sensor pixels. Coarse sensor pixels, each the mean of 64 x 64 points."""
+    """Projector pixels lie askew on the sensor pixels. Coarse sensor pixels, each the mean of 64 x 64 parts."""
     pixels, pitch, fine = 48, 0.125, 64
     labels, _ = parse_patterns("dots:7", N).classes()
     normal = tilted(2.0, -1.5)
@@ -195,14 +195,17 @@ def test_dots_by_a_mirror_that_casts_a_keystone(variant: str) -> None:
     image = rig.mirrored((place, normal))
     u = ((np.arange(pixels * fine) + 0.5) / fine - pixels / 2) * pitch
     light, row, column = image.irradiance(u[:, None], u)
-    light = REFLECTANCE * light * np.outer(*(code(image.shadow(u, axis)) for axis in (0, 1)))
+    half = pitch / fine / 2
+    masks = [code_mean(image.shadow(u - half, axis), image.shadow(u + half, axis)) for axis in (0, 1)]
+    light = REFLECTANCE * light * np.outer(*masks)
     label = labels[np.floor(row).astype(int) * N + np.floor(column).astype(int)]
     expected = np.stack(
         [(light * (label == c)).reshape(pixels, fine, pixels, fine).mean(axis=(1, 3)) for c in np.unique(label)]
     )
     assert found.classes.tolist() == np.unique(label).tolist()
-    # The points themselves leave 1 / (64 sqrt(12)) of a pixel at each edge, 3e-3.
-    assert relative(found.irradiance, expected) < 5e-3
+    # The points leave 1 / (64 sqrt(12)) of a sensor pixel at each edge of a projector pixel: with 48, 64, 128 of them
+    # the difference is 3.0e-3, 2.2e-3, 1.2e-3.
+    assert relative(found.irradiance, expected) < 3e-3
 
 
 def test_two_mirrors_make_a_periscope(variant: str) -> None:
@@ -241,10 +244,16 @@ def test_a_mirror_out_of_view_gives_nothing(variant: str) -> None:
     # Lit, but outside the field stop: the source's image stands at x = 60, 4.3 degrees from the axis.
     stopped = rig.scene(mirror=mirror((30.0, 0.0, 400.0), BACK), fov=8.0)
     assert rig.frames(stopped, UNIFORM).flux == 0
-    # A sheet of paper before the mirror stops the light, on its way there or back.
-    paper = {"type": "rectangle", "to_world": facing((0, 0, 200), BACK, 8), "bsdf": {"type": "diffuse"}}
-    hidden = rig.scene(mirror=mirror((30.0, 0.0, 400.0), BACK), paper=paper)
-    assert rig.frames(hidden, UNIFORM).flux < 0.5 * rig.frames(rig.scene(mirror=hidden.shapes()[0]), UNIFORM).flux
+
+
+@pytest.mark.parametrize(("x", "passes"), [(45.0, False), (15.0, False), (30.0, True)], ids=["out", "back", "between"])
+def test_paper_in_the_way(x: float, passes: bool) -> None:
+    """Halfway to the mirror the light passes x = 45 on its way out and 15 on its way back."""
+    rig = Rig((60, 0, 0))
+    paper = {"type": "rectangle", "to_world": facing((x, 0, 200), BACK, 6), "bsdf": {"type": "diffuse"}}
+    found = rig.frames(rig.scene(mask="open", mirror=mirror((30.0, 0.0, 400.0), BACK), paper=paper), UNIFORM)
+    full = np.pi * SCALE * REFLECTANCE / 800**2 * (512 * PITCH) ** 2
+    assert found.flux == (pytest.approx(full, rel=1e-5) if passes else 0)
 
 
 def test_no_camera_side_path_finds_this_light(variant: str) -> None:
