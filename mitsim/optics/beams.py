@@ -5,11 +5,9 @@ known, its four corner rays say where it lands, and between them all is bilinear
 at most half a sensor pixel, and each box gives every pixel that it overlaps its part of the flux times the mask's mean
 over the part. Boxes tile what the beam lights, and flux is conserved whatever their shape.
 
-The mask enters as separable terms ``(weight, row sampler, column sampler)``. A sampler takes arrays of centres s and
-widths w (mm, index coordinates in the mask plane) and of tan-angles t, and gives the mean over each [s - w/2, s + w/2]
-of a mask profile for light that comes under t. :func:`geometric_terms` makes them for a thin mask's geometric shadow,
-where t does not matter; profiles of thick masks and wave-optical ones (at the beams' :attr:`Beams.inverse_depth`) fit
-as well. Coordinates are index coordinates (s_row = -y, s_col = -x), centred, in mm.
+The mask enters as separable terms of samplers (:mod:`mitsim.optics.samplers`); a wave-optical one needs the distance of
+the virtual source, :attr:`Beams.inverse_depth`. Coordinates are index coordinates (s_row = -y, s_col = -x), centred, in
+mm.
 """
 
 from __future__ import annotations
@@ -22,11 +20,12 @@ import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.samplers import ProfileSampler, SeparableTerm, geometric_terms
+
+__all__ = ["Beams", "ProfileSampler", "SeparableTerm", "SpecularFrames", "beam_frames", "geometric_terms"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-SeparableTerm = tuple[float, Sampler, Sampler]
 Response = Callable[[FloatArray, FloatArray], FloatArray]
 _BOXES_AT_ONCE = 2**18
 
@@ -95,37 +94,6 @@ class SpecularFrames:
     lit_pixels: IntArray
     flux: float
     unresolved: float
-
-
-class ProfileSampler:
-    """Exact means of a piecewise constant mask profile, zero outside its features."""
-
-    def __init__(self, profile: npt.ArrayLike, feature_mm: float) -> None:
-        """``profile``: (N,) transmission of each feature, centred on the axis; ``feature_mm``: their size [mm]."""
-        values = np.asarray(profile, dtype=np.float64)
-        self._values = np.concatenate(([0.0], values, [0.0]))
-        self._sums = np.concatenate(([0.0, 0.0], np.cumsum(values)))
-        self._feature, self._count = feature_mm, len(values)
-
-    def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
-        """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
-        centre, half = s / self._feature + self._count / 2, np.maximum(np.abs(width) / self._feature, 1e-9) / 2
-        return np.asarray((self._integral(centre + half) - self._integral(centre - half)) / (2 * half))
-
-    def _integral(self, x: FloatArray) -> FloatArray:
-        """Integral of the profile up to x, in features from its first edge."""
-        feature = np.clip(np.floor(x).astype(np.intp), -1, self._count)
-        inside = np.clip(x, 0, self._count) - feature
-        return np.asarray(self._sums[feature + 1] + self._values[feature + 1] * inside)
-
-
-def geometric_terms(geometry: CameraGeometry) -> list[SeparableTerm]:
-    """The mask's geometric shadow as separable terms for :func:`beam_frames`."""
-    mask = geometry.build_mask()
-    return [
-        (weight, ProfileSampler(rows, mask.feature_mm), ProfileSampler(columns, mask.feature_mm))
-        for weight, rows, columns in mask.terms
-    ]
 
 
 def beam_frames(

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
@@ -22,7 +23,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import Beams
 from mitsim.optics.camera import CameraGeometry
 from mitsim.transport.factored import Projector
-from mitsim.transport.mirrors import Crossings, MirrorTracer, specular_bsdfs
+from mitsim.transport.mirrors import Crossings, MirrorTracer, delta_bsdfs
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -33,17 +34,19 @@ _COARSE = 128
 """Least number of coarse beams along the window's side."""
 _TOLERANCE = 0.02
 """Largest departure from a bilinear map, in sensor pixels."""
+_SHADES = 0.01
+"""The same for the light left, relative: a painted mirror."""
 _SMALL = 2.0
 """Whole beams below this many sensor pixels are not divided further."""
 _RIM = 0.5
-"""The same for beams that an edge cuts: they are given up."""
+"""The same for beams that an edge cuts: those are given up if the edge is a rim, and kept if it is one of paint."""
 _MARGIN = 0.02
 """Sine by which the field stop is widened when squares are left out."""
 
 
 def has_specular(scene: Any) -> bool:
     """Whether some surface of the scene reflects or refracts like a perfect mirror or lens."""
-    return bool(specular_bsdfs(scene))
+    return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
 
 
 def trace_beams(scene: Any, camera: Any, projector: Projector, max_depth: int = 16) -> Beams:
@@ -122,9 +125,9 @@ def _refine(
         nodes = _trace_squares(tracer, chain, row, column, half)
         extent = _extent(nodes)
         whole = nodes.valid.all(axis=(1, 2))
-        small = extent < _SMALL * pitch
-        smooth = (_departure(nodes) < _TOLERANCE * pitch) & (extent < geometry.half_width)
-        done = whole & (smooth | small)
+        smooth = (_departure(nodes.sensor) < _TOLERANCE * pitch) & (extent < geometry.half_width)
+        even = _departure(nodes.throughput[..., None]) <= _SHADES * nodes.throughput.max(axis=(1, 2))
+        done = whole & (smooth | (extent < _SMALL * pitch)) & (even | (extent < _RIM * pitch))
         lost = ~done & ((half == 1) | (~whole & (extent > 0) & (extent < _RIM * pitch)))
         share = nodes.throughput.mean(axis=(1, 2)) * _fluxes(tracer, row, column, size, n)
         unresolved += float(share[lost & _near(nodes, nodes, geometry)].sum())
@@ -204,11 +207,11 @@ def _sine(nodes: _Nodes) -> FloatArray:
     return np.asarray(nodes.tangent / np.sqrt(1 + np.square(nodes.tangent).sum(axis=-1, keepdims=True)))
 
 
-def _departure(nodes: _Nodes) -> FloatArray:
-    """(q,) largest distance of the five inner nodes from the bilinear map of the corners [mm]; NaN if one lacks."""
+def _departure(values: FloatArray) -> FloatArray:
+    """(q,) largest distance of values (q, 3, 3, k) from the bilinear map of their corners; NaN if one lacks."""
     blend = np.array([[1, 0], [0.5, 0.5], [0, 1]])
-    flat = np.einsum("ia,jb,qabk->qijk", blend, blend, nodes.sensor[:, ::2, ::2])
-    return np.asarray(np.linalg.norm(nodes.sensor - flat, axis=-1).max(axis=(1, 2)))
+    flat = np.einsum("ia,jb,qabk->qijk", blend, blend, values[:, ::2, ::2])
+    return np.asarray(np.linalg.norm(values - flat, axis=-1).max(axis=(1, 2)))
 
 
 def _fluxes(tracer: MirrorTracer, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
