@@ -181,7 +181,8 @@ def _emitter_class() -> type:
         def sample_wavelengths(self, si: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
             none = dr.zeros(mi.Ray3f).wavelengths
             # Spectral variants take several wavelengths at once, evenly apart.
-            shifted = type(none)(*((sample + i / len(none)) % 1.0 for i in range(len(none))))
+            places = [sample + i / max(1, len(none)) for i in range(len(none))]
+            shifted = type(none)(*(place - dr.floor(place) for place in places))
             wavelengths, weight = self.irradiance.sample_spectrum(si, shifted, active)
             return wavelengths, weight * self.scale
 

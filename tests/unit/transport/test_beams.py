@@ -1,5 +1,8 @@
 """Rays of the projector, what counts as a mirror, and beams through glass, blends and other chains."""
 
+import subprocess
+import sys
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -220,3 +223,27 @@ def test_a_painted_mirror_is_divided_where_its_paint_ends(variant: str) -> None:
     frame = beam_frames(beams, camera.geometry, geometric_terms(camera.geometry), np.zeros(N * N, np.int64)).irradiance
     rows = np.sort(frame[0].mean(axis=1))
     assert rows[30] == pytest.approx(rows[0], rel=1e-2) and rows[33] == pytest.approx(9 * rows[0], rel=1e-2)
+
+
+ONE_VARIANT = """
+import runpy, sys
+import numpy as np
+from mitsim.core.environment import load_variant
+mi = load_variant(sys.argv[1])
+from mitsim.transport import lensless
+lensless.register()
+tests = runpy.run_path(sys.argv[2])
+half = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+print(tests["flux"](tests["scene_with"](sheet=tests["plane"](0, 400, half))))
+"""
+
+
+def test_rgb_and_spectral_see_the_same_grey(variant: str) -> None:
+    """Children, because a process must not use objects of one variant under another."""
+    expected = 0.5 * flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
+    for name in ("llvm_ad_rgb", "llvm_ad_spectral"):
+        command = [sys.executable, "-c", ONE_VARIANT, name, __file__]
+        child = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert child.returncode == 0, child.stderr
+        # An upsampled grey is good to a few 1e-4.
+        assert float(child.stdout.splitlines()[-1]) == pytest.approx(expected, rel=1e-3), name
