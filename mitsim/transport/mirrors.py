@@ -2,7 +2,8 @@
 
 Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error
 in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
-hit, the normal is moved along, and reflection or refraction is worked out again from it.
+hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
+float32: nothing for a mirror that faces the axis squarely, 1e-4 mm for a steel ball of 20 mm at 400 mm.
 """
 
 from __future__ import annotations
@@ -121,8 +122,7 @@ class MirrorTracer:
 
     def _intersect(self, rays: _Rays) -> Any:
         ray = mi.Ray3f(mi.Point3f(rays.start.T.astype(np.float32)), mi.Vector3f(rays.direction.T.astype(np.float32)))
-        flags = mi.RayFlags.All | mi.RayFlags.dNSdUV
-        si = self._scene.ray_intersect(ray, flags, True)
+        si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
         dr.eval(si)
         return si
 
@@ -232,14 +232,7 @@ def _polished(rays: _Rays, si: Any) -> tuple[FloatArray, FloatArray, FloatArray]
         geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
         along = ((hit - rays.origin) * geometric).sum(axis=1) / (rays.direction * geometric).sum(axis=1)
         point = rays.origin + rays.direction * along[:, None]
-        shift = point - hit
-        good = np.linalg.norm(shift, axis=1) < 10 * _OFFSET * (1 + np.abs(hit).max(axis=1))
-        shift[~good] = 0
-        du, dv, ndu, ndv = (vectors(v, count) for v in (si.dp_du, si.dp_dv, si.dn_du, si.dn_dv))
-        e, f, g = (du * du).sum(axis=1), (du * dv).sum(axis=1), (dv * dv).sum(axis=1)
-        a, b, determinant = (shift * du).sum(axis=1), (shift * dv).sum(axis=1), e * g - f * f
-        turn = ((a * g - b * f) / determinant)[:, None] * ndu + ((b * e - a * f) / determinant)[:, None] * ndv
-        normal += np.where(np.isfinite(turn).all(axis=1, keepdims=True), turn, 0)
+        good = np.linalg.norm(point - hit, axis=1) < 10 * _OFFSET * (1 + np.abs(hit).max(axis=1))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     return np.where(good[:, None], point, hit), geometric, normal
 

@@ -88,11 +88,14 @@ def test_throughput_dims_where_it_is_low() -> None:
     assert rows[11] / rows[4] == pytest.approx(15, rel=1e-6)
 
 
-@pytest.mark.parametrize("depth", [800.0, 30.0, -50.0])
+@pytest.mark.parametrize("depth", [800.0, 30.0, 4.0, -50.0])
 def test_the_mask_is_magnified_as_from_the_virtual_source(depth: float) -> None:
-    """s = u (1 - d/z); a converging beam (z < 0: it would meet behind the sensor) shrinks the shadow instead."""
+    """s = u (1 - d/z); a converging beam (z < 0: it would meet behind the sensor) stretches the shadow's code instead.
+
+    The beam ends beside the sensor's edge, so that its boxes lie across the edges of pixels.
+    """
     camera = geometry("separable")
-    lit = beams(square((-0.4, -0.4), (0.4, 0.4)), depth=depth)
+    lit = beams(square((-0.41, -0.41), (0.41, 0.41)), depth=depth)
     assert 1 / lit.inverse_depth == pytest.approx(np.full((1, 2), depth))
     frame = beam_frames(lit, camera, geometric_terms(camera), LABELS).irradiance[0]
     mask = camera.build_mask()
@@ -100,7 +103,7 @@ def test_the_mask_is_magnified_as_from_the_virtual_source(depth: float) -> None:
     s = fine * (1 - camera.mask_distance / depth)
     index = np.floor(s / mask.feature_mm + len(mask.bits) / 2).astype(int)
     profile = mask.bits[index].reshape(16, -1).mean(axis=1)
-    assert np.allclose(frame, 2 / 0.64 * np.outer(profile, profile), rtol=0, atol=2e-3)
+    assert np.allclose(frame, 2 / 0.82**2 * np.outer(profile, profile), rtol=0, atol=2e-3)
 
 
 def test_flatcam_terms_add_up() -> None:
