@@ -1,0 +1,51 @@
+"""A mask as functions that can be asked for means: from mask profiles to separable terms of samplers.
+
+A term is ``(weight, row sampler, column sampler)``. A sampler takes arrays of centres s and widths w (mm, index
+coordinates in the mask plane) and of tan-angles t, and gives the mean over each [s - w/2, s + w/2] of a mask profile
+for light that comes under t. :func:`geometric_terms` makes them for a thin mask's geometric shadow, where t does not
+matter; profiles of thick masks and wave-optical ones fit as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.optics.camera import CameraGeometry
+
+FloatArray = npt.NDArray[np.float64]
+Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+SeparableTerm = tuple[float, Sampler, Sampler]
+
+
+class ProfileSampler:
+    """Exact means of a piecewise constant mask profile, zero outside its features."""
+
+    def __init__(self, profile: npt.ArrayLike, feature_mm: float) -> None:
+        """``profile``: (N,) transmission of each feature, centred on the axis; ``feature_mm``: their size [mm]."""
+        values = np.asarray(profile, dtype=np.float64)
+        self._values = np.concatenate(([0.0], values, [0.0]))
+        self._sums = np.concatenate(([0.0, 0.0], np.cumsum(values)))
+        self._feature, self._count = feature_mm, len(values)
+
+    def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
+        """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
+        centre, half = s / self._feature + self._count / 2, np.maximum(np.abs(width) / self._feature, 1e-9) / 2
+        return np.asarray((self._integral(centre + half) - self._integral(centre - half)) / (2 * half))
+
+    def _integral(self, x: FloatArray) -> FloatArray:
+        """Integral of the profile up to x, in features from its first edge."""
+        feature = np.clip(np.floor(x).astype(np.intp), -1, self._count)
+        inside = np.clip(x, 0, self._count) - feature
+        return np.asarray(self._sums[feature + 1] + self._values[feature + 1] * inside)
+
+
+def geometric_terms(geometry: CameraGeometry) -> list[SeparableTerm]:
+    """The mask's geometric shadow as separable terms for :func:`beam_frames`."""
+    mask = geometry.build_mask()
+    return [
+        (weight, ProfileSampler(rows, mask.feature_mm), ProfileSampler(columns, mask.feature_mm))
+        for weight, rows, columns in mask.terms
+    ]

@@ -1,0 +1,233 @@
+"""Light that reaches the sensor over perfect mirrors only: from a scene and a pinhole projector to beams of rays.
+
+A path projector - mirror - sensor has a delta at both ends, so no camera-side path finds it: it is traced from the
+projector instead (:mod:`mitsim.transport.mirrors`). Rays go through a grid of points of each projector pixel. Four
+neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided
+until the map from the projector's window to the sensor is bilinear over each. :mod:`mitsim.optics.beams` turns beams
+into frames.
+
+Flux: the stock projector's irradiance on the plane at unit distance is pi x scale x texture, the same everywhere on it,
+so a beam holds that times its area on this plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.errors import MitsimError
+from mitsim.optics.beams import Beams
+from mitsim.optics.camera import CameraGeometry
+from mitsim.transport.factored import Projector
+from mitsim.transport.mirrors import Crossings, MirrorTracer, delta_bsdfs
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+_UNIT = 2**10
+"""Lattice points a projector pixel's side: the finest division."""
+_COARSE = 128
+"""Least number of coarse beams along the window's side."""
+_TOLERANCE = 0.02
+"""Largest departure from a bilinear map, in sensor pixels."""
+_SHADES = 0.01
+"""The same for the light left, relative: a painted mirror."""
+_SMALL = 2.0
+"""Whole beams below this many sensor pixels are not divided further."""
+_RIM = 0.5
+"""The same for beams that an edge cuts: those are given up if the edge is a rim, and kept if it is one of paint."""
+_MARGIN = 0.02
+"""Sine by which the field stop is widened when squares are left out."""
+
+
+def has_specular(scene: Any) -> bool:
+    """Whether some surface of the scene reflects or refracts like a perfect mirror or lens."""
+    return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
+
+
+def trace_beams(scene: Any, camera: Any, projector: Projector, max_depth: int = 16) -> Beams:
+    """All beams that leave the projector, meet 1 to ``max_depth`` perfect mirrors or lenses, and reach the sensor.
+
+    A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
+
+    Raises
+    ------
+    MitsimError
+        for a depth below 1.
+    """
+    if max_depth < 1:
+        raise MitsimError(f"max_depth of mirror light is {max_depth}; give at least 1")
+    if not has_specular(scene):
+        return _join([], 0.0)
+    tracer = MirrorTracer(scene, camera, projector, max_depth)
+    n, geometry = projector.n, camera.geometry
+    step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
+    line = np.arange(0, n * _UNIT + 1, step)
+    row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
+    crossings = tracer.follow(np.stack([row, column], axis=1) / _UNIT)
+    low_row, low_column = (axis.ravel() for axis in np.meshgrid(line[:-1], line[:-1], indexing="ij"))
+    first = np.arange(len(line) - 1)
+    corner = (first[:, None] * len(line) + first).ravel()[:, None, None] + np.array(
+        [[0, 1], [len(line), len(line) + 1]]
+    )
+    parts, unresolved = [], 0.0
+    for chain in np.unique(crossings.chain):
+        nodes = _nodes(crossings, chain, row.size)
+        squares = nodes.take(corner)
+        chosen = _near(squares, squares, geometry)
+        found, lost = _refine(tracer, chain, low_row[chosen], low_column[chosen], step, n, geometry)
+        parts += found
+        unresolved += lost
+    return _join(parts, unresolved)
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """What is known at lattice points of one chain, any shape: whether a ray arrived, and where, how, how bright."""
+
+    valid: Mask
+    sensor: FloatArray
+    tangent: FloatArray
+    throughput: FloatArray
+
+    def take(self, index: Any) -> _Nodes:
+        return _Nodes(self.valid[index], self.sensor[index], self.tangent[index], self.throughput[index])
+
+    def at(self, *index: Any) -> _Nodes:
+        return self.take((slice(None), *index))
+
+
+def _nodes(crossings: Crossings, chain: Any, count: int) -> _Nodes:
+    """The crossings of one chain, by number of the ray."""
+    mine = crossings.chain == chain
+    ray = crossings.ray[mine]
+    valid = np.zeros(count, dtype=bool)
+    valid[ray] = True
+    nodes = _Nodes(valid, np.full((count, 2), np.nan), np.full((count, 2), np.nan), np.zeros(count))
+    nodes.sensor[ray], nodes.tangent[ray] = crossings.sensor[mine], crossings.tangent[mine]
+    nodes.throughput[ray] = crossings.throughput[mine]
+    return nodes
+
+
+def _refine(
+    tracer: MirrorTracer, chain: Any, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
+) -> tuple[list[Beams], float]:
+    """Beams of one chain inside squares of the lattice (first row and column, ``size``), and the flux not resolved."""
+    parts: list[Beams] = []
+    unresolved = 0.0
+    pitch = geometry.pixel_pitch
+    while len(row):
+        half = size // 2
+        nodes = _trace_squares(tracer, chain, row, column, half)
+        extent = _extent(nodes)
+        whole = nodes.valid.all(axis=(1, 2))
+        smooth = (_departure(nodes.sensor) < _TOLERANCE * pitch) & (extent < geometry.half_width)
+        even = _departure(nodes.throughput[..., None]) <= _SHADES * nodes.throughput.max(axis=(1, 2))
+        done = whole & (smooth | (extent < _SMALL * pitch)) & (even | (extent < _RIM * pitch))
+        lost = ~done & ((half == 1) | (~whole & (extent > 0) & (extent < _RIM * pitch)))
+        share = nodes.throughput.mean(axis=(1, 2)) * _fluxes(tracer, row, column, size, n)
+        unresolved += float(share[lost & _near(nodes, nodes, geometry)].sum())
+        for i, j in np.ndindex(2, 2):
+            quarter = nodes.at(slice(i, i + 2), slice(j, j + 2)).take(done)
+            at = row[done] + i * half, column[done] + j * half
+            parts.append(
+                Beams(
+                    (at[0] // _UNIT) * n + at[1] // _UNIT,
+                    _fluxes(tracer, *at, half, n),
+                    quarter.sensor,
+                    quarter.tangent,
+                    quarter.throughput,
+                    0.0,
+                )
+            )
+        open_ = ~done & ~lost
+        following = []
+        for i, j in np.ndindex(2, 2):
+            quarter = nodes.at(slice(i, i + 2), slice(j, j + 2))
+            goes_on = open_ & _near(quarter, nodes, geometry)
+            following.append((row[goes_on] + i * half, column[goes_on] + j * half))
+        row, column = (np.concatenate(part) for part in zip(*following, strict=True))
+        size = half
+    return parts, unresolved
+
+
+def _trace_squares(tracer: MirrorTracer, chain: Any, row: IntArray, column: IntArray, half: int) -> _Nodes:
+    """Nodes (q, 3, 3) at corners, edge middles and centre of squares; shared points are traced once."""
+    step = half * np.arange(3)
+    rows, columns = np.broadcast_arrays(row[:, None, None] + step[:, None], column[:, None, None] + step)
+    stride = int(columns.max()) + 1
+    key, place = np.unique((rows * stride + columns).ravel(), return_inverse=True)
+    crossings = tracer.follow(np.stack(np.divmod(key, stride), axis=1) / _UNIT)
+    return _nodes(crossings, chain, len(key)).take(place.reshape(rows.shape))
+
+
+def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(q, 2) least and greatest values (q, ., ., 2) at valid nodes, inf and -inf where there are none."""
+    low, high = (np.where(valid[..., None], values, limit) for limit in (np.inf, -np.inf))
+    return low.min(axis=(1, 2)), high.max(axis=(1, 2))
+
+
+def _size(low: FloatArray, high: FloatArray) -> FloatArray:
+    """(q,) larger side of boxes, 0 where nothing or one ray arrived."""
+    return np.asarray(np.where(np.isfinite(low), high - low, 0).max(axis=-1))
+
+
+def _extent(nodes: _Nodes) -> FloatArray:
+    """(q,) larger side of the bounding box of what arrived [mm]."""
+    return _size(*_box(nodes.valid, nodes.sensor))
+
+
+def _near(nodes: _Nodes, parent: _Nodes, geometry: CameraGeometry) -> Mask:
+    """(q,) whether a square may light the sensor within the field stop: its corners' box, grown by what may be hidden.
+
+    A whole square bulges by its curvature; one that a rim cuts may be as large as the square ``parent`` that it is part
+    of, or of any size if only one ray of that arrived. Directions are compared by sines, which stay finite.
+    """
+    sine = geometry.tan_half_fov / np.hypot(1, geometry.tan_half_fov)
+    whole = nodes.valid.all(axis=(1, 2))
+    near = nodes.valid.any(axis=(1, 2))
+    for of, reach in ((_place, geometry.half_width + geometry.pixel_pitch), (_sine, sine + _MARGIN)):
+        low, high = _box(nodes.valid, of(nodes))
+        above = _size(*_box(parent.valid, of(parent)))
+        margin = np.where(whole, _size(low, high) / 2, np.where(above > 0, above, np.inf))[:, None]
+        with np.errstate(invalid="ignore"):
+            near &= ((low - margin < reach) & (high + margin > -reach)).all(axis=1)
+    return np.asarray(near)
+
+
+def _place(nodes: _Nodes) -> FloatArray:
+    return nodes.sensor
+
+
+def _sine(nodes: _Nodes) -> FloatArray:
+    return np.asarray(nodes.tangent / np.sqrt(1 + np.square(nodes.tangent).sum(axis=-1, keepdims=True)))
+
+
+def _departure(values: FloatArray) -> FloatArray:
+    """(q,) largest distance of values (q, 3, 3, k) from the bilinear map of their corners; NaN if one lacks."""
+    blend = np.array([[1, 0], [0.5, 0.5], [0, 1]])
+    flat = np.einsum("ia,jb,qabk->qijk", blend, blend, values[:, ::2, ::2])
+    return np.asarray(np.linalg.norm(values - flat, axis=-1).max(axis=(1, 2)))
+
+
+def _fluxes(tracer: MirrorTracer, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
+    """(q,) flux into squares of the lattice [W m^-2 mm^2]."""
+    power = tracer.rays.power.mean(axis=1)[(row // _UNIT) * n + column // _UNIT]
+    return np.asarray(power * tracer.rays.area * (size / _UNIT) ** 2)
+
+
+def _join(parts: list[Beams], unresolved: float) -> Beams:
+    pair = np.zeros((0, 2, 2, 2))
+    every = [Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0), *parts]
+    return Beams(
+        np.concatenate([part.pixel for part in every]),
+        np.concatenate([part.flux for part in every]),
+        np.concatenate([part.sensor for part in every]),
+        np.concatenate([part.tangent for part in every]),
+        np.concatenate([part.throughput for part in every]),
+        unresolved,
+    )

@@ -1,0 +1,256 @@
+"""Rays that follow perfect mirrors: from points of a pinhole projector's window to where they cross the sensor plane.
+
+Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error
+in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
+hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
+float32: nothing for a mirror that faces the axis squarely, 1e-4 mm for a steel ball of 20 mm at 400 mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.transport.factored import Projector
+from mitsim.transport.pinhole import PinholeRays, channels, host, vectors, wavelength_sets
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Chains = npt.NDArray[np.uint64]
+Mask = npt.NDArray[np.bool_]
+_FAINTEST = 1e-5
+_AGREEMENT = 1e-4
+_OFFSET = 1e-4
+
+
+def delta_bsdfs(scene: Any, kinds: int) -> list[Any]:
+    """The scene's materials with a part of one of these ``mi.BSDFFlags`` (added up)."""
+    found: list[Any] = []
+    for shape in scene.shapes():
+        bsdf = shape.bsdf()
+        if bsdf is not None and bsdf.flags() & kinds and bsdf not in found:
+            found.append(bsdf)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Rays that crossed the sensor plane from the front after at least one mirror; one ray may arrive several times.
+
+    Attributes
+    ----------
+    ray
+        (k,) number of the ray that was sent.
+    chain
+        (k,) a number for the sequence of surfaces it met, and whether each reflected or transmitted it.
+    sensor, tangent
+        (k, 2) where it crosses [mm] and its tan-angles from there, (row, column) in index coordinates.
+    throughput
+        (k,) part of the light left.
+    """
+
+    ray: IntArray
+    chain: Chains
+    sensor: FloatArray
+    tangent: FloatArray
+    throughput: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Rays under way. ``start`` lies on the ray a little beyond ``origin``, clear of the surface that it leaves."""
+
+    index: IntArray
+    origin: FloatArray
+    direction: FloatArray
+    start: FloatArray
+    chain: Chains
+    spectrum: FloatArray
+
+    def __getitem__(self, chosen: Any) -> _Rays:
+        parts = (self.index, self.origin, self.direction, self.start, self.chain, self.spectrum)
+        return _Rays(*(part[chosen] for part in parts))
+
+
+class MirrorTracer:
+    """Follows rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
+
+    At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends
+    there: that light is the camera-side estimators'.
+    """
+
+    def __init__(self, scene: Any, camera: Any, projector: Projector, max_depth: int) -> None:
+        self._scene, self._max_depth = scene, max_depth
+        self._wavelengths = wavelength_sets()
+        self.rays = PinholeRays(projector, self._wavelengths)
+        mean = self.rays.power.mean(axis=0)
+        self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
+        self._lobes = [lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)]
+        matrix = np.array(camera.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
+        self._camera_turn, self._camera_place = matrix[:3, :3], matrix[:3, 3]
+
+    def follow(self, points: FloatArray) -> Crossings:
+        """Send rays through window points (row, column) (k, 2), in projector pixels."""
+        count = len(points)
+        origin = np.broadcast_to(self.rays.origin, (count, 3))
+        rays = _Rays(
+            np.arange(count),
+            origin,
+            self.rays.directions(points),
+            origin,
+            np.zeros(count, dtype=np.uint64),
+            np.ones((count, len(self._colour))),
+        )
+        found = [Crossings(np.zeros(0, np.int64), rays.chain[:0], np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))]
+        for depth in range(self._max_depth + 1):
+            if not len(rays.index):
+                break
+            si = self._intersect(rays)
+            distance = np.where(host(si.is_valid(), len(rays.index)), host(si.t, len(rays.index)), np.inf)
+            distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
+            crossing, arrived = self._cross(rays, distance)
+            if depth:
+                found.append(crossing)
+            rays = self._bounce(rays, si, ~arrived & np.isfinite(distance))
+        parts = zip(*((c.ray, c.chain, c.sensor, c.tangent, c.throughput) for c in found), strict=True)
+        return Crossings(*(np.concatenate(part) for part in parts))
+
+    def _intersect(self, rays: _Rays) -> Any:
+        ray = mi.Ray3f(mi.Point3f(rays.start.T.astype(np.float32)), mi.Vector3f(rays.direction.T.astype(np.float32)))
+        si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
+        dr.eval(si)
+        return si
+
+    def _cross(self, rays: _Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
+        """Rays that cross the sensor plane from the front before they meet anything."""
+        origin = (rays.origin - self._camera_place) @ self._camera_turn
+        direction = rays.direction @ self._camera_turn
+        ahead = (origin[:, 2] > 0) & (direction[:, 2] < 0)
+        reach = np.full(len(ahead), np.inf)
+        np.divide(-origin[:, 2], direction[:, 2], out=reach, where=ahead)
+        arrived = ahead & (reach < distance)
+        o, d, r = origin[arrived], direction[arrived], reach[arrived, None]
+        crossing = Crossings(
+            rays.index[arrived],
+            rays.chain[arrived],
+            -(o + d * r)[:, 1::-1],
+            -(d[:, :2] / d[:, 2:])[:, ::-1],
+            rays.spectrum[arrived] @ self._colour,
+        )
+        return crossing, arrived
+
+    def _bounce(self, rays: _Rays, si: Any, active: Mask) -> _Rays:
+        """The rays that go on, polished; see the module."""
+        count = len(active)
+        point, geometric, normal = _polished(rays, si)
+        shapes = host(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
+        onward: list[_Rays] = []
+        for lobe in self._lobes:
+            here = mi.Bool(active) & (si.bsdf() == mi.BSDFPtr(lobe.bsdf))
+            if not dr.any(here):
+                continue
+            sample, weight = self._sampled(lobe, si, here)
+            kind, eta = host(sample.sampled_type, count), host(sample.eta, count)
+            single = (kind & int(mi.BSDFFlags.Delta)) != 0
+            spectrum = rays.spectrum * np.nan_to_num(weight)
+            chosen = np.flatnonzero(host(here, count) & single & ((spectrum @ self._colour) > _FAINTEST))
+            traced = vectors(si.to_world(sample.wo), count)[chosen]
+            direction = _redirected(rays.direction[chosen], normal[chosen], kind[chosen], eta[chosen], traced)
+            slope = np.abs((direction * geometric[chosen]).sum(axis=1))
+            clear = _OFFSET * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, 0.02)
+            reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
+            code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
+            chain = rays.chain[chosen] * np.uint64(0x9E3779B97F4A7C15) + code
+            start = point[chosen] + direction * clear[:, None]
+            onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
+        if not onward:
+            return rays[np.zeros(0, dtype=np.int64)]
+        names = ("index", "origin", "direction", "start", "chain", "spectrum")
+        return _Rays(*(np.concatenate([getattr(part, name) for part in onward]) for name in names))
+
+    def _sampled(self, lobe: _Lobe, si: Any, active: Any) -> tuple[Any, FloatArray]:
+        """Direction sample, and weights (k, channels) over all wavelength sets."""
+        weights = []
+        for wavelengths in self._wavelengths:
+            if wavelengths is not None:
+                si.wavelengths = wavelengths
+            sample, weight = lobe.bsdf.sample(lobe.context, si, lobe.choice, mi.Point2f(0.5), active)
+            weight = weight * sample.pdf if lobe.by_chance else weight
+            weights.append(channels(mi.unpolarized_spectrum(weight), dr.width(si.t)))
+        return sample, np.concatenate(weights, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lobe:
+    """One way on at a material: the context and random number that choose it, and whether that was one of several.
+
+    If so, Mitsuba has divided the weight by the probability of the choice, which is the sample's ``pdf``.
+    """
+
+    bsdf: Any
+    context: Any
+    choice: float = 0.5
+    by_chance: bool = False
+
+
+def _lobes(bsdf: Any) -> list[_Lobe]:
+    """Every delta part of a material, so that nothing is left to chance.
+
+    Parts are chosen by type, because components of a ``twosided`` are not numbered alike on both sides; those of a
+    blend can be told by component only, and a ``mask`` obeys neither: its first and last outcome are taken (a mirror or
+    the reflection of glass, and the hole).
+    """
+    name, delta = str(bsdf), int(mi.BSDFFlags.Delta)
+    lobes = []
+    if name.startswith("Mask"):
+        everything = mi.BSDFContext(mi.TransportMode.Importance)
+        return [_Lobe(bsdf, everything, choice, True) for choice in (0.0, 1 - 2**-24)]
+    if "BlendBSDF" in name:
+        for component in range(bsdf.component_count()):
+            if bsdf.flags(component) & delta:
+                lobes.append(_Lobe(bsdf, mi.BSDFContext(mi.TransportMode.Importance)))
+                lobes[-1].context.component = component
+        return lobes
+    reflection = int(mi.BSDFFlags.DeltaReflection)
+    for kinds in (reflection, delta & ~reflection):
+        if bsdf.flags() & kinds:
+            lobes.append(_Lobe(bsdf, mi.BSDFContext(mi.TransportMode.Importance)))
+            lobes[-1].context.type_mask = kinds
+    return lobes
+
+
+def _polished(rays: _Rays, si: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Hit point, geometric and shading normal (k, 3), the ray met in float64 with the surface's tangent plane."""
+    count = len(rays.index)
+    hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
+    with np.errstate(all="ignore"):
+        geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
+        along = ((hit - rays.origin) * geometric).sum(axis=1) / (rays.direction * geometric).sum(axis=1)
+        point = rays.origin + rays.direction * along[:, None]
+        good = np.linalg.norm(point - hit, axis=1) < 10 * _OFFSET * (1 + np.abs(hit).max(axis=1))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.where(good[:, None], point, hit), geometric, normal
+
+
+def _redirected(
+    direction: FloatArray, normal: FloatArray, kind: IntArray, eta: FloatArray, traced: FloatArray
+) -> FloatArray:
+    """(k, 3) unit directions after the surface in float64: reflected, refracted by ``eta`` (Snell) or straight on.
+
+    Where that disagrees with Mitsuba's own direction ``traced`` (a material that bends light in another way), Mitsuba's
+    stands.
+    """
+    cosine = (direction * normal).sum(axis=1, keepdims=True)
+    reflected = direction - 2 * cosine * normal
+    inside = 1 - (1 - cosine**2) / eta[:, None] ** 2
+    refracted = (direction - cosine * normal) / eta[:, None] + np.sign(cosine) * np.sqrt(np.maximum(inside, 0)) * normal
+    exact = np.where((kind & int(mi.BSDFFlags.DeltaTransmission))[:, None] != 0, refracted, direction)
+    exact = np.where((kind & int(mi.BSDFFlags.DeltaReflection))[:, None] != 0, reflected, exact)
+    agrees = np.linalg.norm(exact - traced, axis=1, keepdims=True) < _AGREEMENT
+    chosen = np.where(agrees, exact, traced)
+    return np.asarray(chosen / np.linalg.norm(chosen, axis=1, keepdims=True))

@@ -1,0 +1,188 @@
+"""A projector of finite aperture: its limit, its blur circle and its light, against the pinhole and geometry.
+
+Boards are seen from the camera's own position by a Mitsuba pinhole camera at 64 x 64 pixels. Renderings use fixed
+seeds; errors of means come from the spread between pixels or passes, gates are five of them unless stated.
+"""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.transport import aperture
+from mitsim.transport.aperture import aperture_scene_parts
+
+SCALE, ALBEDO, N = 111000.0, 0.5, 16
+
+
+@pytest.fixture(autouse=True)
+def plugin(variant: str) -> None:
+    aperture.register()
+
+
+def stock(place: tuple[float, float, float] = (60, 0, 0), turn: float = 0.0, canvas: np.ndarray | None = None):
+    if canvas is None:
+        canvas = np.zeros((N, 2 * N))
+        canvas[:, N:] = 1
+    bitmap = mi.Bitmap(canvas[..., None].astype(np.float32))
+    picture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    to_world = mi.ScalarAffineTransform4f().translate(list(place)).rotate([0, 1, 0], turn)
+    light = {"type": "projector", "to_world": to_world, "fov_axis": "x", "fov": 33.398488, "scale": SCALE}
+    return mi.load_dict({**light, "irradiance": picture})
+
+
+def board(z: float, bsdf: dict | None = None) -> dict:
+    place = mi.ScalarAffineTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180).scale([600, 600, 1])
+    grey = {"type": "diffuse", "reflectance": {"type": "uniform", "value": ALBEDO}}
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf or grey}
+
+
+def picture(light: dict, z: float, half: float, x: float = 0.0, spp: int = 256, **scene: dict) -> np.ndarray:
+    """(64, 64) irradiance on a board at z, seen squarely over x +- half, y +- half; row 0 at +y, column 0 at +x."""
+    look = mi.ScalarAffineTransform4f().look_at(origin=[x, 0, z - 100], target=[x, 0, z], up=[0, 1, 0])
+    film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    fov = float(np.degrees(2 * np.arctan(half / 100)))
+    camera = {"type": "perspective", "fov": fov, "to_world": look, "film": film}
+    path = {"type": "path", "max_depth": 2}
+    parts = {"type": "scene", "integrator": path, "camera": camera, "board": board(z), **light, **scene}
+    return np.array(mi.render(mi.load_dict(parts), spp=spp, seed=3), dtype=np.float64)[..., 0] * np.pi / ALBEDO
+
+
+@pytest.mark.parametrize("radius", [0.01, 5.0])
+@pytest.mark.parametrize("z", [400.0, 700.0])
+def test_an_even_picture_casts_the_stock_projectors_irradiance(radius: float, z: float) -> None:
+    """E = pi scale / z^2 inside the picture, at any aperture, in and out of focus; off the axis as well as on it."""
+    whole = stock(canvas=np.ones((N, 2 * N)))
+    found = picture(aperture_scene_parts(whole, radius, 400.0), z, 40.0)
+    expected = np.pi * SCALE / z**2
+    # Nothing is left to chance but the place on the aperture, and there L cos^2 / r^2 is constant.
+    assert found == pytest.approx(np.full((64, 64), expected), rel=1e-4)
+    assert picture({"light": whole}, z, 40.0) == pytest.approx(found, rel=1e-4)
+
+
+def test_a_small_aperture_is_the_pinhole() -> None:
+    """The same picture of random pixels, out of focus, turned: blur of 0.01 mm on pixels of 7 mm."""
+    texels = (np.random.default_rng(2).random((N, 2 * N)) > 0.5).astype(float)
+    light = stock(turn=4.0, canvas=texels)
+    sharp = picture({"light": light}, 500.0, 60.0, 20.0)
+    found = picture(aperture_scene_parts(light, 0.02, 250.0), 500.0, 60.0, 20.0)
+    assert 0.2 < (sharp > 0.5 * sharp.max()).mean() < 0.8
+    # Both use the same sequence of random numbers for the camera; the blur touches 1 path in 500 or so.
+    assert np.linalg.norm(found - sharp) < 1e-2 * np.linalg.norm(sharp)
+
+
+def circle_below(distance: np.ndarray, radius: float) -> np.ndarray:
+    """Part of a disk on one side of a line at a distance from its centre (1/2 through the centre)."""
+    s = np.clip(distance / radius, -1, 1)
+    return 0.5 + (np.arcsin(s) + s * np.sqrt(1 - s**2)) / np.pi
+
+
+@pytest.mark.parametrize(("z", "focus"), [(800.0, 400.0), (400.0, 400.0), (200.0, 400.0)])
+def test_an_edge_spreads_by_the_blur_circle(z: float, focus: float) -> None:
+    """The window's left edge, texel 16 of 32, is on the projector's axis. A point of the picture is a disk of radius
+    a |z - focus| / focus there, so the edge is the disk's part on one side."""
+    radius = 4.0
+    found = picture(aperture_scene_parts(stock(), radius, focus), z, 6.0, 60.0, spp=1024).mean(axis=0)
+    edges = 60 + (32 - np.arange(65)) * 12 / 64  # x falls with the column
+    fine = (edges[:-1, None] + (edges[1:] - edges[:-1])[:, None] * (np.arange(32) + 0.5) / 32) - 60
+    blur = radius * abs(z - focus) / focus
+    lit = circle_below(-fine, blur) if blur else (fine < 0).astype(float)
+    # 64 x 1024 paths a column: a standard deviation of 0.5 / 256 at most, times 5.
+    assert np.abs(found / (np.pi * SCALE / z**2) - lit.mean(axis=1)).max() < 5 * 0.5 / 256
+    assert blur == 0 or (np.abs(lit - 0.5) < 0.49).any()
+
+
+def test_defocus_keeps_the_flux() -> None:
+    """One projector pixel of 7.5 mm on a board twice as far as the focus: blurred, but as much light as in focus."""
+    canvas = np.zeros((N, 2 * N))
+    canvas[8, 16] = 1
+    light = stock(canvas=canvas)
+    expected = np.pi * SCALE * (0.3 / N) ** 2
+    for z in (400.0, 800.0):
+        half = 30.0
+        flux = picture(aperture_scene_parts(light, 4.0, 400.0), z, half, 55.0, 1024).sum() * (2 * half / 64) ** 2
+        # About 1.5 % of 4 M paths are lit: 0.4 % of their number's spread at most.
+        assert flux == pytest.approx(expected, rel=1e-2)
+
+
+def test_light_traced_from_the_projector_agrees() -> None:
+    """``sample_ray`` against ``sample_direction``: mean of what a particle tracer and a path tracer render."""
+    parts = aperture_scene_parts(stock(turn=3.0), 3.0, 300.0)
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    camera = {"type": "perspective", "fov": 50, "film": film}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "board": board(400), **parts})
+    means = {}
+    for name in ("path", "ptracer"):
+        integrator = mi.load_dict({"type": name, "max_depth": 2})
+        runs = [np.array(mi.render(scene, integrator=integrator, spp=4096, seed=s)).mean() for s in range(8)]
+        means[name] = np.mean(runs), np.std(runs, ddof=1) / np.sqrt(8)
+    error = np.hypot(means["path"][1], means["ptracer"][1])
+    assert 7 * error < 0.02 * means["path"][0]  # t distribution of 7 degrees and more: 5 sigma become about 7
+    assert abs(means["path"][0] - means["ptracer"][0]) < 7 * error
+
+
+def lensless(light: dict, bsdf: dict, integrator: str = "path", spp: int = 256, seed: int = 0) -> np.ndarray:
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    camera = {"type": "mitsim_lensless", "mask": "open", "film": film, "pixel_pitch": 0.1875}
+    scene = {"type": "scene", "integrator": {"type": integrator}, "camera": camera, "mirror": board(400, bsdf), **light}
+    return np.array(mi.render(mi.load_dict(scene), spp=spp, seed=seed), dtype=np.float64)[..., 0]
+
+
+def test_the_reference_finds_a_mirrors_light_now() -> None:
+    """A perfect mirror shows the aperture: hit by chance only, yet E = pi scale / 800^2, where the pinhole gave 0."""
+    light = stock()
+    found = lensless(aperture_scene_parts(light, 20.0, 400.0), {"type": "conductor"}, spp=2048)
+    expected = np.pi * SCALE / 800**2
+    error = found.std(ddof=1) / 32
+    assert 5 * error < 0.05 * expected
+    # The blur circle of 20 mm stays clear of the window's edges for all of the sensor.
+    assert abs(found.mean() - expected) < 5 * error
+    assert not lensless({"light": light}, {"type": "conductor"}).any()
+
+
+@pytest.mark.slow
+def test_a_rough_mirror_has_a_finite_highlight() -> None:
+    """Roughness 0.05: light sampling and BSDF sampling meet; with a small disk the pinhole's answer comes out."""
+    rough = {"type": "roughconductor", "alpha": 0.05}
+    light = stock()
+    found, sharp = lensless(aperture_scene_parts(light, 0.5, 400.0), rough), lensless({"light": light}, rough)
+    error = np.hypot(found.std(ddof=1), sharp.std(ddof=1)) / 32
+    assert found.mean() > 0 and 5 * error < 0.1 * sharp.mean()
+    assert abs(found.mean() - sharp.mean()) < 5 * error
+    # A wide disk, hit by BSDF samples: the two ways of MIS add up to what each alone would give.
+    wide = aperture_scene_parts(light, 20.0, 400.0)
+    mixed = [lensless(wide, rough, spp=4096, seed=seed).mean() for seed in range(6)]
+    lit = [lensless_without_mis(wide, rough, seed) for seed in range(6)]
+    spread = np.hypot(np.std(mixed, ddof=1), np.std(lit, ddof=1)) / np.sqrt(6)
+    assert abs(np.mean(mixed) - np.mean(lit)) < 8 * spread < 0.03 * np.mean(lit)
+
+
+def lensless_without_mis(light: dict, bsdf: dict, seed: int) -> float:
+    """Mean over the sensor by light sampling alone."""
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    camera = {"type": "mitsim_lensless", "mask": "open", "film": film, "pixel_pitch": 0.1875}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "mirror": board(400, bsdf), **light})
+    integrator = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
+    return float(np.array(mi.render(scene, integrator=integrator, spp=4096, seed=seed)).mean())
+
+
+@pytest.mark.parametrize(("radius", "focus"), [(0.0, 400.0), (2.0, -1.0), (float("nan"), 400.0), (2.0, float("inf"))])
+def test_an_aperture_without_size_is_refused(radius: float, focus: float) -> None:
+    with pytest.raises(MitsimError, match=r"projector aperture: (radius|focus) is"):
+        aperture_scene_parts(stock(), radius, focus)
+
+
+def test_a_projector_without_a_bitmap_is_refused() -> None:
+    with pytest.raises(MitsimError, match="not a bitmap"):
+        aperture_scene_parts(mi.load_dict({"type": "projector", "fov": 30}), 1.0, 400.0)
+
+
+@pytest.mark.parametrize(("name", "value"), [("focus", 0.0), ("fov", 180.0), ("focus", None), ("irradiance", None)])
+def test_bad_parameters_of_the_plugin_are_refused(name: str, value: float | None) -> None:
+    disk = aperture_scene_parts(stock(), 1.0, 400.0)["projector_aperture"]
+    if value is None:
+        del disk["emitter"][name]
+    else:
+        disk["emitter"][name] = value
+    with pytest.raises((MitsimError, RuntimeError), match=rf"mitsim_projector: {name} is"):
+        mi.load_dict({"type": "scene", "disk": disk})

@@ -1,0 +1,249 @@
+"""Rays of the projector, what counts as a mirror, and beams through glass, blends and other chains."""
+
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.optics.beams import beam_frames, geometric_terms
+from mitsim.transport.beams import has_specular, trace_beams
+from mitsim.transport.factored import Projector
+from mitsim.transport.mirrors import MirrorTracer
+from mitsim.transport.pinhole import PinholeRays
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, SCALE = 8, 111000.0
+CONDUCTOR = {"type": "conductor"}
+
+
+def emitter(n: int = N, to_world: "mi.ScalarAffineTransform4f | None" = None) -> "mi.Emitter":
+    canvas = np.zeros((n + 3, 2 * n + 1, 1), np.float32)
+    canvas[1 : 1 + n, 2 : 2 + n] = np.linspace(0.5, 1, n)[:, None, None]
+    return mi.load_dict(
+        {
+            "type": "projector",
+            "to_world": mi.ScalarAffineTransform4f().translate([20, 0, 0]) if to_world is None else to_world,
+            "fov": 30,
+            "fov_axis": "x",
+            "scale": SCALE,
+            "irradiance": {
+                "type": "bitmap",
+                "bitmap": mi.Bitmap(canvas),
+                "raw": True,
+                "filter_type": "nearest",
+                "wrap_mode": "clamp",
+            },
+        }
+    )
+
+
+def projector(scene: "mi.Scene", n: int = N) -> Projector:
+    return Projector(scene.emitters()[0], n, 1, 2, (n + 3, 2 * n + 1))
+
+
+def scene_with(**shapes: dict) -> "mi.Scene":
+    film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    camera = {"type": "mitsim_lensless", "mask": "open", "pixel_pitch": 0.1, "film": film, "fov": 40}
+    return mi.load_dict({"type": "scene", "camera": camera, "light": emitter(), **shapes})
+
+
+def plane(x: float, z: float, bsdf: dict, half: float = 60.0, toward: float = -1.0) -> dict:
+    t = mi.ScalarAffineTransform4f()
+    to_world = t.look_at(origin=[x, 0, z], target=[x, 0, z + toward], up=[0, 1, 0]) @ t.scale([half, half, 1])
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+
+def flux(scene: "mi.Scene", **settings: int) -> float:
+    camera = scene.sensors()[0]
+    beams = trace_beams(scene, camera, projector(scene), **settings)
+    geometry = camera.geometry
+    return beam_frames(beams, geometry, geometric_terms(geometry), np.zeros(N * N, np.int64)).flux
+
+
+def test_a_ray_meets_the_emitter_at_the_uv_that_it_was_made_for() -> None:
+    t = mi.ScalarAffineTransform4f()
+    light = emitter(to_world=t.translate([60, -20, 5]).rotate([0.3, 1, 0.2], 25))
+    rays = PinholeRays(Projector(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
+    points = np.random.default_rng(1).uniform(0, N, (200, 2))
+    si = mi.SurfaceInteraction3f()
+    si.p = mi.Point3f((rays.origin + 700 * rays.directions(points)).T.astype(np.float32))
+    sample, _ = light.sample_direction(si, mi.Point2f(0.5), True)
+    assert np.all(np.array(sample.pdf) == 1)
+    # uv comes back in float32: 6e-8 of the canvas and what the point's own rounding adds.
+    assert np.array(sample.uv.x) == pytest.approx((2 + points[:, 1]) / (2 * N + 1), abs=5e-7)
+    assert np.array(sample.uv.y) == pytest.approx((1 + points[:, 0]) / (N + 3), abs=5e-7)
+
+
+def test_power_is_the_irradiance_that_mitsuba_renders(variant: str) -> None:
+    """A board at 400 mm seen by a pinhole camera: L = E reflectance / pi."""
+    light = emitter(to_world=mi.ScalarAffineTransform4f())
+    rays = PinholeRays(Projector(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
+    expected = np.pi * SCALE * np.linspace(0.5, 1, N)
+    assert rays.power[:, 0].reshape(N, N) == pytest.approx(np.repeat(expected[:, None], N, axis=1), rel=1e-6)
+    side = 2 * np.tan(np.radians(15)) / (2 * N + 1)
+    assert rays.area == pytest.approx(side**2, rel=1e-6)
+    centre = (np.arange(N * N) // N + 0.5, np.arange(N * N) % N + 0.5)
+    d = rays.directions(np.stack(centre, axis=1))
+    # Straight above each lit point, looking down: the pinhole's own rays would be in the light's way.
+    target = d / d[:, 2:] * 400
+    scene = mi.load_dict({"type": "scene", "light": light, "board": plane(0, 400, {"type": "diffuse"}, 500)})
+    origin = (target - [0, 0, 30]).astype(np.float32)
+    ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(0, 0, 1)))
+    integrator = mi.load_dict({"type": "direct"})
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, N * N)
+    radiance = np.array(integrator.sample(scene, sampler, ray)[0]).ravel()
+    assert radiance * np.pi / 0.5 * 400**2 == pytest.approx(rays.power[:, 0], rel=1e-5)
+
+
+def test_what_counts_as_a_mirror(variant: str) -> None:
+    assert not has_specular(scene_with())
+    for bsdf, answer in (
+        ({"type": "diffuse"}, False),
+        ({"type": "roughconductor", "alpha": 0.05}, False),
+        ({"type": "mask", "opacity": 0.5, "bsdf": {"type": "diffuse"}}, False),
+        (CONDUCTOR, True),
+        ({"type": "twosided", "bsdf": CONDUCTOR}, True),
+        ({"type": "plastic"}, True),
+        ({"type": "thindielectric"}, True),
+        ({"type": "blendbsdf", "weight": 0.3, "a": {"type": "diffuse"}, "b": CONDUCTOR}, True),
+    ):
+        assert has_specular(scene_with(sheet=plane(0, 400, bsdf))) is answer, bsdf
+
+
+def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
+    scene = scene_with(sheet=plane(0, 400, {"type": "diffuse"}))
+    beams = trace_beams(scene, scene.sensors()[0], projector(scene))
+    assert len(beams) == 0 and beams.unresolved == 0
+    with pytest.raises(MitsimError, match="max_depth of mirror light is 0"):
+        trace_beams(scene, scene.sensors()[0], projector(scene), max_depth=0)
+
+
+def fresnel(cosine: float, eta: float) -> float:
+    """Unpolarised reflectance of glass."""
+    inside = np.sqrt(1 - (1 - cosine**2) / eta**2)
+    s, p = (cosine - eta * inside) / (cosine + eta * inside), (eta * cosine - inside) / (eta * cosine + inside)
+    return float((s**2 + p**2) / 2)
+
+
+COSINE = float(np.cos(np.arctan(10 / 400)))
+GLASS = fresnel(COSINE, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "part"),
+    [
+        ({"type": "conductor", "specular_reflectance": {"type": "uniform", "value": 0.3}}, 0.3),
+        ({"type": "twosided", "front": CONDUCTOR, "back": {"type": "diffuse"}}, 1.0),
+        ({"type": "twosided", "front": {"type": "diffuse"}, "back": CONDUCTOR}, 0.0),
+        ({"type": "blendbsdf", "weight": 0.25, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
+        ({"type": "mask", "opacity": 0.25, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 0.25),
+        ({"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
+        ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
+        ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, 2 * GLASS / (1 + GLASS)),
+    ],
+    ids=["grey", "front", "back", "blend", "mask", "plastic", "glass", "pane"],
+)
+def test_each_material_sends_on_its_part(bsdf: dict, part: float) -> None:
+    full = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
+    assert full > 0
+    # The reflectance of glass changes by less than 1e-4 over the window's small part that meets the sensor.
+    assert flux(scene_with(sheet=plane(0, 400, bsdf))) == pytest.approx(part * full, rel=1e-3)
+
+
+def test_light_through_a_pane_before_the_mirror(variant: str) -> None:
+    """A pane passes T on the way out and T on the way back; its own reflections land elsewhere or are faint."""
+    pane = {"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}
+    passed = 1 - 2 * GLASS / (1 + GLASS)
+    mirror = scene_with(sheet=plane(0, 400, CONDUCTOR))
+    scene = scene_with(sheet=plane(0, 400, CONDUCTOR), pane=plane(0, 300, {**pane}, 60))
+    tracer = MirrorTracer(scene, scene.sensors()[0], projector(scene), 3)
+    found = tracer.follow(np.array([[4.5, 7.3]]))
+    expected = MirrorTracer(mirror, mirror.sensors()[0], projector(mirror), 3).follow(np.array([[4.5, 7.3]]))
+    straight = np.argmin(np.abs(found.sensor - expected.sensor).sum(axis=1))
+    assert len(found.ray) == 2 and len(set(found.chain.tolist())) == 2
+    assert found.throughput[straight] == pytest.approx(passed**2, rel=1e-2)
+    assert found.sensor[straight] == pytest.approx(expected.sensor[0], abs=1e-6)
+
+
+def test_a_slab_of_glass_shifts_the_ray_by_snells_law(variant: str) -> None:
+    slab = {
+        "type": "cube",
+        "to_world": mi.ScalarAffineTransform4f().translate([0, 0, 200]).scale([70, 70, 10]),
+        "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+    }
+    scene = scene_with(sheet=plane(0, 400, CONDUCTOR), slab=slab)
+    tracer = MirrorTracer(scene, scene.sensors()[0], projector(scene), 5)
+    point = np.array([[4.5, 7.3]])
+    found = tracer.follow(point)
+    x, y, z = tracer.rays.directions(point)[0]
+    sine = np.hypot(x, y)
+    inside = np.tan(np.arcsin(sine / 1.5))
+    # Out and back: 2 x 400 mm, of which 2 x 20 mm at the smaller angle.
+    reach = (2 * 380 * sine / z + 2 * 20 * inside) / sine
+    expected = -(tracer.rays.origin[:2] + reach * np.array([x, y]))[::-1]
+    brightest = int(np.argmax(np.where(np.abs(found.sensor - expected).max(axis=1) < 0.5, found.throughput, 0)))
+    assert found.sensor[brightest] == pytest.approx(expected, abs=2e-5)
+
+
+def test_max_depth_counts_mirrors(variant: str) -> None:
+    one = -1 / np.sqrt(2)
+    t = mi.ScalarAffineTransform4f()
+
+    def place(x: float, normal: list[float]) -> "mi.ScalarAffineTransform4f":
+        target = [x + normal[0], 0, 300 + normal[2]]
+        return t.look_at(origin=[x, 0, 300], target=target, up=[0, 1, 0]) @ t.scale([8, 8, 1])
+
+    first = {"type": "rectangle", "to_world": place(20, [one, 0, one]), "bsdf": CONDUCTOR}
+    second = {"type": "rectangle", "to_world": place(0, [-one, 0, one]), "bsdf": CONDUCTOR}
+    scene = scene_with(first=first, second=second)
+    assert flux(scene, max_depth=2) > 0
+    assert flux(scene, max_depth=1) == 0
+
+
+def test_a_rim_is_followed_down_and_its_rest_reported(variant: str) -> None:
+    """Half the sensor sees a mirror's edge; what is not resolved is a small part, and the rest is right to that."""
+    whole, half = scene_with(sheet=plane(0, 400, CONDUCTOR)), scene_with(sheet=plane(70, 400, CONDUCTOR, 60))
+    beams = trace_beams(half, half.sensors()[0], projector(half))
+    assert 0 < beams.unresolved < 0.02 * flux(whole)
+    assert flux(half) + beams.unresolved / 2 == pytest.approx(flux(whole) / 2, rel=5e-3)
+
+
+def test_a_painted_mirror_is_divided_where_its_paint_ends(variant: str) -> None:
+    paint = np.where(np.arange(64)[:, None, None] < 32, 0.9, 0.1).astype(np.float32) * np.ones((1, 64, 1), np.float32)
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(paint), "raw": True, "filter_type": "nearest"}
+    scene = scene_with(sheet=plane(0, 400, {"type": "conductor", "specular_reflectance": bitmap}))
+    whole = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
+    assert flux(scene) == pytest.approx(0.5 * whole, rel=5e-3)
+    camera = scene.sensors()[0]
+    beams = trace_beams(scene, camera, projector(scene))
+    frame = beam_frames(beams, camera.geometry, geometric_terms(camera.geometry), np.zeros(N * N, np.int64)).irradiance
+    rows = np.sort(frame[0].mean(axis=1))
+    assert rows[30] == pytest.approx(rows[0], rel=1e-2) and rows[33] == pytest.approx(9 * rows[0], rel=1e-2)
+
+
+ONE_VARIANT = """
+import runpy, sys
+import numpy as np
+from mitsim.core.environment import load_variant
+mi = load_variant(sys.argv[1])
+from mitsim.transport import lensless
+lensless.register()
+tests = runpy.run_path(sys.argv[2])
+half = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+print(tests["flux"](tests["scene_with"](sheet=tests["plane"](0, 400, half))))
+"""
+
+
+def test_rgb_and_spectral_see_the_same_grey(variant: str) -> None:
+    """Children, because a process must not use objects of one variant under another."""
+    expected = 0.5 * flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
+    for name in ("llvm_ad_rgb", "llvm_ad_spectral"):
+        command = [sys.executable, "-c", ONE_VARIANT, name, __file__]
+        child = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert child.returncode == 0, child.stderr
+        # An upsampled grey is good to a few 1e-4.
+        assert float(child.stdout.splitlines()[-1]) == pytest.approx(expected, rel=1e-3), name
