@@ -40,9 +40,7 @@ Accuracy = Annotated[float, typer.Option(help="relative rms error of the expecte
 Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", metavar="FILE.toml")]
 ProjectorFile = Annotated[Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")]
 Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
-Effects = Annotated[
-    str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")
-]
+Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
 Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
 
 
@@ -179,9 +177,7 @@ def capture(
     chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
     with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define)
-        result = run_capture(
-            bench, patterns, output, accuracy, seed, chosen, resume, progress, forced, noise_fraction
-        )
+        result = run_capture(bench, patterns, output, accuracy, seed, chosen, resume, progress, forced, noise_fraction)
     payload = {key: value for key, value in asdict(result).items() if key != "plan"}
     seconds = result.seconds
     lines = [

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from mitsim.capture.mirror import MirrorLight
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
@@ -22,6 +24,7 @@ from mitsim.scene.patterns import PatternFamily, parse_patterns
 from mitsim.scene.projector import window_at
 from mitsim.sensor.model import SensorModel, load_sensor
 from mitsim.transport import plugins
+from mitsim.transport.beams import trace_beams
 from mitsim.transport.source import Projector
 
 __all__ = ["DEFAULT_VARIANT", "Bench", "PatternFamily", "ProjectorModel", "SessionRecipe", "load_recipe", "open_bench"]
@@ -125,6 +128,11 @@ class Bench:
         """The projector's photons by wavelength."""
         return self.projector.spectrum
 
+    @cached_property
+    def mirror_light(self) -> MirrorLight:
+        """Light of the projector that mirrors alone bring to the sensor."""
+        return MirrorLight(trace_beams(self.loaded.scene, self.loaded.camera, self.source))
+
     @property
     def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Row and column tan-angles of the projector's window on the aligned plane."""
@@ -189,7 +197,7 @@ class Bench:
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
-        return replace(self, loaded=replace(self.loaded, scene=scene, lamps=()))
+        return replace(self, loaded=replace(self.loaded, scene=scene, lamps=(), mirrors=False))
 
 
 def open_bench(

@@ -182,7 +182,9 @@ def collect(
         if error <= goal or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=error <= goal)
         # The error falls at least with the square root of the samples; where it falls faster, less is needed.
-        growth = min(1.1 * (error / goal) ** (2 if "interreflection" in plan.settings.effects else 1.2), _LARGEST_GROWTH)
+        growth = min(
+            1.1 * (error / goal) ** (2 if "interreflection" in plan.settings.effects else 1.2), _LARGEST_GROWTH
+        )
         wanted = min(max(wanted + 1, math.ceil(wanted * growth)), max(wanted + 1, _MOST_PATHS // (GROUPS * lanes)))
 
 
@@ -216,7 +218,6 @@ class _Group:
     def flux(self) -> FloatArray:
         """(n^2,) mean over the samples."""
         return self._flux / self.done
-
 
 
 def uniform_light(n: int) -> tuple[Labels, FloatArray]:

@@ -245,7 +245,9 @@ class _Anchors:
 
     def __init__(self, fine: _Fine, accuracy: float) -> None:
         self.fine, self.accuracy = fine, accuracy
-        self.coarse = Simulation(fine.bench, replace(fine.base, linear=True), pixels=max(fine.bench.n // _RATIO_PIXELS, 1))
+        self.coarse = Simulation(
+            fine.bench, replace(fine.base, linear=True), pixels=max(fine.bench.n // _RATIO_PIXELS, 1)
+        )
         self.centre = tuple(self._light(1, half) for half in range(2))
         self.classes = tuple(
             fine.simulation.file(one, fine.family.labels, _CELL_SAMPLES).tocoo() for one in fine.deposits
@@ -258,7 +260,9 @@ class _Anchors:
     def _light(self, anchors: int, half: int) -> FloatArray:
         """(anchors, rows, anchors, columns) light of all classes at the corners of coarse cells."""
         settings = replace(self.fine.base, anchors=anchors, linear=True)
-        simulation = Simulation(self.fine.bench, settings, common=True, pixels=max(self.fine.bench.n // _RATIO_PIXELS, 1))
+        simulation = Simulation(
+            self.fine.bench, settings, common=True, pixels=max(self.fine.bench.n // _RATIO_PIXELS, 1)
+        )
         found = simulation.tracer.trace(integer(self.fine.seed, "pilot", "anchors", half), 0, _RATIO_SAMPLES)
         light = simulation.bundle.file(found, np.zeros(self.fine.bench.n**2, dtype=np.int64))[[0]].toarray()
         rows, columns = simulation.bundle.cells
@@ -272,7 +276,9 @@ class _Anchors:
 
     def _half(self, simulation: Simulation, half: int) -> FloatArray:
         anchors, bundle, found = simulation.settings.anchors, simulation.bundle, self.classes[half]
-        centre = np.broadcast_to(self.centre[half], (anchors, *self.centre[half].shape[1:2], anchors, self.centre[half].shape[3]))
+        centre = np.broadcast_to(
+            self.centre[half], (anchors, *self.centre[half].shape[1:2], anchors, self.centre[half].shape[3])
+        )
         ratio = np.divide(self._light(anchors, half), centre, out=np.zeros(centre.shape), where=centre > 0)
         row, column = np.divmod(found.col, bundle.cells[1])
         beside = self.coarse.bundle.shares(bundle.grid.rows.centre(row), bundle.grid.columns.centre(column))

@@ -264,7 +264,9 @@ def truth(bench: Bench, plan: Plan, light: Light, seed: int) -> FloatArray:
 
 def board_flux(bench: Bench, plan: Plan, seed: int) -> FloatArray:
     """(n^2,) direct light of each projector pixel on the sensor, over the calibration board [W m^-2]."""
-    settings = Settings(bench.geometry.scene_distance, plan.settings.anchors, effects=_OF_PROJECTOR & plan.settings.effects)
+    settings = Settings(
+        bench.geometry.scene_distance, plan.settings.anchors, effects=_OF_PROJECTOR & plan.settings.effects
+    )
     board = bench.with_board(load_recipe().board_reflectance)
     return collect(
         board, replace(plan, settings=settings), *uniform_light(bench.n), seed, purpose="board", by_pixel=False

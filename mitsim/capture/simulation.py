@@ -46,7 +46,9 @@ class Simulation:
         self.black = bench.projector.black_level if "black-level" in on else 0.0
         pixels = pixels or bench.n
         self.aim = self._grid(pixels, 1)
-        self.bundle = Bundle(self._grid(pixels, settings.subdivision), settings.anchors, settings.depths, settings.linear)
+        self.bundle = Bundle(
+            self._grid(pixels, settings.subdivision), settings.anchors, settings.depths, settings.linear
+        )
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
         windows = self.bench.windows_at(self.settings.depth)
@@ -90,7 +92,7 @@ class Simulation:
         return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS))
 
     def _optics(self, spectrum: Spectrum) -> FrameOptics:
-        waves = spectrum if "diffraction" in self.settings.effects else None
+        waves = spectrum if self.waves else None
         bundle = self.bundle
         return FrameOptics(self.geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, waves)
 
@@ -108,8 +110,18 @@ class Simulation:
         return np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1]
 
     def mirrored(self, labels: Labels) -> ClassFrames | None:
-        """Frames of light that comes from the projector over mirrors alone, by class; None without such light."""
-        return None
+        """Frames of light that comes from the projector over mirrors alone, by class; None without such light.
+
+        It is a pinhole's light, whatever the projector's lens.
+        """
+        if "mirrors" not in self.settings.effects or not self.bench.loaded.mirrors:
+            return None
+        return self.bench.mirror_light.frames(labels, self.geometry, self.bench.spectrum if self.waves else None)
+
+    @property
+    def waves(self) -> bool:
+        """Whether the mask's shadow is wave-optical."""
+        return "diffraction" in self.settings.effects
 
     def expected(
         self,

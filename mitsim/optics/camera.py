@@ -98,6 +98,18 @@ class CameraGeometry(BaseModel):
         """A pixel's response, relative to normal incidence, to rays of the given tan^2(theta): cos^n(theta)."""
         return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
 
+    def setting(self, depth: float) -> Setting:
+        """Sensor, mask and a depth [mm] of the scene, for one shadow."""
+        edges = self.pixel_edges
+        return Setting(
+            mask=self.build_mask(),
+            pixel_centres_mm=(edges[:-1] + edges[1:]) / 2,
+            active_mm=self.active_side,
+            distance_mm=self.mask_distance,
+            thickness_mm=self.mask_thickness,
+            depth_mm=depth,
+        )
+
     def shadow_terms(
         self, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None = None
     ) -> SeparableTerms:
@@ -107,15 +119,7 @@ class CameraGeometry(BaseModel):
         The mean over a pixel's active area times the fill factor: irradiance is per pixel area. All weights are folded
         into left. The angular response is not in here; it belongs to the light.
         """
-        edges = self.pixel_edges
-        setting = Setting(
-            mask=self.build_mask(),
-            pixel_centres_mm=(edges[:-1] + edges[1:]) / 2,
-            active_mm=self.active_side,
-            distance_mm=self.mask_distance,
-            thickness_mm=self.mask_thickness,
-            depth_mm=depth,
-        )
+        setting = self.setting(depth)
         if spectrum is None:
             terms = geometric_terms(setting, rows, columns)
         else:

@@ -137,6 +137,21 @@ def wave_terms(setting: Setting, rows: Directions, columns: Directions, spectrum
     return found
 
 
+def wave_profiles(
+    setting: Setting, wavelength_nm: float, low_mm: float, high_mm: float, tau: float
+) -> tuple[list[tuple[float, FloatArray]], float, float]:
+    """Intensity of a point source's shadow over the mask coordinate, before any averaging over pixel and cell.
+
+    Returns (weight, (cells,) profile) of each separable term, and the start and the step [mm] of the grid. ``tau`` is
+    the source's tan-angle; it matters to thick masks.
+    """
+    waves = _prepare(setting, wavelength_nm, np.array([low_mm]), np.array([high_mm]))
+    start = _start(setting, waves.step_mm, low_mm)
+    rows = [profile for _, profile, _ in setting.mask.terms]
+    products = _products([waves.field(clear, start) for clear in setting.clear(rows, tau)])
+    return list(zip(_pair_weights(setting.weights()), products, strict=True)), start, waves.step_mm
+
+
 def grid_step(setting: Setting, wavelength_nm: float) -> float:
     """Width of a grid cell [mm]; a feature holds a whole number of them."""
     fresnel_length = (wavelength_nm * 1e-6 * setting.distance_mm * setting.shrink) ** 0.5

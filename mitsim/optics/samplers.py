@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.diffraction import Spectrum, wave_profiles
 
 FloatArray = npt.NDArray[np.float64]
 Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
@@ -23,16 +24,18 @@ SeparableTerm = tuple[float, Sampler, Sampler]
 class ProfileSampler:
     """Exact means of a piecewise constant mask profile, zero outside its features."""
 
-    def __init__(self, profile: npt.ArrayLike, feature_mm: float) -> None:
-        """``profile``: (N,) transmission of each feature, centred on the axis; ``feature_mm``: their size [mm]."""
+    def __init__(self, profile: npt.ArrayLike, feature_mm: float, start_mm: float | None = None) -> None:
+        """``profile``: (N,) transmission of each feature from ``start_mm`` on (centred on the axis without it);
+        ``feature_mm``: their size [mm]."""
         values = np.asarray(profile, dtype=np.float64)
         self._values = np.concatenate(([0.0], values, [0.0]))
         self._sums = np.concatenate(([0.0, 0.0], np.cumsum(values)))
         self._feature, self._count = feature_mm, len(values)
+        self._start = -len(values) / 2 if start_mm is None else start_mm / feature_mm
 
     def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
         """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
-        centre, half = s / self._feature + self._count / 2, np.maximum(np.abs(width) / self._feature, 1e-9) / 2
+        centre, half = s / self._feature - self._start, np.maximum(np.abs(width) / self._feature, 1e-9) / 2
         return np.asarray((self._integral(centre + half) - self._integral(centre - half)) / (2 * half))
 
     def _integral(self, x: FloatArray) -> FloatArray:
@@ -40,6 +43,24 @@ class ProfileSampler:
         feature = np.clip(np.floor(x).astype(np.intp), -1, self._count)
         inside = np.clip(x, 0, self._count) - feature
         return np.asarray(self._sums[feature + 1] + self._values[feature + 1] * inside)
+
+
+def wave_samplers(
+    geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: tuple[float, float]
+) -> list[SeparableTerm]:
+    """The mask's wave-optical shadow of a (virtual) source at ``depth`` [mm] and tan-angles ``tau``, as samplers."""
+    edges = geometry.pixel_edges
+    setting = geometry.setting(depth)
+    reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + float(edges[1] - edges[0])
+    found: list[SeparableTerm] = []
+    for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
+        rows, start, step = wave_profiles(setting, float(wavelength), -reach, reach, tau[0])
+        columns, *_ = wave_profiles(setting, float(wavelength), -reach, reach, tau[1])
+        found += [
+            (float(share) * weight, ProfileSampler(row, step, start), ProfileSampler(column, step, start))
+            for (weight, row), (_, column) in zip(rows, columns, strict=True)
+        ]
+    return found
 
 
 def geometric_terms(geometry: CameraGeometry) -> list[SeparableTerm]:

@@ -278,7 +278,9 @@ def _anchors(anchors: int, evidence: Evidence, accuracy: float, cost: _Cost) -> 
 def _layers(layers: int, evidence: Evidence, accuracy: float, cost: _Cost) -> Effect:
     errors = evidence.layer_error
     if layers == 1:
-        reason = f"the light is seen at {evidence.depth:.1f} mm; one layer leaves {errors[1]:.1e} of {accuracy:g} allowed"
+        reason = (
+            f"the light is seen at {evidence.depth:.1f} mm; one layer leaves {errors[1]:.1e} of {accuracy:g} allowed"
+        )
         return Effect("layers", "off", reason, errors[1], 0.0)
     far, near = evidence.layers[layers][0], evidence.layers[layers][-1]
     reason = f"the light is seen from {near:.0f} to {far:.0f} mm; {layers} layers leave {errors[layers]:.1e}"
@@ -332,7 +334,9 @@ def _fixed(facts: SceneFacts) -> tuple[Effect, ...]:
     )
     return (
         Effect("keystone", "exact", keystone, None, 0.0),
-        Effect("spectrum", "off", "one panchromatic reflectance; wavelengths differ in the mask's shadow only", None, 0.0),
+        Effect(
+            "spectrum", "off", "one panchromatic reflectance; wavelengths differ in the mask's shadow only", None, 0.0
+        ),
         Effect("sensor-noise", "exact", "Poisson, full well, read noise and quantisation of each frame", None, 0.0),
     )
 

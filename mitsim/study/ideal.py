@@ -25,7 +25,9 @@ def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Lig
     """
     simulation = Simulation(bench, Settings(bench.geometry.scene_distance))
     grid, pixels = simulation.bundle.grid, np.arange(bench.n**2)
-    first = [round((w[0] - axis.start) / axis.size) for w, axis in zip(bench.windows, (grid.rows, grid.columns), strict=True)]
+    first = [
+        round((w[0] - axis.start) / axis.size) for w, axis in zip(bench.windows, (grid.rows, grid.columns), strict=True)
+    ]
     row, column = np.divmod(pixels, bench.n)
     places = (row + first[0]) * grid.columns.count + column + first[1]
     flux = reflectance.ravel() * board_flux

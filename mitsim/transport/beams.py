@@ -22,7 +22,7 @@ import numpy.typing as npt
 from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import Beams
 from mitsim.optics.camera import CameraGeometry
-from mitsim.transport.factored import Projector
+from mitsim.transport.source import Projector
 from mitsim.transport.mirrors import Crossings, MirrorTracer, delta_bsdfs
 
 FloatArray = npt.NDArray[np.float64]

@@ -366,4 +366,3 @@ def panchromatic(radiance: Any) -> Any:
 def _edge(axis: Any, index: Any, jitter: Any) -> Any:
     start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, axis.size)
     return start + (mi.Float(index) + jitter) * size
-

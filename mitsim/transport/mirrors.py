@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.transport.factored import Projector
+from mitsim.transport.source import Projector
 from mitsim.transport.pinhole import PinholeRays, channels, host, vectors, wavelength_sets
 
 FloatArray = npt.NDArray[np.float64]

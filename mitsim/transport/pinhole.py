@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.transport.factored import Projector
+from mitsim.transport.source import Projector
 
 FloatArray = npt.NDArray[np.float64]
 _WAVELENGTH_SETS = 8

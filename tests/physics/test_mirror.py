@@ -16,7 +16,7 @@ from scipy.signal import max_len_seq
 from mitsim.optics.beams import SpecularFrames, beam_frames, geometric_terms
 from mitsim.scene.patterns import parse_patterns
 from mitsim.transport.beams import trace_beams
-from mitsim.transport.factored import Projector
+from mitsim.transport.source import Projector
 from mitsim.transport.mirrors import MirrorTracer
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -10,7 +10,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import beam_frames, geometric_terms
 from mitsim.transport.beams import has_specular, trace_beams
-from mitsim.transport.factored import Projector
+from mitsim.transport.source import Projector
 from mitsim.transport.mirrors import MirrorTracer
 from mitsim.transport.pinhole import PinholeRays
 

@@ -1,0 +1,54 @@
+"""Light that comes to the sensor over mirrors alone: from a projector's beams to frames of each class of its pixels."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.optics.beams import Beams, beam_frames
+from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.diffraction import Spectrum
+from mitsim.optics.frames import ClassFrames
+from mitsim.optics.samplers import SeparableTerm, geometric_terms, wave_samplers
+
+FloatArray = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
+_KEPT = 4
+
+
+class MirrorLight:
+    """Frames made from beams; the last few are kept, because forming them takes as long as tracing does."""
+
+    def __init__(self, beams: Beams) -> None:
+        self.beams = beams
+        self._made: dict[tuple[bytes, CameraGeometry, bytes], ClassFrames] = {}
+
+    def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
+        """Frames by class for ``labels`` (n^2,); without a ``spectrum`` the mask's shadow is geometric."""
+        if not len(self.beams):
+            return None
+        key = labels.tobytes(), geometry, spectrum.wavelengths_nm.tobytes() if spectrum else b""
+        if key not in self._made:
+            while len(self._made) >= _KEPT:
+                del self._made[next(iter(self._made))]
+            self._made[key] = self._form(labels, geometry, spectrum)
+        return self._made[key]
+
+    def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
+        def response(row: FloatArray, column: FloatArray) -> FloatArray:
+            return geometry.pixel_fill_factor * geometry.angular_response(np.square(row) + np.square(column))
+
+        active = math.sqrt(geometry.pixel_fill_factor)
+        found = beam_frames(self.beams, geometry, self._terms(geometry, spectrum), labels, response, active)
+        return ClassFrames(found.classes, found.irradiance)
+
+    def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SeparableTerm]:
+        """The mask for a virtual source at the beams' mean depth and direction."""
+        if spectrum is None:
+            return geometric_terms(geometry)
+        near = float(np.mean(self.beams.inverse_depth))
+        depth = 1 / near if near > 0 else math.inf
+        tau = np.average(self.beams.tangent.mean(axis=(1, 2)), axis=0, weights=self.beams.delivered)
+        return wave_samplers(geometry, spectrum, depth, (float(tau[0]), float(tau[1])))
