@@ -215,7 +215,7 @@ class ExpectedFrames:
         pairs = count * (count - 1)
         for frame, one in zip(irradiance, deviation, strict=True):
             if self._always is not None:
-                frame, one = frame + self._always[0][0], one + self._always[1][0]  # noqa: PLW2901
+                frame, one = frame + self._always[0][0], one + self._always[1][0]
             squared = float(one @ one)
             variance = squared / pairs / frame.size if pairs else 0.0
             seen = np.maximum(frame, 0)

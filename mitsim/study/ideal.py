@@ -14,6 +14,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.light import Light
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.shadow import Directions
+from mitsim.scene.plan import Settings
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -22,8 +22,8 @@ import numpy.typing as npt
 from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import Beams
 from mitsim.optics.camera import CameraGeometry
-from mitsim.transport.source import Projector
 from mitsim.transport.mirrors import Crossings, MirrorTracer, delta_bsdfs
+from mitsim.transport.source import Projector
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -16,8 +16,8 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.transport.source import Projector
 from mitsim.transport.pinhole import PinholeRays, channels, host, vectors, wavelength_sets
+from mitsim.transport.source import Projector
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -16,8 +16,8 @@ from scipy.signal import max_len_seq
 from mitsim.optics.beams import SpecularFrames, beam_frames, geometric_terms
 from mitsim.scene.patterns import parse_patterns
 from mitsim.transport.beams import trace_beams
-from mitsim.transport.source import Projector
 from mitsim.transport.mirrors import MirrorTracer
+from mitsim.transport.source import Projector
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE, REFLECTANCE, D, FEATURE, PITCH = 128, 151250.0, 0.8, 2.0, 0.06, 0.01172

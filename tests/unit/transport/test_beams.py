@@ -10,9 +10,9 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import beam_frames, geometric_terms
 from mitsim.transport.beams import has_specular, trace_beams
-from mitsim.transport.source import Projector
 from mitsim.transport.mirrors import MirrorTracer
 from mitsim.transport.pinhole import PinholeRays
+from mitsim.transport.source import Projector
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE = 8, 111000.0
