@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,8 +50,9 @@ class Light:
 
     Attributes
     ----------
-    groups
-        independent estimates, (rows + 1, places) each [W m^-2]; the last row is ambient light.
+    groups, indirect
+        independent estimates, (rows + 1, places) each [W m^-2], the last row ambient light; and of indirect light
+        (rows, places).
     simulation
         what was simulated; it turns light into frames.
     labels
@@ -65,6 +66,7 @@ class Light:
     """
 
     groups: tuple[sparse.csr_array, ...]
+    indirect: tuple[sparse.csr_array, ...]
     simulation: Simulation
     labels: Labels
     flux: FloatArray
@@ -82,11 +84,11 @@ class Light:
         if not np.array_equal(rows[self.labels], labels):
             raise ValueError("the light was collected for another family of patterns")
         exact = self.simulation.mirrored(labels)
-        return self.simulation.expected(self.groups, rows, weights, seed, exact)
+        return self.simulation.expected(self.groups, self.indirect, rows, weights, seed, exact)
 
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""
-        return replace(self, groups=(sum(self.groups[1:], self.groups[0]) / len(self.groups),))
+        return replace(self, groups=(_mean(self.groups),), indirect=(_mean(self.indirect),))
 
 
 def make_plan(
@@ -168,6 +170,7 @@ def collect(
             group.sample(wanted)
         light = Light(
             groups=tuple(group.light for group in groups),
+            indirect=tuple(group.indirect for group in groups),
             simulation=simulation,
             labels=kept,
             flux=np.asarray(sum(group.flux for group in groups) / GROUPS),
@@ -193,31 +196,52 @@ class _Group:
 
     def __init__(self, simulation: Simulation, labels: Labels, seed: int) -> None:
         self.simulation, self.labels, self.seed = simulation, labels, seed
-        self.done = 0
+        self.done = self._direct = 0
+        self._most_direct = simulation.settings.direct_samples
         self._light: sparse.csr_array | None = None
+        self._indirect: sparse.csr_array | None = None
         self._flux = np.zeros(simulation.bench.n**2)
 
     def sample(self, wanted: int) -> None:
         """Trace up to the sample number ``wanted`` of the sequence."""
-        at_once = max(1, _LANES_AT_ONCE // self.simulation.tracer.lanes)
+        simulation = self.simulation
+        at_once = max(1, _LANES_AT_ONCE // simulation.tracer.lanes)
         while self.done < wanted:
             count = min(at_once, wanted - self.done)
-            found = self.simulation.tracer.trace(self.seed, self.done, count)
-            light = self.simulation.file(found, self.labels, 1)
-            self._light = light if self._light is None else self._light + light
-            self._flux += self.simulation.flux(found, 1)
+            if self._most_direct > self.done:
+                count = min(count, self._most_direct - self.done)
+            found = simulation.tracer.trace(self.seed, self.done, count)
             self.done += count
+            if not self._most_direct or self.done <= self._most_direct:
+                self._light = _added(self._light, simulation.file(found, self.labels, 1))
+                self._flux += simulation.flux(found, 1)
+                self._direct = self.done
+            self._indirect = _added(self._indirect, simulation.file_indirect(found, self.labels, 1))
 
     @property
     def light(self) -> sparse.csr_array:
-        """(rows + 1, places) mean over the samples [W m^-2]."""
+        """(rows + 1, places) mean over the samples of direct and ambient light [W m^-2]."""
         assert self._light is not None
-        return self._light / self.done
+        return self._light / self._direct
+
+    @property
+    def indirect(self) -> sparse.csr_array:
+        """(rows, places) mean over the samples of indirect light [W m^-2]."""
+        assert self._indirect is not None
+        return self._indirect / self.done
 
     @property
     def flux(self) -> FloatArray:
         """(n^2,) mean over the samples."""
-        return self._flux / self.done
+        return self._flux / self._direct
+
+
+def _added(total: sparse.csr_array | None, light: sparse.csr_array) -> sparse.csr_array:
+    return light if total is None else total + light
+
+
+def _mean(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
+    return sum(groups[1:], groups[0]) / len(groups)
 
 
 def uniform_light(n: int) -> tuple[Labels, FloatArray]:

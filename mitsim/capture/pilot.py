@@ -1,4 +1,4 @@
-"""A short look at a scene before the real work: the error that each effect and each coarseness would leave, and the pace.
+"""A short look at a scene before the real work: the error that each effect or coarseness would leave, and the pace.
 
 Numbers in, numbers out: the effect plan (:mod:`mitsim.scene.plan`) reads them and decides. Every error is relative,
 ``||a - b|| / ||b||``, over up to four captures of the family. Two independent halves A and B see the same change with
@@ -23,7 +23,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.scene.plan import GROUPS, PHYSICAL, Evidence, Noise, Settings
-from mitsim.transport.histogram import Deposits
+from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
@@ -210,8 +210,7 @@ class _Effects:
 
     def noise(self) -> Noise:
         """Monte Carlo error of one estimate of all that is not direct light, relative to all light."""
-        n = self.bench.n**2
-        other = tuple(found.where((found.order > 1) | (found.source == n)) for found in self.deposits)
+        other = tuple(found.where(found.order != DIRECT) for found in self.deposits)
         first, second = self._form(self.simulation, other)
         energy = float(np.vdot(*self.frames))
         spread = float(np.square(first - second).sum()) / 2
@@ -221,9 +220,9 @@ class _Effects:
         simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {name}))
         deposits = self._trace(simulation) if name in _TRACED_ANEW else self.deposits
         if name == "interreflection":
-            deposits = tuple(found.where(found.order == 1) for found in deposits)
+            deposits = tuple(found.where(found.order != INDIRECT) for found in deposits)
         if name == "ambient":
-            deposits = tuple(found.where(found.source < self.bench.n**2) for found in deposits)
+            deposits = tuple(found.where(found.order != AMBIENT) for found in deposits)
         return self._form(simulation, deposits)
 
     def _trace(self, simulation: Simulation) -> tuple[Deposits, ...]:
@@ -318,9 +317,10 @@ def _ladder(
 def _form(simulation: Simulation, found: Deposits, samples: int, family: _Family) -> FloatArray:
     """(captures, pixels, pixels) frames of some deposits."""
     light = simulation.file(found, family.labels, samples)
+    indirect = simulation.file_indirect(found, family.labels, samples)
     rows = np.arange(family.weights.shape[1])
     exact = simulation.mirrored(family.labels)
-    expected = simulation.expected([light], rows, family.weights, 0, exact)
+    expected = simulation.expected([light], [indirect], rows, family.weights, 0, exact)
     return np.stack([frame.irradiance for frame in expected])
 
 

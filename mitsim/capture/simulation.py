@@ -18,11 +18,11 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 from mitsim.optics.diffraction import Spectrum
-from mitsim.optics.frames import Ambient, ClassFrames, ExpectedFrames, FrameOptics
+from mitsim.optics.frames import Ambient, ClassFrames, ExpectedFrames, FrameOptics, Indirect
 from mitsim.scene.plan import Settings
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.factored import Paths, Tracer
-from mitsim.transport.histogram import Bundle, Deposits
+from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
@@ -34,7 +34,7 @@ class Simulation:
     """A bench with settings; its parts are prepared when they are first asked for."""
 
     def __init__(self, bench: Bench, settings: Settings, common: bool = False, pixels: int | None = None) -> None:
-        """``common``: anchors share their random numbers; ``pixels``: cells a side of the window, instead of its own."""
+        """``common``: anchors share random numbers; ``pixels``: cells a side of the window, instead of its own."""
         self.bench, self.settings, self.common = bench, settings, common
         on = settings.effects
         neutral: dict[str, float] = {}
@@ -84,21 +84,36 @@ class Simulation:
     @cached_property
     def optics(self) -> FrameOptics:
         """The mask's shadow in the projector's light."""
-        return self._optics(self.bench.spectrum)
+        return self._optics(self.bench.spectrum, self.bundle)
 
     @cached_property
     def ambient_optics(self) -> FrameOptics:
         """The mask's shadow in the light of other lamps."""
-        return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS))
+        return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS), self.bundle)
 
-    def _optics(self, spectrum: Spectrum) -> FrameOptics:
+    def _optics(self, spectrum: Spectrum, bundle: Bundle) -> FrameOptics:
         waves = spectrum if self.waves else None
-        bundle = self.bundle
         return FrameOptics(self.geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, waves)
 
     def file(self, found: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        """(classes + 1, places) light of every class, and ambient light [W m^-2]."""
-        return self.bundle.file(found, labels, samples)
+        """(classes + 1, places) light of every class, indirect light apart, and ambient light [W m^-2]."""
+        return self.bundle.file(found.where(found.order != INDIRECT), labels, samples)
+
+    def file_indirect(self, found: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
+        """(classes, places) indirect light of every class [W m^-2]."""
+        return self.indirect.file(found.where(found.order == INDIRECT), labels, samples)[:-1]
+
+    @cached_property
+    def indirect(self) -> Bundle:
+        """How indirect light is filed: it is smooth, and a small part of the light can do with coarser cells."""
+        if not self.settings.coarse_indirect:
+            return self.bundle
+        return Bundle(self.aim, self.settings.anchors, (self.settings.depth,), False)
+
+    @cached_property
+    def indirect_optics(self) -> FrameOptics:
+        """The mask's shadow for indirect light."""
+        return self._optics(self.bench.spectrum, self.indirect) if self.settings.coarse_indirect else self.optics
 
     def flux(self, found: Deposits, samples: int) -> FloatArray:
         """(n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask."""
@@ -106,8 +121,8 @@ class Simulation:
         centres = (edges[:-1] + edges[1:]) / 2
         positions = anchor_positions(self.settings.anchors, self.geometry.half_width)
         mean = anchor_weights(positions, centres).mean(axis=0)
-        value = found.value * mean[found.anchor_row] * mean[found.anchor_column] * (found.order == 1) / samples
-        return np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1]
+        value = found.value * mean[found.anchor_row] * mean[found.anchor_column] * (found.order == DIRECT) / samples
+        return np.asarray(np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
     def mirrored(self, labels: Labels) -> ClassFrames | None:
         """Frames of light that comes from the projector over mirrors alone, by class; None without such light.
@@ -126,18 +141,25 @@ class Simulation:
     def expected(
         self,
         groups: Sequence[sparse.csr_array],
+        indirect: Sequence[sparse.csr_array],
         rows: Labels,
         weights: FloatArray,
         seed: int,
         exact: ClassFrames | None = None,
     ) -> ExpectedFrames:
-        """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' first rows to classes."""
+        """Frames of the captures ``weights`` (captures, classes) from :meth:`file` and :meth:`file_indirect`.
+
+        ``rows`` maps the groups' rows to classes.
+        """
         first = len(rows)
         emitted = self.black + (1 - self.black) * weights
-        ambient = None
+        ambient, more = None, None
         if self.lit_by_lamps:
             ambient = Ambient(self.ambient_optics, tuple(group[first:] for group in groups))
-        return ExpectedFrames(self.optics, [group[:first] for group in groups], rows, emitted, seed, ambient, exact)
+        if any(group.nnz for group in indirect):
+            more = Indirect(self.indirect_optics, tuple(indirect))
+        direct = [group[:first] for group in groups]
+        return ExpectedFrames(self.optics, direct, rows, emitted, seed, ambient, exact, more)
 
     @property
     def lit_by_lamps(self) -> bool:

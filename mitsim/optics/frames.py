@@ -1,9 +1,9 @@
 """Frames in closed form: from light per (anchor, tan-angle cell) to irradiance on every sensor pixel, and its error.
 
 A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
-distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and its
-columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that hold light enter the product: for k x k shifting dots that
-is one in k of each.
+distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and
+its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
+hold light enter the product: for k x k shifting dots that is one in k of each.
 """
 
 from __future__ import annotations
@@ -130,6 +130,14 @@ class ClassFrames:
 
 
 @dataclass(frozen=True, eq=False)
+class Indirect:
+    """Indirect light of the same projector pixels or classes: its optics, and independent estimates (rows, cells)."""
+
+    optics: FrameOptics
+    groups: tuple[sparse.csr_array, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Ambient:
     """Light that every capture holds alike: its optics, and independent estimates (1, cells) each."""
 
@@ -158,15 +166,19 @@ class ExpectedFrames:
         seed: int,
         ambient: Ambient | None = None,
         exact: ClassFrames | None = None,
+        indirect: Indirect | None = None,
     ) -> None:
         """``groups``: independent estimates of the light, (rows, cells) each; their mean is used.
 
         ``labels``: (rows,) class 0..C-1 of each row, a projector pixel or a class of them; ``weights``: (captures, C)
         fraction of full power that each class emits; ``seed``: of the random signs; ``ambient``: light of every
-        capture, its groups paired with these; ``exact``: frames of some classes without Monte Carlo error.
+        capture, its groups paired with these; ``exact``: frames of some classes without Monte Carlo error;
+        ``indirect``: more light of the same rows, filed in other cells.
         """
-        self._optics, self._groups, self._seed = optics, tuple(groups), seed
-        self._mean = _mean_of(self._groups)
+        self._lights = [(optics, tuple(groups), _mean_of(groups))]
+        if indirect is not None:
+            self._lights.append((indirect.optics, indirect.groups, _mean_of(indirect.groups)))
+        self._seed = seed
         classes, rows = weights.shape[1], labels.size
         indicator = sparse.csr_array((np.ones(rows), (labels, np.arange(rows))), shape=(classes, rows))
         self._mixed = classes <= min(_LARGEST_BASIS, len(weights))
@@ -199,7 +211,11 @@ class ExpectedFrames:
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) deviations of their groups."""
         chosen = self._basis[start:stop]
-        found = _formed(self._optics, chosen @ self._mean, [chosen @ group for group in self._groups], self._seed)
+        parts = [
+            _formed(optics, chosen @ mean, [chosen @ group for group in groups], self._seed)
+            for optics, groups, mean in self._lights
+        ]
+        found = parts[0] if len(parts) == 1 else (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
         if self._exact is not None:
             shares = self._shares[start:stop][:, self._exact.classes]
             for frame, share in zip(found[0], shares, strict=True):
@@ -211,7 +227,7 @@ class ExpectedFrames:
         if self._ambient is not None and self._always is None:
             lamps = self._ambient.groups
             self._always = _formed(self._ambient.optics, _mean_of(lamps), lamps, self._seed)
-        count = len(self._groups)
+        count = len(self._lights[0][1])
         pairs = count * (count - 1)
         for frame, one in zip(irradiance, deviation, strict=True):
             if self._always is not None:
@@ -230,7 +246,7 @@ def _mean_of(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
 def _formed(
     optics: FrameOptics, light: sparse.csr_array, parts: Sequence[sparse.csr_array], seed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Frames (b, pixels, pixels) of each row of ``light``, and the deviations of its groups ``parts``, as signs see them."""
+    """Frames (b, pixels, pixels) of each row of ``light``, and deviations of its groups ``parts`` as signs see them."""
     pixels, groups = optics.pixels, len(parts)
     probes = _probes(pixels, seed)
     frames = np.empty((light.shape[0], pixels, pixels))

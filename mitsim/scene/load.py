@@ -23,8 +23,8 @@ class LoadedScene:
     """A scene ready for transport.
 
     ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
-    pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all other
-    emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions.
+    pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
+    other emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions.
     """
 
     path: Path

@@ -1,15 +1,15 @@
 """The effect plan: from measured evidence and an accuracy to what is simulated, why, and what it costs.
 
-Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels. An effect is
-simulated when leaving it out would change the frames by more than that. Discretisations of effects that are on (how many
-anchors, layers, cells) each take a part of the budget, and sampling gets what is left of its square.
+Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels. An effect
+is simulated when leaving it out would change the frames by more than that. Discretisations of effects that are on (how
+many anchors, layers, cells) each take a part of the budget, and sampling gets what is left of its square.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from mitsim.core.errors import MitsimError
@@ -25,7 +25,12 @@ SWITCHES = ("anchors", "layers", *PHYSICAL)
 _RESIDUAL = 0.5
 _FLOOR = 0.3
 _SAMPLING_MARGIN = 0.95
-_FEWEST_SAMPLES = 1.0
+_FLAGGED = 1.5
+"""Every effect is held to the accuracy by itself; their sum is reported, and flagged above this much of it."""
+_FEWEST_SAMPLES, _FEWEST_DIRECT = 1.0, 4
+_COARSE = 0.3
+_PARTS = {1: (1.0,), 2: (0.4, 0.9)}
+"""Parts of the sampling error that direct light and all other light may have."""
 GROUPS = 8
 """Independent estimates of the light, whose spread tells the Monte Carlo error."""
 
@@ -57,6 +62,10 @@ class Settings:
         cells a side of a projector pixel, and whether light is split between their corners.
     effects
         those of :data:`PHYSICAL` that are simulated.
+    direct_samples
+        samples a cell and a group after which only indirect light is still collected; 0: no end.
+    coarse_indirect
+        whether indirect light is filed in one layer and one cell a projector pixel.
     """
 
     depth: float
@@ -65,6 +74,8 @@ class Settings:
     subdivision: int = 1
     linear: bool = False
     effects: frozenset[str] = frozenset()
+    direct_samples: int = 0
+    coarse_indirect: bool = False
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -200,15 +211,20 @@ def decide(
         linear=cells[1],
         effects=on,
     )
+    share = evidence.effect_error.get("interreflection", 0.0) if "interreflection" in on else 0.0
+    coarse = share * math.hypot(evidence.layer_error[1], max(evidence.cell_error.values()))
+    settings = replace(settings, coarse_indirect=share > 0 and coarse <= _COARSE * accuracy)
     left_out = {name: error for name, error in evidence.effect_error.items() if name not in on}
     left = math.hypot(
         evidence.anchor_error[anchors],
         evidence.layer_error[layers],
         evidence.cell_error[cells],
+        coarse if settings.coarse_indirect else 0.0,
         *left_out.values(),
     )
     target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - left**2, (_FLOOR * accuracy) ** 2))
     cost = _Cost(evidence, settings, captures, target)
+    settings = replace(settings, direct_samples=cost.direct_samples)
     effects = (
         _anchors(anchors, evidence, accuracy, cost),
         _layers(layers, evidence, accuracy, cost),
@@ -235,8 +251,11 @@ class _Cost:
         single = target * math.sqrt(GROUPS)
         noisy = evidence.noise if settings.effects & {"interreflection", "ambient"} else evidence.noise[:1]
         # Every anchor's paths help: a pixel's light is interpolated between them.
-        needed = max(noise.samples_for(single / math.sqrt(len(noisy))) for noise in noisy)
-        self.samples = max(_FEWEST_SAMPLES, needed / settings.anchors**2)
+        needed = [noise.samples_for(single * part) for noise, part in zip(noisy, _PARTS[len(noisy)], strict=True)]
+        self.samples = max(_FEWEST_SAMPLES, max(needed) / settings.anchors**2)
+        # Direct light converges fast; samples for the sake of the rest need not collect it again.
+        direct = max(math.ceil(1.5 * needed[0] / settings.anchors), _FEWEST_DIRECT)
+        self.direct_samples = direct if self.bounced and direct < self.samples else 0
 
     @property
     def total(self) -> float:
@@ -258,7 +277,7 @@ class _Cost:
 
 
 def _count(errors: Mapping[int, float], accuracy: float, forced: bool | None) -> int:
-    """One when that is good enough, else the fewest that leave a part of the accuracy (the most known, failing that)."""
+    """One if that is good enough, else the fewest that leave a part of the accuracy (failing that, the most known)."""
     if forced is False or (forced is None and errors[1] <= accuracy):
         return 1
     several = [count for count in sorted(errors) if count > 1]
@@ -350,7 +369,7 @@ def _warnings(
     layers: int,
     cells: tuple[int, bool],
 ) -> tuple[str, ...]:
-    if left <= accuracy:
+    if left <= _FLAGGED * accuracy:
         return ()
     parts = {
         f"{anchors}x{anchors} anchors": evidence.anchor_error[anchors],

@@ -33,7 +33,8 @@ def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Lig
     places = (row + first[0]) * grid.columns.count + column + first[1]
     flux = reflectance.ravel() * board_flux
     light = sparse.csr_array((flux, (pixels, places)), shape=(bench.n**2 + 1, simulation.bundle.size))
-    return Light((light,), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True)
+    none = sparse.csr_array((bench.n**2, simulation.bundle.size))
+    return Light((light,), (none,), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True)
 
 
 def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -> tuple[FloatArray, FloatArray]:

@@ -1,7 +1,7 @@
 """From paths to light per cell: deposits in, a sparse matrix out, light[row, layer x (anchor, cell) x (anchor, cell)].
 
-A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the last
-row. A path's light is split between the two layers (in 1/z) that enclose its depth, and filed either in the cell
+A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the
+last row. A path's light is split between the two layers (in 1/z) that enclose its depth, and filed either in the cell
 that holds its direction (``linear`` off: right when cells and projector pixels coincide) or between the four nearest
 cell corners, so that its direction is kept to first order (``linear`` on).
 """
@@ -20,6 +20,8 @@ from mitsim.transport.cells import CellAxis, CellGrid
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+AMBIENT, DIRECT, INDIRECT = 0, 1, 2
+"""Kinds of light, the ``order`` of a deposit."""
 Bins = list[tuple[IntArray, FloatArray]]
 
 
@@ -40,7 +42,7 @@ class Deposits:
     value
         (m,) irradiance [W m^-2].
     order
-        (m,) surfaces that scattered the light, mirrors not counted: 1 is direct light.
+        (m,) 1 for direct light of the projector, 2 for its indirect light, 0 for ambient light.
     """
 
     source: IntArray
@@ -56,6 +58,12 @@ class Deposits:
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
         """All parts in one."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+    @classmethod
+    def none(cls) -> Deposits:
+        """No light at all."""
+        index, number = np.zeros(0, dtype=np.int64), np.zeros(0)
+        return cls(index, index, index, number, number, number, number, np.zeros(0, dtype=np.int16))
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> Deposits:
         """The chosen entries."""
