@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,7 @@ from scipy import sparse
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.simulation import Light as Estimate
 from mitsim.capture.simulation import Simulation
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
@@ -50,9 +53,8 @@ class Light:
 
     Attributes
     ----------
-    groups, indirect
-        independent estimates, (rows + 1, places) each [W m^-2], the last row ambient light; and of indirect light
-        (rows, places).
+    groups
+        independent estimates.
     simulation
         what was simulated; it turns light into frames.
     labels
@@ -65,8 +67,7 @@ class Light:
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     """
 
-    groups: tuple[sparse.csr_array, ...]
-    indirect: tuple[sparse.csr_array, ...]
+    groups: tuple[Estimate, ...]
     simulation: Simulation
     labels: Labels
     flux: FloatArray
@@ -84,11 +85,11 @@ class Light:
         if not np.array_equal(rows[self.labels], labels):
             raise ValueError("the light was collected for another family of patterns")
         exact = self.simulation.mirrored(labels)
-        return self.simulation.expected(self.groups, self.indirect, rows, weights, seed, exact)
+        return self.simulation.expected(self.groups, rows, weights, seed, exact)
 
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""
-        return replace(self, groups=(_mean(self.groups),), indirect=(_mean(self.indirect),))
+        return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
 
 def make_plan(
@@ -170,7 +171,6 @@ def collect(
             group.sample(wanted)
         light = Light(
             groups=tuple(group.light for group in groups),
-            indirect=tuple(group.indirect for group in groups),
             simulation=simulation,
             labels=kept,
             flux=np.asarray(sum(group.flux for group in groups) / GROUPS),
@@ -198,7 +198,7 @@ class _Group:
         self.simulation, self.labels, self.seed = simulation, labels, seed
         self.done = self._direct = 0
         self._most_direct = simulation.settings.direct_samples
-        self._light: sparse.csr_array | None = None
+        self._light: Estimate | None = None
         self._indirect: sparse.csr_array | None = None
         self._flux = np.zeros(simulation.bench.n**2)
 
@@ -213,35 +213,25 @@ class _Group:
             found = simulation.tracer.trace(self.seed, self.done, count)
             self.done += count
             if not self._most_direct or self.done <= self._most_direct:
-                self._light = _added(self._light, simulation.file(found, self.labels, 1))
+                light = simulation.file(found, self.labels, 1)
+                self._light = light if self._light is None else self._light + light
                 self._flux += simulation.flux(found, 1)
                 self._direct = self.done
-            self._indirect = _added(self._indirect, simulation.file_indirect(found, self.labels, 1))
+            indirect = simulation.file_indirect(found, self.labels, 1)
+            self._indirect = indirect if self._indirect is None else self._indirect + indirect
 
     @property
-    def light(self) -> sparse.csr_array:
-        """(rows + 1, places) mean over the samples of direct and ambient light [W m^-2]."""
+    def light(self) -> Estimate:
+        """Mean over the samples."""
         assert self._light is not None
-        return self._light / self._direct
-
-    @property
-    def indirect(self) -> sparse.csr_array:
-        """(rows, places) mean over the samples of indirect light [W m^-2]."""
         assert self._indirect is not None
-        return self._indirect / self.done
+        light = self._light / self._direct
+        return Estimate(light.fine, light.coarse + self._indirect / self.done)
 
     @property
     def flux(self) -> FloatArray:
         """(n^2,) mean over the samples."""
         return self._flux / self._direct
-
-
-def _added(total: sparse.csr_array | None, light: sparse.csr_array) -> sparse.csr_array:
-    return light if total is None else total + light
-
-
-def _mean(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
-    return sum(groups[1:], groups[0]) / len(groups)
 
 
 def uniform_light(n: int) -> tuple[Labels, FloatArray]:
@@ -260,7 +250,7 @@ def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArra
     def seen(which: Bench) -> FloatArray:
         simulation = Simulation(which, settings, pixels=4 * bench.n)
         found = simulation.tracer.trace(integer(seed, "view"))
-        light = simulation.file(found, np.zeros(bench.n**2, dtype=np.int64), 1)[[0]].toarray()
+        light = simulation.file(found, np.zeros(bench.n**2, dtype=np.int64), 1).fine[[0]].toarray()
         return np.asarray(light).reshape(simulation.bundle.cells)
 
     scene, board = seen(bench), seen(bench.with_board(board_reflectance))

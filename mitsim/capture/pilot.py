@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.simulation import Simulation
+from mitsim.capture.simulation import Light, Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames
@@ -249,7 +249,7 @@ class _Anchors:
         )
         self.centre = tuple(self._light(1, half) for half in range(2))
         self.classes = tuple(
-            fine.simulation.file(one, fine.family.labels, _CELL_SAMPLES).tocoo() for one in fine.deposits
+            fine.simulation.file(one, fine.family.labels, _CELL_SAMPLES).fine.tocoo() for one in fine.deposits
         )
 
     def errors(self) -> dict[int, float]:
@@ -258,13 +258,13 @@ class _Anchors:
 
     def _light(self, anchors: int, half: int) -> FloatArray:
         """(anchors, rows, anchors, columns) light of all classes at the corners of coarse cells."""
-        settings = replace(self.fine.base, anchors=anchors, linear=True)
+        settings = replace(self.fine.base, anchors=anchors, coarse_cells=(1, True))
         simulation = Simulation(
             self.fine.bench, settings, common=True, pixels=max(self.fine.bench.n // _RATIO_PIXELS, 1)
         )
         found = simulation.tracer.trace(integer(self.fine.seed, "pilot", "anchors", half), 0, _RATIO_SAMPLES)
-        light = simulation.bundle.file(found, np.zeros(self.fine.bench.n**2, dtype=np.int64))[[0]].toarray()
-        rows, columns = simulation.bundle.cells
+        light = simulation.coarse.file(found, np.zeros(self.fine.bench.n**2, dtype=np.int64))[[0]].toarray()
+        rows, columns = simulation.coarse.cells
         return np.asarray(light).reshape(anchors, rows, anchors, columns)
 
     def _frames(self, anchors: int) -> Halves:
@@ -274,7 +274,7 @@ class _Anchors:
         return first, second
 
     def _half(self, simulation: Simulation, half: int) -> FloatArray:
-        anchors, bundle, found = simulation.settings.anchors, simulation.bundle, self.classes[half]
+        anchors, bundle, found = simulation.settings.anchors, simulation.coarse, self.classes[half]
         centre = np.broadcast_to(
             self.centre[half], (anchors, *self.centre[half].shape[1:2], anchors, self.centre[half].shape[3])
         )
@@ -291,7 +291,7 @@ class _Anchors:
         entries = np.concatenate(values), (np.concatenate(lines), np.concatenate(places))
         light = sparse.coo_array(entries, shape=(found.shape[0], bundle.size)).tocsr()
         rows = np.arange(self.fine.family.weights.shape[1])
-        frames = ExpectedFrames(simulation.optics, [light[: len(rows)]], rows, self.fine.family.weights, 0)
+        frames = ExpectedFrames(simulation.coarse_optics, [light[: len(rows)]], rows, self.fine.family.weights, 0)
         return np.stack([frame.irradiance for frame in frames])
 
 
@@ -318,9 +318,10 @@ def _form(simulation: Simulation, found: Deposits, samples: int, family: _Family
     """(captures, pixels, pixels) frames of some deposits."""
     light = simulation.file(found, family.labels, samples)
     indirect = simulation.file_indirect(found, family.labels, samples)
+    light = Light(light.fine, light.coarse + indirect)
     rows = np.arange(family.weights.shape[1])
     exact = simulation.mirrored(family.labels)
-    expected = simulation.expected([light], [indirect], rows, family.weights, 0, exact)
+    expected = simulation.expected([light], rows, family.weights, 0, exact)
     return np.stack([frame.irradiance for frame in expected])
 
 
@@ -329,7 +330,7 @@ def _pace(simulation: Simulation, found: Deposits, samples: int, family: _Family
     light = simulation.file(found, family.labels, samples)
     started = time.perf_counter()
     rows = np.arange(family.weights.shape[1])
-    list(ExpectedFrames(simulation.optics, [light[: len(rows)]] * GROUPS, rows, family.weights, 0))
+    list(ExpectedFrames(simulation.optics, [light.fine[: len(rows)]] * GROUPS, rows, family.weights, 0))
     return (time.perf_counter() - started) / len(family.weights)
 
 

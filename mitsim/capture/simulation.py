@@ -8,7 +8,7 @@ samples the choice that the plan made.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 from mitsim.optics.diffraction import Spectrum
-from mitsim.optics.frames import Ambient, ClassFrames, ExpectedFrames, FrameOptics, Indirect
+from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
 from mitsim.scene.plan import Settings
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.factored import Paths, Tracer
@@ -28,6 +28,24 @@ FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over this range, in so many bands."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
+
+    ``fine`` is what the sensor sees on average, in fine cells and layers. ``coarse`` is the rest: what each anchor sees
+    beyond that, and indirect light; it is small or smooth, so coarse cells hold it well.
+    """
+
+    fine: sparse.csr_array
+    coarse: sparse.csr_array
+
+    def __add__(self, other: Light) -> Light:
+        return Light(self.fine + other.fine, self.coarse + other.coarse)
+
+    def __truediv__(self, count: float) -> Light:
+        return Light(self.fine / count, self.coarse / count)
 
 
 class Simulation:
@@ -46,9 +64,10 @@ class Simulation:
         self.black = bench.projector.black_level if "black-level" in on else 0.0
         pixels = pixels or bench.n
         self.aim = self._grid(pixels, 1)
-        self.bundle = Bundle(
-            self._grid(pixels, settings.subdivision), settings.anchors, settings.depths, settings.linear
-        )
+        self.bundle = Bundle(self._grid(pixels, settings.subdivision), 1, settings.depths, settings.linear)
+        depths = settings.depths if settings.coarse_layers else (settings.depth,)
+        subdivision, linear = settings.coarse_cells
+        self.coarse = Bundle(self._grid(pixels, subdivision), settings.anchors, depths, linear)
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
         windows = self.bench.windows_at(self.settings.depth)
@@ -83,44 +102,48 @@ class Simulation:
 
     @cached_property
     def optics(self) -> FrameOptics:
-        """The mask's shadow in the projector's light."""
+        """The mask's shadow in the projector's light, for light filed finely."""
         return self._optics(self.bench.spectrum, self.bundle)
 
     @cached_property
-    def ambient_optics(self) -> FrameOptics:
-        """The mask's shadow in the light of other lamps."""
-        return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS), self.bundle)
+    def coarse_optics(self) -> FrameOptics:
+        """The same for light filed coarsely."""
+        return self._optics(self.bench.spectrum, self.coarse)
+
+    @cached_property
+    def ambient_optics(self) -> tuple[FrameOptics, FrameOptics]:
+        """The mask's shadow in the light of other lamps, fine and coarse."""
+        bands = _bands(*AMBIENT_NM, AMBIENT_BANDS)
+        return self._optics(bands, self.bundle), self._optics(bands, self.coarse)
 
     def _optics(self, spectrum: Spectrum, bundle: Bundle) -> FrameOptics:
         waves = spectrum if self.waves else None
         return FrameOptics(self.geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, waves)
 
-    def file(self, found: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        """(classes + 1, places) light of every class, indirect light apart, and ambient light [W m^-2]."""
-        return self.bundle.file(found.where(found.order != INDIRECT), labels, samples)
+    @cached_property
+    def mean_weights(self) -> FloatArray:
+        """(anchors,) weight of each anchor in the mean over the sensor."""
+        edges = self.geometry.pixel_edges
+        positions = anchor_positions(self.settings.anchors, self.geometry.half_width)
+        return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
+
+    def file(self, found: Deposits, labels: Labels, samples: int) -> Light:
+        """Light of the projector's direct and the lamps' light, per sample [W m^-2]."""
+        found = found.where(found.order != INDIRECT)
+        mean = found.averaged(self.mean_weights)
+        fine = self.bundle.file(mean, labels, samples)
+        if self.settings.anchors == 1:
+            return Light(fine, sparse.csr_array((fine.shape[0], self.coarse.size)))
+        single = replace(self.coarse, anchors=1).file(mean, labels, samples)
+        return Light(fine, self.coarse.file(found, labels, samples) - self.coarse.repeated(single))
 
     def file_indirect(self, found: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        """(classes, places) indirect light of every class [W m^-2]."""
-        return self.indirect.file(found.where(found.order == INDIRECT), labels, samples)[:-1]
-
-    @cached_property
-    def indirect(self) -> Bundle:
-        """How indirect light is filed: it is smooth, and a small part of the light can do with coarser cells."""
-        if not self.settings.coarse_indirect:
-            return self.bundle
-        return Bundle(self.aim, self.settings.anchors, (self.settings.depth,), False)
-
-    @cached_property
-    def indirect_optics(self) -> FrameOptics:
-        """The mask's shadow for indirect light."""
-        return self._optics(self.bench.spectrum, self.indirect) if self.settings.coarse_indirect else self.optics
+        """(classes + 1, places) indirect light of every class in coarse cells, per sample [W m^-2]."""
+        return self.coarse.file(found.where(found.order == INDIRECT), labels, samples)
 
     def flux(self, found: Deposits, samples: int) -> FloatArray:
         """(n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask."""
-        edges = self.geometry.pixel_edges
-        centres = (edges[:-1] + edges[1:]) / 2
-        positions = anchor_positions(self.settings.anchors, self.geometry.half_width)
-        mean = anchor_weights(positions, centres).mean(axis=0)
+        mean = self.mean_weights
         value = found.value * mean[found.anchor_row] * mean[found.anchor_column] * (found.order == DIRECT) / samples
         return np.asarray(np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
@@ -139,27 +162,22 @@ class Simulation:
         return "diffraction" in self.settings.effects
 
     def expected(
-        self,
-        groups: Sequence[sparse.csr_array],
-        indirect: Sequence[sparse.csr_array],
-        rows: Labels,
-        weights: FloatArray,
-        seed: int,
-        exact: ClassFrames | None = None,
+        self, groups: Sequence[Light], rows: Labels, weights: FloatArray, seed: int, exact: ClassFrames | None = None
     ) -> ExpectedFrames:
-        """Frames of the captures ``weights`` (captures, classes) from :meth:`file` and :meth:`file_indirect`.
-
-        ``rows`` maps the groups' rows to classes.
-        """
+        """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' rows to classes."""
         first = len(rows)
         emitted = self.black + (1 - self.black) * weights
-        ambient, more = None, None
+        fine, coarse = [group.fine for group in groups], [group.coarse for group in groups]
+        more, ambient = [], []
+        if any(light.nnz for light in coarse):
+            more = [Filed(self.coarse_optics, tuple(light[:first] for light in coarse))]
         if self.lit_by_lamps:
-            ambient = Ambient(self.ambient_optics, tuple(group[first:] for group in groups))
-        if any(group.nnz for group in indirect):
-            more = Indirect(self.indirect_optics, tuple(indirect))
-        direct = [group[:first] for group in groups]
-        return ExpectedFrames(self.optics, direct, rows, emitted, seed, ambient, exact, more)
+            ambient = [
+                Filed(optics, tuple(light[first:] for light in part))
+                for optics, part in zip(self.ambient_optics, (fine, coarse), strict=True)
+            ]
+        direct = [light[:first] for light in fine]
+        return ExpectedFrames(self.optics, direct, rows, emitted, seed, more, ambient, exact)
 
     @property
     def lit_by_lamps(self) -> bool:

@@ -28,7 +28,7 @@ _SAMPLING_MARGIN = 0.95
 _FLAGGED = 1.5
 """Every effect is held to the accuracy by itself; their sum is reported, and flagged above this much of it."""
 _FEWEST_SAMPLES, _FEWEST_DIRECT = 1.0, 4
-_COARSE = 0.3
+_COARSE = 0.4
 _PARTS = {1: (1.0,), 2: (0.4, 0.9)}
 """Parts of the sampling error that direct light and all other light may have."""
 GROUPS = 8
@@ -64,8 +64,9 @@ class Settings:
         those of :data:`PHYSICAL` that are simulated.
     direct_samples
         samples a cell and a group after which only indirect light is still collected; 0: no end.
-    coarse_indirect
-        whether indirect light is filed in one layer and one cell a projector pixel.
+    coarse_cells, coarse_layers
+        cells for what anchors see beyond their mean, and for indirect light: like ``subdivision`` and ``linear``, and
+        whether they have all layers or one.
     """
 
     depth: float
@@ -75,7 +76,8 @@ class Settings:
     linear: bool = False
     effects: frozenset[str] = frozenset()
     direct_samples: int = 0
-    coarse_indirect: bool = False
+    coarse_cells: tuple[int, bool] = (1, False)
+    coarse_layers: bool = False
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -134,7 +136,7 @@ class Evidence:
     seconds_per_path, seconds_per_bounced
         pace of the tracer, without and with interreflection.
     seconds_per_frame
-        of forming a frame with one anchor, one layer and a geometric shadow.
+        of forming a frame with one anchor, one layer, a geometric shadow and a cell a projector pixel.
     terms
         terms of the shadow, wave-optical over geometric.
     """
@@ -211,15 +213,14 @@ def decide(
         linear=cells[1],
         effects=on,
     )
-    share = evidence.effect_error.get("interreflection", 0.0) if "interreflection" in on else 0.0
-    coarse = share * math.hypot(evidence.layer_error[1], max(evidence.cell_error.values()))
-    settings = replace(settings, coarse_indirect=share > 0 and coarse <= _COARSE * accuracy)
+    coarse = _coarse(evidence, settings, accuracy)
+    settings = replace(settings, coarse_cells=coarse.cells, coarse_layers=coarse.layers)
     left_out = {name: error for name, error in evidence.effect_error.items() if name not in on}
     left = math.hypot(
         evidence.anchor_error[anchors],
         evidence.layer_error[layers],
         evidence.cell_error[cells],
-        coarse if settings.coarse_indirect else 0.0,
+        coarse.error,
         *left_out.values(),
     )
     target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - left**2, (_FLOOR * accuracy) ** 2))
@@ -240,6 +241,31 @@ def decide(
         sampling_target=target,
         systematic_error=left,
         warnings=facts.warnings + _warnings(accuracy, left, evidence, left_out, anchors, layers, cells),
+    )
+
+
+@dataclass(frozen=True)
+class _Coarse:
+    """Cells and layers of the light that is small or smooth, and the error that they leave."""
+
+    cells: tuple[int, bool]
+    layers: bool
+    error: float
+
+
+def _coarse(evidence: Evidence, settings: Settings, accuracy: float) -> _Coarse:
+    """The coarsest choice that fits: its error counts only for the part of the light that is filed in it."""
+    part = evidence.anchor_error[1] if settings.anchors > 1 else 0.0
+    if "interreflection" in settings.effects:
+        part = math.hypot(part, evidence.effect_error["interreflection"])
+    count = len(settings.depths)
+    choices = [
+        _Coarse(cells, layers, part * math.hypot(error, evidence.layer_error[count if layers else 1]))
+        for cells, error in evidence.cell_error.items()
+        for layers in ((False, True) if count > 1 else (False,))
+    ]
+    return next(
+        (one for one in choices if one.error <= _COARSE * accuracy), min(choices, key=lambda choice: choice.error)
     )
 
 
@@ -273,7 +299,10 @@ class _Cost:
 
     def forming(self, anchors: int, layers: int, waves: bool) -> float:
         terms = self.evidence.terms if waves else 1.0
-        return self.captures * anchors * layers * terms * self.evidence.seconds_per_frame
+        fine = layers * self.settings.subdivision**2
+        more = anchors > 1 or self.bounced
+        coarse = (layers if self.settings.coarse_layers else 1) * (anchors * self.settings.coarse_cells[0]) ** 2
+        return self.captures * terms * self.evidence.seconds_per_frame * (fine + (coarse if more else 0))
 
 
 def _count(errors: Mapping[int, float], accuracy: float, forced: bool | None) -> int:
