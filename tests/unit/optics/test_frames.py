@@ -13,11 +13,10 @@ from scipy import sparse
 
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 from mitsim.optics.frames import (
-    Ambient,
     ClassFrames,
     ExpectedFrames,
+    Filed,
     FrameOptics,
-    Indirect,
     _corrected,
     relative_error,
 )
@@ -363,7 +362,7 @@ def test_what_interpolation_leaves_below_zero_is_reported() -> None:
     assert not frame.irradiance.any() and frame.removed == 0.0
 
 
-# ---- ambient, indirect and exact light beside the groups'
+# ---- ambient light, light in other cells, and exact light beside the groups'
 
 
 SPLIT = np.arange(PIXELS) % 12
@@ -391,7 +390,7 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     weights[1] = 0
     optics, groups, lamps = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3)
     plain = list(ExpectedFrames(optics, groups, labels, weights, 5))
-    lit = ExpectedFrames(optics, groups, labels, weights, 5, Ambient(optics, lamps))
+    lit = ExpectedFrames(optics, groups, labels, weights, 5, ambient=[Filed(optics, lamps)])
     mean = np.asarray(sum(lamps[1:], lamps[0]).todense()).ravel() / 3
     expected = optics.frame(np.arange(CELLS**2), mean)
     for with_lamps, without in zip(lit, plain, strict=True):
@@ -403,12 +402,20 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     assert next(iter(lit)).variance > 0 and plain[1].variance == 0
 
 
+def test_ambient_light_of_two_kinds() -> None:
+    """Fine and coarse cells: their frames add, and so do the deviations of paired groups, before they are squared."""
+    optics, groups, lamps, others = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3), ambient_groups(3, 32)
+    apart = ExpectedFrames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, lamps), Filed(optics, others)])
+    summed = tuple(a + b for a, b in zip(lamps, others, strict=True))
+    alike(apart, ExpectedFrames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, summed)]))
+
+
 def test_ambient_light_has_a_shadow_of_its_own() -> None:
     optics, other, lamps = small_optics(), small_optics(), ambient_groups(2)
     edges = np.linspace(*WINDOW, CELLS + 1)
     other = cell_optics(CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15, "mask": "open"}), edges, edges)
     groups = random_groups(2, 7, 0.2)
-    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, Ambient(other, lamps))
+    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, ambient=[Filed(other, lamps)])
     plain = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0)
     mean = np.asarray((lamps[0] + lamps[1]).todense()).ravel() / 2
     expected = other.frame(np.arange(CELLS**2), mean)
@@ -416,21 +423,21 @@ def test_ambient_light_has_a_shadow_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("family", BESIDE)
-def test_indirect_light_adds_to_the_light_of_its_pixels(family: str) -> None:
+def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
     """Filed in the same cells it is as if it had been added; errors of one path go together, so they add first."""
     labels, weights = BESIDE[family]
     optics, groups, more = small_optics(), random_groups(3, 7, 0.2), random_groups(3, 8, 0.2)
-    apart = ExpectedFrames(optics, groups, labels, weights, 5, indirect=Indirect(optics, tuple(more)))
+    apart = ExpectedFrames(optics, groups, labels, weights, 5, more=[Filed(optics, tuple(more))])
     alike(apart, ExpectedFrames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
 
 
-def test_indirect_light_in_cells_of_its_own() -> None:
+def test_more_light_in_cells_of_its_own() -> None:
     edges = np.linspace(*WINDOW, 4)
     camera = CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15})
     coarse, optics = cell_optics(camera, edges, edges), small_optics()
     groups = random_groups(2, 7, 0.2)
     more = tuple(sparse.csr_array(np.random.default_rng(seed).random((PIXELS, 9))) for seed in (1, 2))
-    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, indirect=Indirect(coarse, more))
+    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, more=[Filed(coarse, more)])
     plain = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0)
     light = np.asarray((more[0] + more[1]).todense())[LABELS == 2].sum(axis=0) / 2
     difference = list(frames)[2].irradiance - list(plain)[2].irradiance

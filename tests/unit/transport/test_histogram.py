@@ -157,3 +157,20 @@ def test_directions_for_the_shadow() -> None:
     assert np.allclose(even.rows.centres, GRID.rows.edges[:-1] + 0.025) and even.rows.width == pytest.approx(0.05)
     assert np.allclose(split.columns.centres, GRID.columns.edges) and split.columns.width == 0
     assert isinstance(split.rows, Directions) and np.allclose(split.rows.centres, GRID.rows.edges)
+
+
+def test_light_averaged_over_the_anchors() -> None:
+    """The mean of bilinear weights: the light of each anchor times its row's and its column's weight."""
+    found, weights = deposits(), np.array([0.7, 0.3])
+    light = unpacked(bundle(), bundle().file(found, LABELS).toarray())
+    mean = unpacked(bundle(anchors=1), bundle(anchors=1).file(found.averaged(weights), LABELS).toarray())
+    assert np.allclose(mean[:, :, 0, :, 0], np.einsum("a,b,claybx->clyx", weights, weights, light), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("depths", "linear"), WAYS)
+def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...], linear: bool) -> None:
+    made, single = bundle(depths, linear), bundle(depths, linear, anchors=1)
+    light = single.file(deposits().averaged(np.array([0.5, 0.5])), LABELS)
+    shown, one = unpacked(made, made.repeated(light).toarray()), unpacked(single, light.toarray())
+    for a, b in np.ndindex(2, 2):
+        assert np.array_equal(shown[:, :, a, :, b], one[:, :, 0, :, 0])
