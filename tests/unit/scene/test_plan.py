@@ -29,9 +29,10 @@ EVIDENCE = Evidence(
     cell_error={(1, False): 6e-3, (2, False): 2e-3, (2, True): 1e-4, (3, True): 3e-5, (4, True): 1e-5},
     effect_error={"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4, "blur": 1e-3, "speckle": 8e-3},
     noise=(Noise(2e-3, 16, 0.8), Noise(1e-2, 2, 0.5)),
+    pixels=16_384,
     cells=20_000,
-    seconds_per_path=1e-7,
-    seconds_per_bounced=6e-7,
+    seconds_per_connection=1e-7,
+    seconds_per_path=6e-7,
     seconds_per_frame=2e-3,
     terms=3.0,
     seconds=1.5,
@@ -154,9 +155,9 @@ def test_a_flat_scene_has_one_layer_whatever_is_asked_for() -> None:
 def test_sampling_gets_what_is_left(accuracy: float) -> None:
     found = plan(accuracy)
     assert 0 < found.sampling_target < accuracy
-    if found.systematic_error <= 0.9 * accuracy:
+    if found.systematic_error <= 0.7 * accuracy:
         assert math.hypot(found.systematic_error, found.sampling_target) <= accuracy
-    assert found.sampling_target > 0.25 * accuracy, "sampling must keep its share"
+    assert found.sampling_target > 0.6 * accuracy, "sampling must keep its share"
 
 
 def test_the_systematic_error_is_all_that_was_left_out_or_made_coarse() -> None:
@@ -193,7 +194,7 @@ def test_warnings_of_the_devices_come_first() -> None:
 
 def test_settings_do_not_depend_on_the_machines_pace() -> None:
     """Bit-equal repetition and --resume need it: the same seed must mean the same settings."""
-    slow = replace(EVIDENCE, seconds_per_path=1e-5, seconds_per_bounced=1e-4, seconds_per_frame=1.0, seconds=60.0)
+    slow = replace(EVIDENCE, seconds_per_connection=1e-5, seconds_per_path=1e-4, seconds_per_frame=1.0, seconds=60.0)
     for accuracy in ACCURACIES:
         assert plan(accuracy).settings == plan(accuracy, slow).settings
         assert plan(accuracy).sampling_target == plan(accuracy, slow).sampling_target
@@ -257,7 +258,7 @@ def test_noise_says_how_many_samples_it_takes() -> None:
     noise = Noise(2e-3, 16, 0.8)
     assert noise.samples_for(2e-3) == pytest.approx(16)
     assert noise.samples_for(2e-4) == pytest.approx(16 * 10**1.25)
-    assert Noise(0.0, 16, 1.0).samples_for(1e-9) == 1
+    assert 0 < Noise(0.0, 16, 1.0).samples_for(1e-9) <= 1
 
 
 def test_a_keystone_is_told() -> None:
