@@ -70,9 +70,12 @@ class Simulation:
         self.coarse = Bundle(self._grid(pixels, subdivision), settings.anchors, depths, linear)
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
-        windows = self.bench.windows_at(self.settings.depth)
-        stop = self.geometry.tan_half_fov
-        return aligned_grid(*windows, pixels, subdivision, stop, multiple=subdivision)
+        """Cells as far as the outermost anchors see: directions are those seen from the sensor's centre."""
+        settings, geometry = self.settings, self.geometry
+        windows = self.bench.windows_at(settings.depth)
+        outermost = float(anchor_positions(settings.anchors, geometry.half_width)[-1])
+        reach = geometry.tan_half_fov + outermost / min(settings.depths)
+        return aligned_grid(*windows, pixels, subdivision, reach, multiple=subdivision)
 
     @cached_property
     def tracer(self) -> Tracer:

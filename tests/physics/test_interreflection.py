@@ -87,8 +87,10 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     bench = open_bench(scene, check_camera=False)
     family = bench.family(f"dots:{K}", 0)
     labels, weights = family.classes()
-    simulation = Simulation(bench, Settings(depth=400.0, anchors=3, effects=frozenset({"interreflection"})))
-    samples = max(1, spp // 16)
+    settings = Settings(depth=400.0, anchors=3, effects=frozenset({"interreflection"}))
+    # Cells as narrow as a real projector's: the wide ones of 15 pixels would hide light lost at the field stop's rim.
+    simulation = Simulation(bench, settings, pixels=8 * N)
+    samples = max(1, spp // 256)
     quadrants = []
     for group in range(GROUPS):
         found = simulation.tracer.trace(1000 * seed + group, 0, samples)
@@ -191,7 +193,7 @@ def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "rho"), [("path", 0.5), ("path", 0.9), *(("factored", rho) for rho in (0.3, 0.5, 0.7, 0.9))]
+    ("name", "rho"), [("path", 0.5), ("path", 0.9), *(("factored", rho) for rho in (0.3, 0.6, 0.9))]
 )
 def test_furnace(small_scene: Callable[..., Path], name: str, rho: float) -> None:
     scene = write_scene(small_scene, "furnace", SPHERE.format(rho=rho))
