@@ -70,11 +70,12 @@ class Simulation:
         self.coarse = Bundle(self._grid(pixels, subdivision), settings.anchors, depths, linear)
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
-        """Cells as far as the outermost anchors see: directions are those seen from the sensor's centre."""
-        settings, geometry = self.settings, self.geometry
-        windows = self.bench.windows_at(settings.depth)
-        outermost = float(anchor_positions(settings.anchors, geometry.half_width)[-1])
-        reach = geometry.tan_half_fov + outermost / min(settings.depths)
+        """Cells as far as the sensor's edge sees through the field stop: directions are those from its centre.
+
+        The same for any number of anchors and layers, so that their light can be compared.
+        """
+        windows = self.bench.windows_at(self.settings.depth)
+        reach = self.geometry.tan_half_fov + self.geometry.half_width / self.settings.depth
         return aligned_grid(*windows, pixels, subdivision, reach, multiple=subdivision)
 
     @cached_property

@@ -173,8 +173,9 @@ def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.n
     """Mean and its variance by the reference, the projector's lens a disk that shines."""
     import mitsuba as mi
 
-    from mitsim.transport.aperture import aperture_scene_parts
+    from mitsim.transport.aperture import aperture_scene_parts, register
 
+    register()
     with projected(bench, shown):
         parts = aperture_scene_parts(bench.loaded.projector, bench.source.aperture, bench.source.focus)
     shapes = {f"shape{i}": shape for i, shape in enumerate(bench.loaded.scene.shapes())}

@@ -12,8 +12,8 @@ weighted sums over all pixels, in each of which one kind of mistake shows:
 
 The reference follows light along rays and knows all bounces and lamps. So diffraction and the projector's black level
 are forced off in the factored run, and interreflection and ambient light forced on where the scene is there for them;
-elsewhere the plan decides, and with the mark `slow` every bounce is followed everywhere. Each case records its largest z
-(`--junitxml` shows it).
+elsewhere the plan decides, and with the mark `slow` every bounce is followed everywhere. Each case records its largest
+z (`--junitxml` shows it).
 
 Significance. A sum's variance comes from the spread between independent passes, pixel by pixel, and adds up over
 pixels, which a box filter keeps independent; 262 144 pixels times 7 degrees of freedom make it exact to a fraction of a

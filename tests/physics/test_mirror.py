@@ -16,7 +16,7 @@ from scipy.signal import max_len_seq
 from mitsim.capture.light import collect, make_plan
 from mitsim.optics.beams import SpecularFrames, beam_frames, geometric_terms
 from mitsim.scene.patterns import parse_patterns
-from mitsim.transport.aperture import aperture_scene_parts
+from mitsim.transport.aperture import aperture_scene_parts, register
 from mitsim.transport.beams import trace_beams
 from mitsim.transport.mirrors import MirrorTracer
 from mitsim.transport.source import Projector
@@ -403,6 +403,7 @@ def test_a_perfect_mirror_with_an_aperture_in_the_reference(variant: str) -> Non
 
     Paths that hit the lens: 4e6 x 1.6e-2, so the mean is good to half a percent.
     """
+    register()
     place, radius = (30.0, 0.0, 400.0), 20.0
     rig = Rig((60, 0, 0))
     pinhole = rig.scene(mask="open", pixels=64, pitch=0.09375, mirror=mirror(place, BACK))
