@@ -10,7 +10,6 @@ from operator import add
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
@@ -29,6 +28,7 @@ __all__ = [
     "make_plan",
     "pinhole_view",
     "silent",
+    "speckle_of",
     "uniform_light",
 ]
 
@@ -39,6 +39,8 @@ Target = Callable[[ExpectedFrames], float]
 _CHECKED_CAPTURES = 8
 _MOST_PATHS = 2**32
 _LARGEST_GROWTH = 8.0
+_FIRST_ROUND = 0.5
+_VIEW_SAMPLES = 64
 _LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 
@@ -62,7 +64,7 @@ class Light:
     flux
         (n^2,) irradiance that each pixel's direct light casts on the sensor without the mask, mean over the sensor.
     paths
-        rays traced from the camera.
+        connections and paths traced.
     sampling_error
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     """
@@ -164,17 +166,16 @@ def collect(
     kept = np.arange(bench.n**2) if by_pixel else labels
     chosen = np.unique(np.linspace(0, len(weights) - 1, min(len(weights), _CHECKED_CAPTURES)).astype(int))
     groups = [_Group(simulation, kept, integer(seed, "transport", purpose, group)) for group in range(GROUPS)]
-    wanted = 1
-    lanes = simulation.tracer.lanes
+    rounds = _FIRST_ROUND
     while True:
         for group in groups:
-            group.sample(wanted)
+            group.sample(rounds)
         light = Light(
             groups=tuple(group.light for group in groups),
             simulation=simulation,
             labels=kept,
             flux=np.asarray(sum(group.flux for group in groups) / GROUPS),
-            paths=wanted * GROUPS * lanes,
+            paths=sum(group.paths for group in groups),
             sampling_error=math.inf,
             reached=False,
         )
@@ -184,54 +185,50 @@ def collect(
         progress("transport", min(1.0, (goal / error) ** 2) if error > 0 else 1.0)
         if error <= goal or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=error <= goal)
-        # The error falls at least with the square root of the samples; where it falls faster, less is needed.
-        growth = min(
-            1.1 * (error / goal) ** (2 if "interreflection" in plan.settings.effects else 1.2), _LARGEST_GROWTH
-        )
-        wanted = min(max(wanted + 1, math.ceil(wanted * growth)), max(wanted + 1, _MOST_PATHS // (GROUPS * lanes)))
+        # Indirect light's error falls with the square root of the samples; direct light's falls faster.
+        growth = min(1.1 * (error / goal) ** (2 if simulation.other else 1.2), _LARGEST_GROWTH)
+        rounds *= max(growth, 1.2)
 
 
 class _Group:
     """One independent estimate of the light: the sum over its samples so far."""
 
     def __init__(self, simulation: Simulation, labels: Labels, seed: int) -> None:
-        self.simulation, self.labels, self.seed = simulation, labels, seed
-        self.done = self._direct = 0
-        self._most_direct = simulation.settings.direct_samples
-        self._light: Estimate | None = None
-        self._indirect: sparse.csr_array | None = None
+        self.simulation, self.labels = simulation, labels
+        self.seed = seed
+        self.done: dict[str, int] = {}
+        self.paths = 0
+        self._sums: dict[str, Estimate] = {}
         self._flux = np.zeros(simulation.bench.n**2)
 
-    def sample(self, wanted: int) -> None:
-        """Trace up to the sample number ``wanted`` of the sequence."""
-        simulation = self.simulation
-        at_once = max(1, _LANES_AT_ONCE // simulation.tracer.lanes)
-        while self.done < wanted:
-            count = min(at_once, wanted - self.done)
-            if self._most_direct > self.done:
-                count = min(count, self._most_direct - self.done)
-            found = simulation.tracer.trace(self.seed, self.done, count)
-            self.done += count
-            if not self._most_direct or self.done <= self._most_direct:
-                light = simulation.file(found, self.labels, 1)
-                self._light = light if self._light is None else self._light + light
-                self._flux += simulation.flux(found, 1)
-                self._direct = self.done
-            indirect = simulation.file_indirect(found, self.labels, 1)
-            self._indirect = indirect if self._indirect is None else self._indirect + indirect
+    def sample(self, rounds: float) -> None:
+        """Trace until this many times the samples that the plan predicted are done."""
+        for name, stage in self.simulation.tracers().items():
+            wanted, seed = max(math.ceil(rounds * stage.predicted), 1), integer(self.seed, name)
+            while (done := self.done.get(name, 0)) < wanted:
+                count = min(max(1, _LANES_AT_ONCE // stage.tracer.lanes), wanted - done)
+                found = stage.tracer.trace(seed, done, count)
+                light = stage.file(found, self.labels, 1)
+                self._sums[name] = self._sums[name] + light if name in self._sums else light
+                if name == "direct":
+                    self._flux += self.simulation.flux(found, 1)
+                self.done[name] = done + count
+                self.paths += count * stage.tracer.lanes
 
     @property
     def light(self) -> Estimate:
         """Mean over the samples."""
-        assert self._light is not None
-        assert self._indirect is not None
-        light = self._light / self._direct
-        return Estimate(light.fine, light.coarse + self._indirect / self.done)
+        return reduce(add, (light / self.done[name] for name, light in self._sums.items()))
 
     @property
     def flux(self) -> FloatArray:
         """(n^2,) mean over the samples."""
-        return self._flux / self._direct
+        return self._flux / self.done["direct"]
+
+
+def speckle_of(bench: Bench, plan: Plan) -> float:
+    """Speckle contrast of frames under a plan; 0 where the effect is off."""
+    return bench.projector.speckle_contrast if "speckle" in plan.settings.effects else 0.0
 
 
 def uniform_light(n: int) -> tuple[Labels, FloatArray]:
@@ -242,14 +239,13 @@ def uniform_light(n: int) -> tuple[Labels, FloatArray]:
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:
     """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
 
-    Direct light, one path a cell, four cells a side of a projector pixel; 0 where the projector does not light the
-    board.
+    Direct light, two cells a side of a projector pixel; 0 where the projector does not light the board.
     """
     settings = Settings(depth=bench.geometry.scene_distance)
 
     def seen(which: Bench) -> FloatArray:
-        simulation = Simulation(which, settings, pixels=4 * bench.n)
-        found = simulation.tracer.trace(integer(seed, "view"))
+        simulation = Simulation(which, settings, pixels=2 * bench.n)
+        found = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
         light = simulation.file(found, np.zeros(bench.n**2, dtype=np.int64), 1).fine[[0]].toarray()
         return np.asarray(light).reshape(simulation.bundle.cells)
 

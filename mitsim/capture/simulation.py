@@ -7,7 +7,7 @@ samples the choice that the plan made.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,11 +21,15 @@ from mitsim.optics.diffraction import Spectrum
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
 from mitsim.scene.plan import Settings
 from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.transport.direct import DirectTracer
 from mitsim.transport.factored import Paths, Tracer
 from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
+from mitsim.transport.source import Projector
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
+_ANCHORED = 8
+"""Samples to all of the sensor for each one to every anchor: differences between anchors are small."""
 AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over this range, in so many bands."""
 
@@ -34,26 +38,36 @@ AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 class Light:
     """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
 
-    ``fine`` is what the sensor sees on average, in fine cells and layers. ``coarse`` is the rest: what each anchor sees
-    beyond that, and indirect light; it is small or smooth, so coarse cells hold it well.
+    ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees beyond
+    that, and ``smooth`` is indirect light: small or smooth, so coarse cells hold them well.
     """
 
     fine: sparse.csr_array
     coarse: sparse.csr_array
+    smooth: sparse.csr_array
 
     def __add__(self, other: Light) -> Light:
-        return Light(self.fine + other.fine, self.coarse + other.coarse)
+        return Light(self.fine + other.fine, self.coarse + other.coarse, self.smooth + other.smooth)
 
     def __truediv__(self, count: float) -> Light:
-        return Light(self.fine / count, self.coarse / count)
+        return Light(self.fine / count, self.coarse / count, self.smooth / count)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A tracer, the samples of it that the plan predicted, and how its light is filed (deposits, labels, samples)."""
+
+    tracer: DirectTracer | Tracer
+    predicted: float
+    file: Callable[[Deposits, Labels, int], Light]
 
 
 class Simulation:
     """A bench with settings; its parts are prepared when they are first asked for."""
 
-    def __init__(self, bench: Bench, settings: Settings, common: bool = False, pixels: int | None = None) -> None:
-        """``common``: anchors share random numbers; ``pixels``: cells a side of the window, instead of its own."""
-        self.bench, self.settings, self.common = bench, settings, common
+    def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None) -> None:
+        """``pixels``: cells a side of the projector's window, instead of one a pixel."""
+        self.bench, self.settings = bench, settings
         on = settings.effects
         neutral: dict[str, float] = {}
         if "mask-thickness" not in on:
@@ -68,6 +82,7 @@ class Simulation:
         depths = settings.depths if settings.coarse_layers else (settings.depth,)
         subdivision, linear = settings.coarse_cells
         self.coarse = Bundle(self._grid(pixels, subdivision), settings.anchors, depths, linear)
+        self.smooth = replace(self.coarse, anchors=1)
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
         """Cells as far as the sensor's edge sees through the field stop: directions are those from its centre.
@@ -79,30 +94,37 @@ class Simulation:
         return aligned_grid(*windows, pixels, subdivision, reach, multiple=subdivision)
 
     @cached_property
-    def tracer(self) -> Tracer:
-        """Follows the paths that the settings ask for."""
-        on, bench = self.settings.effects, self.bench
-        source = bench.source
-        if "aperture" not in on:
-            source = replace(source, aperture=0.0)
-        if "blur" not in on:
-            source = replace(source, blur=0.0)
+    def source(self) -> Projector:
+        """The projector, ideal but for the effects that are on."""
+        on, source = self.settings.effects, self.bench.source
+        source = source if "aperture" in on else replace(source, aperture=0.0)
+        return source if "blur" in on else replace(source, blur=0.0)
+
+    @cached_property
+    def direct(self) -> DirectTracer:
+        """Follows direct light from the projector to the sensor's centre, or to all of it where anchors are used."""
+        loaded, spread = self.bench.loaded, self.settings.anchors > 1
+        return DirectTracer(loaded.scene, loaded.camera, self.source, 1, self.geometry, spread)
+
+    @cached_property
+    def anchored(self) -> DirectTracer | None:
+        """The same to every anchor."""
+        loaded, anchors = self.bench.loaded, self.settings.anchors
+        return DirectTracer(loaded.scene, loaded.camera, self.source, anchors, self.geometry) if anchors > 1 else None
+
+    @cached_property
+    def other(self) -> Tracer | None:
+        """Follows all other light from the sensor's centre; none where there is none."""
+        on, loaded = self.settings.effects, self.bench.loaded
         paths = Paths(
-            mirrors="mirrors" in on,
+            mirrors="mirrors" in on and loaded.mirrors,
             interreflection="interreflection" in on,
-            emitters=bench.loaded.lamps if self.lit_by_lamps else (),
+            emitters=loaded.lamps if self.lit_by_lamps else (),
         )
-        return Tracer(
-            bench.loaded.scene,
-            bench.loaded.camera,
-            source,
-            self.aim,
-            self.settings.anchors,
-            self.settings.depth,
-            paths,
-            self.common,
-            self.geometry,
-        )
+        if paths == Paths():
+            return None
+        depth = self.settings.depth
+        return Tracer(loaded.scene, loaded.camera, self.source, self.aim, 1, depth, paths, geometry=self.geometry)
 
     @cached_property
     def optics(self) -> FrameOptics:
@@ -115,10 +137,14 @@ class Simulation:
         return self._optics(self.bench.spectrum, self.coarse)
 
     @cached_property
-    def ambient_optics(self) -> tuple[FrameOptics, FrameOptics]:
-        """The mask's shadow in the light of other lamps, fine and coarse."""
-        bands = _bands(*AMBIENT_NM, AMBIENT_BANDS)
-        return self._optics(bands, self.bundle), self._optics(bands, self.coarse)
+    def smooth_optics(self) -> FrameOptics:
+        """The same for indirect light."""
+        return self._optics(self.bench.spectrum, self.smooth)
+
+    @cached_property
+    def ambient_optics(self) -> FrameOptics:
+        """The mask's shadow in the light of other lamps."""
+        return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS), self.bundle)
 
     def _optics(self, spectrum: Spectrum, bundle: Bundle) -> FrameOptics:
         waves = spectrum if self.waves else None
@@ -132,23 +158,38 @@ class Simulation:
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
 
     def file(self, found: Deposits, labels: Labels, samples: int) -> Light:
-        """Light of the projector's direct and the lamps' light, per sample [W m^-2]."""
-        found = found.where(found.order != INDIRECT)
-        mean = found.averaged(self.mean_weights)
-        fine = self.bundle.file(mean, labels, samples)
-        if self.settings.anchors == 1:
-            return Light(fine, sparse.csr_array((fine.shape[0], self.coarse.size)))
-        single = replace(self.coarse, anchors=1).file(mean, labels, samples)
-        return Light(fine, self.coarse.file(found, labels, samples) - self.coarse.repeated(single))
+        """Light of :attr:`direct`, per sample."""
+        return self._light(fine=self.bundle.file(found, labels, samples))
 
-    def file_indirect(self, found: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        """(classes + 1, places) indirect light of every class in coarse cells, per sample [W m^-2]."""
-        return self.coarse.file(found.where(found.order == INDIRECT), labels, samples)
+    def file_anchored(self, found: Deposits, labels: Labels, samples: int) -> Light:
+        """Light of :attr:`anchored` beyond its mean over the sensor, per sample."""
+        mean = self.smooth.file(found.averaged(self.mean_weights), labels, samples)
+        return self._light(coarse=self.coarse.file(found, labels, samples) - self.coarse.repeated(mean))
+
+    def file_other(self, found: Deposits, labels: Labels, samples: int) -> Light:
+        """Light of :attr:`other`, per sample."""
+        indirect = found.order == INDIRECT
+        fine = self.bundle.file(found.where(~indirect), labels, samples)
+        return self._light(fine=fine, smooth=self.smooth.file(found.where(indirect), labels, samples))
+
+    def _light(self, **parts: sparse.csr_array) -> Light:
+        rows = next(iter(parts.values())).shape[0]
+        sizes = {"fine": self.bundle.size, "coarse": self.coarse.size, "smooth": self.smooth.size}
+        return Light(**{name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()})
+
+    def tracers(self) -> dict[str, Stage]:
+        """What is traced: samples a group is predicted to need, and how the light is filed, by name."""
+        settings = self.settings
+        stages = {"direct": Stage(self.direct, settings.direct_samples, self.file)}
+        if self.anchored is not None:
+            stages["anchored"] = Stage(self.anchored, settings.direct_samples / _ANCHORED, self.file_anchored)
+        if self.other is not None:
+            stages["other"] = Stage(self.other, settings.other_samples, self.file_other)
+        return stages
 
     def flux(self, found: Deposits, samples: int) -> FloatArray:
         """(n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask."""
-        mean = self.mean_weights
-        value = found.value * mean[found.anchor_row] * mean[found.anchor_column] * (found.order == DIRECT) / samples
+        value = found.value * (found.order == DIRECT) / samples
         return np.asarray(np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
     def mirrored(self, labels: Labels) -> ClassFrames | None:
@@ -171,16 +212,14 @@ class Simulation:
         """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' rows to classes."""
         first = len(rows)
         emitted = self.black + (1 - self.black) * weights
-        fine, coarse = [group.fine for group in groups], [group.coarse for group in groups]
         more, ambient = [], []
-        if any(light.nnz for light in coarse):
-            more = [Filed(self.coarse_optics, tuple(light[:first] for light in coarse))]
+        if self.settings.anchors > 1:
+            more.append(Filed(self.coarse_optics, tuple(group.coarse[:first] for group in groups)))
+        if "interreflection" in self.settings.effects:
+            more.append(Filed(self.smooth_optics, tuple(group.smooth[:first] for group in groups)))
         if self.lit_by_lamps:
-            ambient = [
-                Filed(optics, tuple(light[first:] for light in part))
-                for optics, part in zip(self.ambient_optics, (fine, coarse), strict=True)
-            ]
-        direct = [light[:first] for light in fine]
+            ambient.append(Filed(self.ambient_optics, tuple(group.fine[first:] for group in groups)))
+        direct = [group.fine[:first] for group in groups]
         return ExpectedFrames(self.optics, direct, rows, emitted, seed, more, ambient, exact)
 
     @property

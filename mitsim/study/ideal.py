@@ -34,8 +34,12 @@ def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Lig
     places = (row + first[0]) * grid.columns.count + column + first[1]
     flux = reflectance.ravel() * board_flux
     light = sparse.csr_array((flux, (pixels, places)), shape=(bench.n**2 + 1, simulation.bundle.size))
-    none = sparse.csr_array((bench.n**2 + 1, simulation.coarse.size))
-    return Light((Estimate(light, none),), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True)
+    coarse, smooth = (
+        sparse.csr_array((bench.n**2 + 1, which.size)) for which in (simulation.coarse, simulation.smooth)
+    )
+    return Light(
+        (Estimate(light, coarse, smooth),), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True
+    )
 
 
 def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -> tuple[FloatArray, FloatArray]:

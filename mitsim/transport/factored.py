@@ -31,7 +31,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.camera import CameraGeometry, anchor_positions
 from mitsim.transport.cells import CellGrid
 from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
-from mitsim.transport.sampling import generator, stratified
+from mitsim.transport.sampling import generator, panchromatic, stratified
 from mitsim.transport.source import Projector, Source
 
 LANES_PER_LAUNCH = 2**22
@@ -215,14 +215,17 @@ class _Walk:
             self._emitter_hit(si)
         self.active &= si.is_valid()
         bsdf = si.bsdf()
-        self._connect(si, bsdf)
+        if not first or self.paths.mirrors:
+            self._connect(si, bsdf, first)
         for emitter in self.paths.emitters:
             self._light(si, bsdf, emitter)
         if self.paths.mirrors or self.paths.interreflection:
             self._leave(si, bsdf, first)
 
-    def _connect(self, si: Any, bsdf: Any) -> None:
-        """Light of the projector that this vertex sends on along its path."""
+    def _connect(self, si: Any, bsdf: Any, first: bool) -> None:
+        """Light of the projector that this vertex sends on along its path; what the first one sends is direct light."""
+        if first:
+            return
         found = self.source.connect(si, self.rng, self.active)
         active = found.valid & ~self.scene.ray_test(si.spawn_ray_to(found.target), found.valid)
         toward = si.to_local(found.direction)
@@ -363,16 +366,6 @@ class _Walk:
     def _load(self, values: tuple[Any, ...]) -> None:
         for name, value in zip(self._STATE, values, strict=True):
             setattr(self, name, value)
-
-
-def panchromatic(radiance: Any) -> Any:
-    """One number for a spectrum, by a flat response: the mean over channels, or over wavelength 360-830 nm.
-
-    In spectral variants the radiance has been divided by the density of its sampled wavelengths, so the mean over
-    samples is an integral; dividing by the range makes a flat spectrum of 1 count as 1, as in the other variants.
-    """
-    mean = dr.mean(radiance)
-    return mean / (mi.MI_CIE_MAX - mi.MI_CIE_MIN) if mi.is_spectral else mean
 
 
 def _edge(axis: Any, index: Any, jitter: Any) -> Any:
