@@ -55,7 +55,7 @@ def ambient_frame(bench: Bench, samples: int = 8, anchors: int = 3, interreflect
     settings = Settings(depth=400.0, anchors=anchors, effects=frozenset(on))
     simulation = Simulation(bench, settings)
     labels, weights = uniform_light(bench.n)
-    light = simulation.file(simulation.tracer.trace(5, 0, samples), labels, samples)
+    light = simulation.file_other(simulation.other.trace(5, 0, samples), labels, samples)
     return next(iter(simulation.expected([light], np.zeros(1, np.int64), 0 * weights, 0))).irradiance
 
 

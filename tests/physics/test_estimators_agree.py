@@ -64,9 +64,14 @@ class Pair:
     def of_changed_light(self, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """The factored frame after ``change`` of the light (layers, anchor rows, rows, anchor columns, columns)."""
         simulation = self.light.simulation
-        fine, coarse = zip(*((group.fine, group.coarse) for group in self.light.groups), strict=True)
+        groups = self.light.groups
+        kinds = (
+            (simulation.optics, [group.fine for group in groups]),
+            (simulation.coarse_optics, [group.coarse for group in groups]),
+            (simulation.smooth_optics, [group.smooth for group in groups]),
+        )
         total = np.zeros_like(self.factored)
-        for optics, parts in ((simulation.optics, fine), (simulation.coarse_optics, coarse)):
+        for optics, parts in kinds:
             lit = sum(parts[1:], parts[0])[[int(self.shown.min() == 0)]].toarray() / len(parts)
             anchors, (rows, columns) = optics.anchors, optics.cells
             changed = change(lit.reshape(-1, anchors, rows, anchors, columns))
@@ -307,7 +312,7 @@ def one_layer_shifted(pair: Pair) -> np.ndarray:
 
 
 class NothingInTheWay:
-    """A scene in which nothing stands between a surface and the projector."""
+    """A scene in which nothing hides a lit surface from the camera."""
 
     def __init__(self, scene: object) -> None:
         self.scene = scene
@@ -321,8 +326,8 @@ class NothingInTheWay:
         return mi.Bool(False)
 
 
-def without_shadows(pair: Pair) -> np.ndarray:
-    """Light as if the near card cast no shadow."""
+def without_occlusion(pair: Pair) -> np.ndarray:
+    """Light as if the camera saw the far card through the near one."""
     loaded = replace(pair.bench.loaded, scene=NothingInTheWay(pair.bench.loaded.scene))
     return frame_of(replace(pair.bench, loaded=loaded), pair.plan, pair.shown)[0]
 
@@ -352,9 +357,9 @@ def test_two_percent_are_seen(compare: Compare, case: Case, factor: float) -> No
     assert abs(z) > LIMIT
 
 
-def test_a_missing_shadow_is_seen(compare: Compare) -> None:
+def test_missing_occlusion_is_seen(compare: Compare) -> None:
     pair = compare(CARDS)
-    _, z = worst(z_scores(pair, without_shadows(pair)))
+    _, z = worst(z_scores(pair, without_occlusion(pair)))
     assert abs(z) > LIMIT
 
 

@@ -78,10 +78,10 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
 def factored(scene: Path, spp: int, seed: int) -> Measured:
     """The factored estimator: light filed and made into frames as a capture does, in GROUPS independent parts.
 
-    Light of one reflection and of more is told apart by the deposits' own order.
+    Light of one reflection is traced apart from light of more.
     """
     from mitsim.capture.bench import open_bench
-    from mitsim.capture.simulation import Light, Simulation
+    from mitsim.capture.simulation import Simulation
     from mitsim.scene.plan import Settings
 
     bench = open_bench(scene, check_camera=False)
@@ -93,12 +93,16 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     samples = max(1, spp // 256)
     quadrants = []
     for group in range(GROUPS):
-        found = simulation.tracer.trace(1000 * seed + group, 0, samples)
-        direct, indirect = (
-            simulation.file(found, labels, samples),
-            simulation.file_indirect(found, labels, samples),
+        own = 1000 * seed + group
+        one, more = (
+            [
+                stage.file(stage.tracer.trace(own, 0, samples), labels, samples)
+                for name, stage in simulation.tracers().items()
+                if (name == "other") == indirect
+            ]
+            for indirect in (False, True)
         )
-        for light in (direct, Light(direct.fine * 0, indirect)):
+        for light in (sum(one[1:], one[0]), more[0]):
             frames = [frame.irradiance for frame in simulation.expected([light], np.arange(K**2), weights, 0)]
             quadrants.append(np.reshape(frames, (K**2, 2, PIXELS // 2, 2, PIXELS // 2)).mean(axis=(2, 4)))
     values = np.reshape(quadrants, (GROUPS, 2, K**2, 2, 2))
