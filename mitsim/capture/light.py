@@ -28,6 +28,7 @@ __all__ = [
     "make_plan",
     "pinhole_view",
     "silent",
+    "speckle_of",
     "uniform_light",
 ]
 
@@ -223,6 +224,11 @@ class _Group:
     def flux(self) -> FloatArray:
         """(n^2,) mean over the samples."""
         return self._flux / self.done["direct"]
+
+
+def speckle_of(bench: Bench, plan: Plan) -> float:
+    """Speckle contrast of frames under a plan; 0 where the effect is off."""
+    return bench.projector.speckle_contrast if "speckle" in plan.settings.effects else 0.0
 
 
 def uniform_light(n: int) -> tuple[Labels, FloatArray]:
