@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -87,18 +89,7 @@ class Comparison:
     def _recovery(
         self, family: PatternFamily, expected: ExpectedFrames, model: Prepared, exposure_s: float, seed: int
     ) -> Recovery:
-        frames = model.accumulator()
-        with single_threaded_blas():
-            for measurement, row, column in Exposer(self.bench, exposure_s, seed).measurements(family, expected):
-                frames.add(measurement, row, column)
-        solution = model.solve(frames, "auto")
-        return Recovery(
-            solution.image,
-            psnr(solution.image, self.truth),
-            ssim(solution.image, self.truth),
-            solution.lam,
-            solution.status,
-        )
+        return recover(Exposer(self.bench, exposure_s, seed), family, expected, [model], self.truth)[0]
 
     def _model(self, family: PatternFamily, factors: tuple[FloatArray, FloatArray]) -> Prepared:
         return prepare(*factors, family.left, family.right, centre=self.bench.geometry.mask == "flatcam")
@@ -107,4 +98,29 @@ class Comparison:
         return light.merged().frames(*family.classes(), self.seed)
 
     def _peak_time(self, expected: ExpectedFrames) -> float:
-        return Exposure().choose(self.bench, max(float(frame.irradiance.max()) for frame in expected))
+        return peak_time(self.bench, expected)
+
+
+def peak_time(bench: Bench, expected: ExpectedFrames) -> float:
+    """Exposure time [s] of a family at equal peak: its brightest pixel fills the default part of the full well."""
+    return Exposure().choose(bench, max(float(frame.irradiance.max()) for frame in expected))
+
+
+def recover(
+    exposer: Exposer,
+    family: PatternFamily,
+    expected: ExpectedFrames,
+    models: Sequence[Prepared],
+    truth: FloatArray,
+) -> list[Recovery]:
+    """Images from one noisy exposure of a family's frames, one for each model, judged against the truth (n, n)."""
+    sums = [model.accumulator() for model in models]
+    with single_threaded_blas():
+        for measurement, row, column in exposer.measurements(family, expected):
+            for frames in sums:
+                frames.add(measurement, row, column)
+    solutions = [model.solve(frames, "auto") for model, frames in zip(models, sums, strict=True)]
+    return [
+        Recovery(found.image, psnr(found.image, truth), ssim(found.image, truth), found.lam, found.status)
+        for found in solutions
+    ]

@@ -11,11 +11,10 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.light import Light
+from mitsim.capture.light import Light, Settings
 from mitsim.capture.simulation import Light as Estimate
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.shadow import Directions
-from mitsim.scene.plan import Settings
 
 FloatArray = npt.NDArray[np.float64]
 
