@@ -1,0 +1,343 @@
+"""`mitsim study diffraction`: what the mask's diffraction does to separability, and to a model that leaves it out.
+
+Three questions, for both masks and for light of one line, the projector's lines and a broad band:
+
+* How far is the wave-optical shadow from the geometric one?
+* How far is it from one separable term, all that a calibration can find and a separable solver can use?
+* What does an image lose whose solver assumes the geometric mask, and what one with factors of the true shadow?
+
+The last is asked of idealised frames (an evenly lit plane without falloff, as in :mod:`mitsim.study.ideal`), so that
+only diffraction differs from the model, and once of rendered ones: the scene's own mask, the projector's lines, a
+rendered calibration session. Every family is exposed at equal peak, with the camera's noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.calibrate.hadamard import estimate_factors
+from mitsim.capture.bench import Bench, PatternFamily, load_recipe
+from mitsim.capture.clock import Clock
+from mitsim.capture.exposer import Exposer
+from mitsim.capture.light import Light, Plan, Progress, collect, make_plan, speckle_of
+from mitsim.capture.run import board_flux, truth
+from mitsim.capture.session import Session
+from mitsim.capture.simulation import Simulation
+from mitsim.core.manifest import prepare_output, versions, write_json
+from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.diffraction import Spectrum
+from mitsim.optics.frames import ExpectedFrames, FrameOptics
+from mitsim.optics.mask import MaskKind
+from mitsim.optics.separable import best_term, centred, relative_difference
+from mitsim.optics.shadow import Directions, SeparableTerms
+from mitsim.reconstruct.solver import prepare
+from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.study import plots
+from mitsim.study.compare import peak_time, recover
+from mitsim.study.ideal import ideal_factors
+from mitsim.study.metrics import relative_error
+
+FloatArray = npt.NDArray[np.float64]
+Factors = tuple[FloatArray, FloatArray]
+ACCURACY = 1e-3
+MASKS: tuple[MaskKind, ...] = ("separable", "flatcam")
+BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
+GEOMETRIC, LINE, PROJECTOR, BROADBAND = "geometric", "one line", "projector", "broadband"
+ASSUMED, SEPARABLE, CALIBRATED = "geometric factors", "best separable factors", "calibrated factors"
+PROFILE_MM = 0.75
+
+
+@dataclass(frozen=True)
+class ShadowRow:
+    """One mask in one light against its geometric shadow; relative rms differences of operators, no unit.
+
+    ``terms``: separable terms of the operator. ``point_source`` and ``scene_pixel``: difference from the geometric
+    shadow, for point sources at the centres of projector pixels and averaged over these pixels. ``factor``: difference
+    of the factor that a solver uses on one side. ``separability``: what the best single separable term leaves of the
+    operator, and ``separability_centred`` once row and column means are taken off its frames.
+    """
+
+    mask: str
+    light: str
+    wavelengths: int
+    terms: int
+    point_source: float
+    scene_pixel: float
+    factor: float
+    separability: float
+    separability_centred: float
+
+
+@dataclass(frozen=True)
+class QualityRow:
+    """One reconstruction: which frames (idealised or rendered) in which light, which factors; PSNR [dB]."""
+
+    frames: str
+    mask: str
+    light: str
+    patterns: str
+    factors: str
+    captures: int
+    psnr_db: float
+    ssim: float
+    lam: float
+    status: str
+
+
+@dataclass(frozen=True)
+class DiffractionStudy:
+    """All rows, and the difference in PSNR that each choice of factors makes."""
+
+    scene: str
+    patterns: str
+    shadows: tuple[ShadowRow, ...]
+    quality: tuple[QualityRow, ...]
+    output: str
+
+    def loss_db(self, frames: str, mask: str, light: str, patterns: str, factors: str) -> float:
+        """PSNR [dB] that is lost against the geometric shadow seen by a solver that is right to assume it."""
+        return self._psnr(frames, mask, GEOMETRIC, patterns, ASSUMED) - self._psnr(
+            frames, mask, light, patterns, factors
+        )
+
+    def _psnr(self, *wanted: str) -> float:
+        return next(
+            row.psnr_db
+            for row in self.quality
+            if (row.frames, row.mask, row.light, row.patterns, row.factors) == wanted
+        )
+
+    def payload(self) -> dict[str, Any]:
+        """The JSON of the command line."""
+        return {
+            "shadows": [asdict(row) for row in self.shadows],
+            "quality": [
+                {**asdict(row), "loss_db": self.loss_db(row.frames, row.mask, row.light, row.patterns, row.factors)}
+                for row in self.quality
+            ],
+            "scene": self.scene,
+            "patterns": self.patterns,
+            "output": self.output,
+        }
+
+    def lines(self) -> list[str]:
+        """For people."""
+        shadows = [
+            f"{row.mask:>10} {row.light:<10} off the geometric shadow by {row.point_source:5.1%} (point), "
+            f"{row.scene_pixel:5.1%} (scene pixel); off one separable term by {row.separability:.1e}, centred "
+            f"{row.separability_centred:.1e}"
+            for row in self.shadows
+        ]
+        quality = [
+            f"{row.frames:>10} {row.mask:<10} {row.light:<10} {row.patterns:<8} {row.factors:<22} {row.psnr_db:5.1f} dB"
+            for row in self.quality
+        ]
+        return [*shadows, *quality, f"{self.verdict}.", f"Plots: {self.output}/quality.png, {self.output}/shadow.png"]
+
+    @property
+    def verdict(self) -> str:
+        """What idealised frames of the separable mask in the projector's light say, in one clause."""
+        case = "idealised", MASKS[0], PROJECTOR, self.patterns
+        wrong, right = (self.loss_db(*case, factors) for factors in (ASSUMED, SEPARABLE))
+        return (
+            f"Assuming the geometric mask costs {wrong:.1f} dB under {self.patterns}, factors of the true shadow "
+            f"{right:.1f} dB"
+        )
+
+
+def study_diffraction(
+    bench: Bench, output: Path | str, patterns: str, seed: int, progress: Progress
+) -> DiffractionStudy:
+    """Measure shadows and reconstructions and write diffraction.json, quality.png and shadow.png to ``output``."""
+    # Only an earlier study is replaced.
+    folder = prepare_output(output, overwrite=(Path(output) / "diffraction.json").is_file())
+    families = [bench.family(name, seed) for name in dict.fromkeys((patterns, "uniform"))]
+    main = families[0].classes()
+    plan = make_plan(bench, *main, ACCURACY, seed, {"diffraction": True})
+    light = collect(bench, plan, *main, seed, progress)
+    flux = float(board_flux(bench, plan, seed).mean())
+    image = truth(bench, plan, light, seed)
+    shadows, quality = [], []
+    spectra = lights(bench)
+    for done, mask in enumerate(MASKS):
+        progress("idealised frames", done / len(MASKS))
+        systems = {name: System(bench, mask, spectrum) for name, spectrum in spectra.items()}
+        shadows += [shadow_row(name, systems) for name in systems]
+        quality += list(_idealised(bench, systems, families, image, flux, seed))
+    progress("rendered session", 0.0)
+    quality += list(_rendered(bench, plan, light, families, image, flux, seed))
+    study = DiffractionStudy(str(bench.loaded.path), patterns, tuple(shadows), tuple(quality), str(folder))
+    _plot(bench, study, folder)
+    write_json(folder / "diffraction.json", {**study.payload(), "seed": seed, "versions": versions()})
+    return study
+
+
+def lights(bench: Bench) -> dict[str, Spectrum | None]:
+    """The study's lights by name; None is light that does not diffract."""
+    edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
+    return {
+        GEOMETRIC: None,
+        LINE: Spectrum(np.array([bench.projector.effective_wavelength_nm]), np.ones(1)),
+        PROJECTOR: bench.spectrum,
+        BROADBAND: Spectrum((edges[:-1] + edges[1:]) / 2, np.full(BROADBAND_BANDS, 1 / BROADBAND_BANDS)),
+    }
+
+
+class System:
+    """The idealised camera with one mask in one light: projector pixels of the aligned plane to sensor pixels."""
+
+    def __init__(self, bench: Bench, mask: MaskKind, spectrum: Spectrum | None) -> None:
+        """``spectrum`` None: the geometric shadow."""
+        self.mask, self.spectrum = mask, spectrum
+        self.geometry: CameraGeometry = bench.geometry.model_copy(update={"mask": mask})
+        self._depth = bench.geometry.scene_distance
+        self._pixels = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows]
+        self.terms = self.geometry.shadow_terms(*self._pixels, self._depth, spectrum)
+
+    @property
+    def centre(self) -> bool:
+        """Whether a solver takes row and column means off its frames."""
+        return self.mask == "flatcam"
+
+    def points(self) -> SeparableTerms:
+        """The same operator for point sources at the centres of the projector's pixels."""
+        centres = [Directions(pixels.centres, 0.0) for pixels in self._pixels]
+        return self.geometry.shadow_terms(*centres, self._depth, self.spectrum)
+
+    def factors(self) -> Factors:
+        """(pixels, n) left and right factor of the nearest separable operator, of transmissions."""
+        best = best_term(centred(self.terms) if self.centre else self.terms)
+        return best.left, best.right
+
+    def frames(self, family: PatternFamily, flux: FloatArray, seed: int) -> ExpectedFrames:
+        """Frames of a family when each projector pixel puts ``flux`` (n, n) [W m^-2] on the sensor without the mask."""
+        optics = FrameOptics(self.geometry, *self._pixels, (self._depth,), 1, self.spectrum)
+        return ExpectedFrames(optics, (sparse.csr_array(sparse.diags_array(flux.ravel())),), *family.classes(), seed)
+
+
+def shadow_row(light: str, systems: Mapping[str, System]) -> ShadowRow:
+    """One light's system compared with the geometric one of the same mask."""
+    system, geometric = systems[light], systems[GEOMETRIC]
+    return ShadowRow(
+        mask=system.mask,
+        light=light,
+        wavelengths=len(system.spectrum.weights) if system.spectrum else 0,
+        terms=len(system.terms),
+        point_source=relative_difference(system.points(), geometric.points()),
+        scene_pixel=relative_difference(system.terms, geometric.terms),
+        factor=relative_error(system.factors()[0], geometric.factors()[0]),
+        separability=best_term(system.terms).residual,
+        separability_centred=best_term(centred(system.terms)).residual,
+    )
+
+
+def _idealised(
+    bench: Bench,
+    systems: Mapping[str, System],
+    families: list[PatternFamily],
+    image: FloatArray,
+    flux: float,
+    seed: int,
+) -> Iterator[QualityRow]:
+    """Frames of an evenly lit plane in every light, solved with geometric factors and with the true shadow's."""
+    root = np.sqrt(flux * _electrons_per_joule(bench))
+    for light, system in systems.items():
+        known = {ASSUMED: systems[GEOMETRIC].factors(), SEPARABLE: system.factors()}
+        if light == GEOMETRIC:
+            del known[SEPARABLE]
+        scaled = {name: (left * root, right * root) for name, (left, right) in known.items()}
+        for family in families:
+            expected = system.frames(family, image * flux, seed)
+            exposer = Exposer(bench, peak_time(bench, expected), seed)
+            yield from _rows("idealised", system.mask, light, exposer, family, expected, scaled, image)
+
+
+def _rendered(
+    bench: Bench,
+    plan: Plan,
+    light: Light,
+    families: list[PatternFamily],
+    image: FloatArray,
+    flux: float,
+    seed: int,
+) -> Iterator[QualityRow]:
+    """Rendered frames of the scene, solved with geometric factors and with those of a rendered noisy session."""
+    session = Session(bench, load_recipe(), ACCURACY, seed, Clock(), lambda stage, part: None)
+    found = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
+    assumed = ideal_factors(bench, flux, _electrons_per_joule(bench))
+    rays = replace(plan.settings, effects=plan.settings.effects - {"diffraction"})
+    seen = {GEOMETRIC: replace(light, simulation=Simulation(bench, rays)), PROJECTOR: light}
+    for name, here in seen.items():
+        known = {ASSUMED: assumed} if name == GEOMETRIC else {ASSUMED: assumed, CALIBRATED: (found.left, found.right)}
+        for family in families:
+            expected = here.merged().frames(*family.classes(), seed)
+            exposer = Exposer(bench, peak_time(bench, expected), seed, speckle_of(bench, plan))
+            yield from _rows("rendered", bench.geometry.mask, name, exposer, family, expected, known, image)
+
+
+def _rows(
+    frames: str,
+    mask: str,
+    light: str,
+    exposer: Exposer,
+    family: PatternFamily,
+    expected: ExpectedFrames,
+    known: Mapping[str, Factors],
+    image: FloatArray,
+) -> Iterator[QualityRow]:
+    """One noisy exposure of a family, solved with each pair of factors."""
+    models = [prepare(*pair, family.left, family.right, centre=mask == "flatcam") for pair in known.values()]
+    recovered = recover(exposer, family, expected, models, image)
+    for factors, found in zip(known, recovered, strict=True):
+        yield QualityRow(
+            frames=frames,
+            mask=mask,
+            light=light,
+            patterns=family.name,
+            factors=factors,
+            captures=len(family.captures),
+            psnr_db=found.psnr_db,
+            ssim=found.ssim,
+            lam=found.lam,
+            status=found.status,
+        )
+
+
+def _electrons_per_joule(bench: Bench) -> float:
+    """Electrons a second of one sensor pixel at 1 W m^-2."""
+    return float(electrons_from_irradiance(1.0, 1.0, bench.sensor, bench.projector.effective_wavelength_nm))
+
+
+def _plot(bench: Bench, study: DiffractionStudy, folder: Path) -> None:
+    quality = [
+        (f"{row.frames}, {row.mask},\n{row.light}", row.factors, row.psnr_db)
+        for row in study.quality
+        if row.patterns == study.patterns
+    ]
+    profiles = {}
+    for name, spectrum in lights(bench).items():
+        camera = bench.geometry.model_copy(update={"mask": MASKS[0]})
+        axis = Directions(np.zeros(1), 0.0)
+        profiles[name] = best_term(camera.shadow_terms(axis, axis, camera.scene_distance, spectrum)).left[:, 0]
+    edges = bench.geometry.pixel_edges
+    off = next(row for row in study.shadows if (row.mask, row.light) == (MASKS[0], PROJECTOR))
+    figures = {
+        "quality.png": plots.quality_by_factors(quality, study.verdict),
+        "shadow.png": plots.shadow_profiles(
+            (edges[:-1] + edges[1:]) / 2,
+            profiles,
+            PROFILE_MM,
+            f"A point's shadow in the projector's light is {off.point_source:.0%} off the geometric one",
+        ),
+    }
+    for name, figure in figures.items():
+        part = folder / f".{name}"
+        figure.savefig(part, dpi=150)
+        part.replace(folder / name)
