@@ -302,7 +302,7 @@ def study(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """An experiment with a plot and JSON: what `accuracy` costs in time, what `diffraction` at the mask does to images."""
+    """An experiment with plots and JSON: what `accuracy` costs in time, what `diffraction` at the mask does."""
     from mitsim.study import STUDIES
 
     if name not in STUDIES:

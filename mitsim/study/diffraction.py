@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from mitsim.calibrate.hadamard import estimate_factors
 from mitsim.capture.bench import Bench, PatternFamily, load_recipe
@@ -31,17 +30,16 @@ from mitsim.capture.run import board_flux, truth
 from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.manifest import prepare_output, versions, write_json
-from mitsim.optics.camera import CameraGeometry
 from mitsim.optics.diffraction import Spectrum
-from mitsim.optics.frames import ExpectedFrames, FrameOptics
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.mask import MaskKind
 from mitsim.optics.separable import best_term, centred, relative_difference
-from mitsim.optics.shadow import Directions, SeparableTerms
+from mitsim.optics.shadow import Directions
 from mitsim.reconstruct.solver import prepare
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.study import plots
 from mitsim.study.compare import peak_time, recover
-from mitsim.study.ideal import ideal_factors
+from mitsim.study.ideal import IdealCamera, ideal_factors
 from mitsim.study.metrics import relative_error
 
 FloatArray = npt.NDArray[np.float64]
@@ -87,7 +85,7 @@ class QualityRow:
     captures: int
     psnr_db: float
     ssim: float
-    lam: float
+    lam: float | None
     status: str
 
 
@@ -168,7 +166,7 @@ def study_diffraction(
     spectra = lights(bench)
     for done, mask in enumerate(MASKS):
         progress("idealised frames", done / len(MASKS))
-        systems = {name: System(bench, mask, spectrum) for name, spectrum in spectra.items()}
+        systems = {name: IdealCamera(bench, mask, spectrum) for name, spectrum in spectra.items()}
         shadows += [shadow_row(name, systems) for name in systems]
         quality += list(_idealised(bench, systems, families, image, flux, seed))
     progress("rendered session", 0.0)
@@ -190,39 +188,7 @@ def lights(bench: Bench) -> dict[str, Spectrum | None]:
     }
 
 
-class System:
-    """The idealised camera with one mask in one light: projector pixels of the aligned plane to sensor pixels."""
-
-    def __init__(self, bench: Bench, mask: MaskKind, spectrum: Spectrum | None) -> None:
-        """``spectrum`` None: the geometric shadow."""
-        self.mask, self.spectrum = mask, spectrum
-        self.geometry: CameraGeometry = bench.geometry.model_copy(update={"mask": mask})
-        self._depth = bench.geometry.scene_distance
-        self._pixels = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows]
-        self.terms = self.geometry.shadow_terms(*self._pixels, self._depth, spectrum)
-
-    @property
-    def centre(self) -> bool:
-        """Whether a solver takes row and column means off its frames."""
-        return self.mask == "flatcam"
-
-    def points(self) -> SeparableTerms:
-        """The same operator for point sources at the centres of the projector's pixels."""
-        centres = [Directions(pixels.centres, 0.0) for pixels in self._pixels]
-        return self.geometry.shadow_terms(*centres, self._depth, self.spectrum)
-
-    def factors(self) -> Factors:
-        """(pixels, n) left and right factor of the nearest separable operator, of transmissions."""
-        best = best_term(centred(self.terms) if self.centre else self.terms)
-        return best.left, best.right
-
-    def frames(self, family: PatternFamily, flux: FloatArray, seed: int) -> ExpectedFrames:
-        """Frames of a family when each projector pixel puts ``flux`` (n, n) [W m^-2] on the sensor without the mask."""
-        optics = FrameOptics(self.geometry, *self._pixels, (self._depth,), 1, self.spectrum)
-        return ExpectedFrames(optics, (sparse.csr_array(sparse.diags_array(flux.ravel())),), *family.classes(), seed)
-
-
-def shadow_row(light: str, systems: Mapping[str, System]) -> ShadowRow:
+def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
     """One light's system compared with the geometric one of the same mask."""
     system, geometric = systems[light], systems[GEOMETRIC]
     return ShadowRow(
@@ -240,7 +206,7 @@ def shadow_row(light: str, systems: Mapping[str, System]) -> ShadowRow:
 
 def _idealised(
     bench: Bench,
-    systems: Mapping[str, System],
+    systems: Mapping[str, IdealCamera],
     families: list[PatternFamily],
     image: FloatArray,
     flux: float,
