@@ -14,6 +14,7 @@ from mitsim.capture.light import Light, Plan, Progress
 from mitsim.capture.run import board_flux
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.sensor.chain import Digital, electrons_from_irradiance
 from mitsim.study.ideal import ideal_factors, ideal_light
@@ -89,7 +90,15 @@ class Comparison:
     def _recovery(
         self, family: PatternFamily, expected: ExpectedFrames, model: Prepared, exposure_s: float, seed: int
     ) -> Recovery:
-        return recover(Exposer(self.bench, exposure_s, seed), family, expected, [model], self.truth)[0]
+        (frames,) = accumulate(Exposer(self.bench, exposure_s, seed), family, expected, [model])
+        solution = model.solve(frames, "auto")
+        return Recovery(
+            solution.image,
+            psnr(solution.image, self.truth),
+            ssim(solution.image, self.truth),
+            solution.lam,
+            solution.status,
+        )
 
     def _model(self, family: PatternFamily, factors: tuple[FloatArray, FloatArray]) -> Prepared:
         return prepare(*factors, family.left, family.right, centre=self.bench.geometry.mask == "flatcam")
@@ -106,21 +115,13 @@ def peak_time(bench: Bench, expected: ExpectedFrames) -> float:
     return Exposure().choose(bench, max(float(frame.irradiance.max()) for frame in expected))
 
 
-def recover(
-    exposer: Exposer,
-    family: PatternFamily,
-    expected: ExpectedFrames,
-    models: Sequence[Prepared],
-    truth: FloatArray,
-) -> list[Recovery]:
-    """Images from one noisy exposure of a family's frames, one for each model, judged against the truth (n, n)."""
+def accumulate(
+    exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared]
+) -> list[Accumulator]:
+    """One noisy exposure of a family's frames, added up for each model."""
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
         for measurement, row, column in exposer.measurements(family, expected):
             for frames in sums:
                 frames.add(measurement, row, column)
-    solutions = [model.solve(frames, "auto") for model, frames in zip(models, sums, strict=True)]
-    return [
-        Recovery(found.image, psnr(found.image, truth), ssim(found.image, truth), found.lam, found.status)
-        for found in solutions
-    ]
+    return sums

@@ -6,6 +6,8 @@ reflectance and the mean flux of the rendered bench, so exposure and noise are t
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -79,6 +81,7 @@ class IdealCamera:
         rows, columns = (Directions(pixels.centres, 0.0) for pixels in (self._rows, self._columns))
         return self.geometry.shadow_terms(rows, columns, self._depth, self.spectrum)
 
+    @cached_property
     def factors(self) -> tuple[FloatArray, FloatArray]:
         """(pixels, n) left and right factor of the nearest separable operator, of transmissions."""
         best = best_term(centred(self.terms) if self.centre else self.terms)
@@ -86,6 +89,9 @@ class IdealCamera:
 
     def frames(self, family: PatternFamily, flux: FloatArray, seed: int) -> ExpectedFrames:
         """Frames of a family when each projector pixel puts ``flux`` (n, n) [W m^-2] on the sensor without the mask."""
-        optics = FrameOptics(self.geometry, self._rows, self._columns, (self._depth,), 1, self.spectrum)
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
-        return ExpectedFrames(optics, (light,), *family.classes(), seed)
+        return ExpectedFrames(self._optics, (light,), *family.classes(), seed)
+
+    @cached_property
+    def _optics(self) -> FrameOptics:
+        return FrameOptics(self.geometry, self._rows, self._columns, (self._depth,), 1, self.spectrum)
