@@ -273,7 +273,7 @@ def _rows(
     for factors, model, measured in zip(known, models, sums, strict=True):
         found = model.solve(measured, "auto")
         quality = psnr(found.image, image)
-        largest = found.lam / found.lam_relative
+        largest = (model.left.singular.max() * model.right.singular.max()) ** 2
         others = (psnr(model.solve(measured, largest * part).image, image) for part in LAMBDAS)
         yield QualityRow(
             frames=frames,
