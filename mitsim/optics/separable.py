@@ -36,7 +36,7 @@ class BestTerm:
 
 
 def best_term(terms: SeparableTerms) -> BestTerm:
-    """The one separable term that comes closest to the sum of ``terms``, its sign so that left is like the first one.
+    """The one separable term that comes closest to the sum of ``terms``; its factors' sign is like the largest term's.
 
     The singular values of A are those of the product of two small triangles, from QR factorisations of the two sides:
     Gram matrices would square the condition number and leave 1e-8 where the residual is zero.
@@ -50,7 +50,8 @@ def best_term(terms: SeparableTerms) -> BestTerm:
         (root * basis @ turn).reshape(like.shape)
         for basis, turn, like in zip((left, right), (turn_left[:, 0], turn_right[0]), terms[0], strict=True)
     ]
-    sign = 1.0 if np.vdot(factors[0], terms[0][0]) >= 0 else -1.0
+    largest = max(terms, key=lambda pair: float(np.linalg.norm(pair[0]) * np.linalg.norm(pair[1])))
+    sign = 1.0 if np.vdot(factors[0], largest[0]) >= 0 else -1.0
     energy = np.square(values)
     return BestTerm(sign * factors[0], sign * factors[1], float(np.sqrt(energy[1:].sum() / energy.sum())))
 
