@@ -32,6 +32,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.manifest import prepare_output, versions, write_json
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.mask import MaskKind
 from mitsim.reconstruct.solver import prepare
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.study import plots
