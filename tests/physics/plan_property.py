@@ -1,4 +1,4 @@
-"""What each effect of the plan changes in the frames, measured apart from the pilot: a bench in, changes and bounds out.
+"""What each effect of the plan changes in the frames, measured apart from the pilot: bench in, changes and bounds out.
 
 GROUPS independent traces of everything the scene has (own seeds, 3 x 3 anchors, more layers and cells half as large as
 the pilot's). Each gives the frames with an effect and without it from the same paths, so what both share cancels. The
