@@ -6,8 +6,8 @@ Monte Carlo error and the discretisation that it is predicted to leave are state
 
 The reference is measured on one frame of the family, and its time counted for all. It has a geometric mask and a
 perfect black, so its judge is the same light formed that way; it is unbiased, so its error falls with 1/sqrt(samples),
-by which it is extrapolated. Seconds are transport and optics for all frames, kernels compiled beforehand. What the pilot predicts
-to take longer than PATIENCE is left out and named.
+by which it is extrapolated. Seconds are transport and optics for all frames, kernels compiled beforehand. Accuracies
+that the plan predicts to take longer than PATIENCE are left out and named.
 """
 
 from __future__ import annotations

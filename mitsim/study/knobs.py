@@ -44,7 +44,7 @@ def rounds(count: int) -> Target:
 
 
 def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Iterator[Variant]:
-    """The plan with one knob turned; left out is what would trace for longer than ``patience`` [s] at the pilot's pace."""
+    """The plan with one knob turned; what would be traced for longer than ``patience`` [s] is left out."""
     now = plan.settings
 
     def changed(knob: str, setting: str, settings: Settings) -> Variant:
