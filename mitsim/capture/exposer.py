@@ -14,6 +14,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.optics.speckle import speckled
 from mitsim.scene.patterns import PatternFamily
 from mitsim.sensor.chain import (
     Digital,
@@ -61,17 +62,25 @@ class Exposure:
 
 @dataclass(frozen=True)
 class Exposer:
-    """A bench's camera at one exposure time; every frame's noise has streams of its own, found by its names."""
+    """A bench's camera at one exposure time; every frame's noise has streams of its own, found by its names.
+
+    ``speckle`` is the contrast of laser speckle in the frames; 0 without.
+    """
 
     bench: Bench
     exposure_s: float
     seed: int
+    speckle: float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
         """Expected photoelectrons (pixels, pixels), without dark current."""
         return electrons_from_irradiance(
             frame.irradiance, self.exposure_s, self.bench.sensor, self.bench.projector.effective_wavelength_nm
         )
+
+    def lit(self, frame: Frame, *names: str | int) -> FloatArray:
+        """Expected photoelectrons of the frame ``names``, with its own speckle."""
+        return speckled(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
         """Noisy digital numbers of the frame ``names``."""
@@ -107,7 +116,9 @@ class Exposer:
         numbered = zip(family.captures, expected, strict=True)
         half: FloatArray | None = None
         while chunk := list(islice(numbered, FRAMES_AT_ONCE)):
-            rates = in_threads(lambda item: self.rate(self.digital(self.electrons(item[1]), *item[0].names)), chunk)
+            rates = in_threads(
+                lambda item: self.rate(self.digital(self.lit(item[1], *item[0].names), *item[0].names)), chunk
+            )
             for (shown, _), rate in zip(chunk, rates, strict=True):
                 if shown.sign == 1:
                     half = rate

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.simulation import Light as Estimate
 from mitsim.capture.simulation import Simulation
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
@@ -26,6 +28,7 @@ __all__ = [
     "make_plan",
     "pinhole_view",
     "silent",
+    "speckle_of",
     "uniform_light",
 ]
 
@@ -36,6 +39,8 @@ Target = Callable[[ExpectedFrames], float]
 _CHECKED_CAPTURES = 8
 _MOST_PATHS = 2**32
 _LARGEST_GROWTH = 8.0
+_FIRST_ROUND = 0.5
+_VIEW_SAMPLES = 64
 _LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 
@@ -51,7 +56,7 @@ class Light:
     Attributes
     ----------
     groups
-        independent estimates, (rows + 1, places) each [W m^-2]; the last row is ambient light.
+        independent estimates.
     simulation
         what was simulated; it turns light into frames.
     labels
@@ -59,12 +64,12 @@ class Light:
     flux
         (n^2,) irradiance that each pixel's direct light casts on the sensor without the mask, mean over the sensor.
     paths
-        rays traced from the camera.
+        connections and paths traced.
     sampling_error
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     """
 
-    groups: tuple[sparse.csr_array, ...]
+    groups: tuple[Estimate, ...]
     simulation: Simulation
     labels: Labels
     flux: FloatArray
@@ -86,7 +91,7 @@ class Light:
 
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""
-        return replace(self, groups=(sum(self.groups[1:], self.groups[0]) / len(self.groups),))
+        return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
 
 def make_plan(
@@ -161,17 +166,16 @@ def collect(
     kept = np.arange(bench.n**2) if by_pixel else labels
     chosen = np.unique(np.linspace(0, len(weights) - 1, min(len(weights), _CHECKED_CAPTURES)).astype(int))
     groups = [_Group(simulation, kept, integer(seed, "transport", purpose, group)) for group in range(GROUPS)]
-    wanted = 1
-    lanes = simulation.tracer.lanes
+    rounds = _FIRST_ROUND
     while True:
         for group in groups:
-            group.sample(wanted)
+            group.sample(rounds)
         light = Light(
             groups=tuple(group.light for group in groups),
             simulation=simulation,
             labels=kept,
             flux=np.asarray(sum(group.flux for group in groups) / GROUPS),
-            paths=wanted * GROUPS * lanes,
+            paths=sum(group.paths for group in groups),
             sampling_error=math.inf,
             reached=False,
         )
@@ -181,43 +185,50 @@ def collect(
         progress("transport", min(1.0, (goal / error) ** 2) if error > 0 else 1.0)
         if error <= goal or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=error <= goal)
-        # The error falls at least with the square root of the samples; where it falls faster, less is needed.
-        growth = min(
-            1.1 * (error / goal) ** (2 if "interreflection" in plan.settings.effects else 1.2), _LARGEST_GROWTH
-        )
-        wanted = min(max(wanted + 1, math.ceil(wanted * growth)), max(wanted + 1, _MOST_PATHS // (GROUPS * lanes)))
+        # Indirect light's error falls with the square root of the samples; direct light's falls faster.
+        growth = min(1.1 * (error / goal) ** (2 if simulation.other else 1.2), _LARGEST_GROWTH)
+        rounds *= max(growth, 1.2)
 
 
 class _Group:
     """One independent estimate of the light: the sum over its samples so far."""
 
     def __init__(self, simulation: Simulation, labels: Labels, seed: int) -> None:
-        self.simulation, self.labels, self.seed = simulation, labels, seed
-        self.done = 0
-        self._light: sparse.csr_array | None = None
+        self.simulation, self.labels = simulation, labels
+        self.seed = seed
+        self.done: dict[str, int] = {}
+        self.paths = 0
+        self._sums: dict[str, Estimate] = {}
         self._flux = np.zeros(simulation.bench.n**2)
 
-    def sample(self, wanted: int) -> None:
-        """Trace up to the sample number ``wanted`` of the sequence."""
-        at_once = max(1, _LANES_AT_ONCE // self.simulation.tracer.lanes)
-        while self.done < wanted:
-            count = min(at_once, wanted - self.done)
-            found = self.simulation.tracer.trace(self.seed, self.done, count)
-            light = self.simulation.file(found, self.labels, 1)
-            self._light = light if self._light is None else self._light + light
-            self._flux += self.simulation.flux(found, 1)
-            self.done += count
+    def sample(self, rounds: float) -> None:
+        """Trace until this many times the samples that the plan predicted are done."""
+        for name, stage in self.simulation.tracers().items():
+            wanted, seed = max(math.ceil(rounds * stage.predicted), 1), integer(self.seed, name)
+            while (done := self.done.get(name, 0)) < wanted:
+                count = min(max(1, _LANES_AT_ONCE // stage.tracer.lanes), wanted - done)
+                found = stage.tracer.trace(seed, done, count)
+                light = stage.file(found, self.labels, 1)
+                self._sums[name] = self._sums[name] + light if name in self._sums else light
+                if name == "direct":
+                    self._flux += self.simulation.flux(found, 1)
+                self.done[name] = done + count
+                self.paths += count * stage.tracer.lanes
 
     @property
-    def light(self) -> sparse.csr_array:
-        """(rows + 1, places) mean over the samples [W m^-2]."""
-        assert self._light is not None
-        return self._light / self.done
+    def light(self) -> Estimate:
+        """Mean over the samples."""
+        return reduce(add, (light / self.done[name] for name, light in self._sums.items()))
 
     @property
     def flux(self) -> FloatArray:
         """(n^2,) mean over the samples."""
-        return self._flux / self.done
+        return self._flux / self.done["direct"]
+
+
+def speckle_of(bench: Bench, plan: Plan) -> float:
+    """Speckle contrast of frames under a plan; 0 where the effect is off."""
+    return bench.projector.speckle_contrast if "speckle" in plan.settings.effects else 0.0
 
 
 def uniform_light(n: int) -> tuple[Labels, FloatArray]:
@@ -228,15 +239,14 @@ def uniform_light(n: int) -> tuple[Labels, FloatArray]:
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:
     """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
 
-    Direct light, one path a cell, four cells a side of a projector pixel; 0 where the projector does not light the
-    board.
+    Direct light, two cells a side of a projector pixel; 0 where the projector does not light the board.
     """
     settings = Settings(depth=bench.geometry.scene_distance)
 
     def seen(which: Bench) -> FloatArray:
-        simulation = Simulation(which, settings, pixels=4 * bench.n)
-        found = simulation.tracer.trace(integer(seed, "view"))
-        light = simulation.file(found, np.zeros(bench.n**2, dtype=np.int64), 1)[[0]].toarray()
+        simulation = Simulation(which, settings, pixels=2 * bench.n)
+        found = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
+        light = simulation.file(found, np.zeros(bench.n**2, dtype=np.int64), 1).fine[[0]].toarray()
         return np.asarray(light).reshape(simulation.bundle.cells)
 
     scene, board = seen(bench), seen(bench.with_board(board_reflectance))

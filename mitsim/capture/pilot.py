@@ -1,4 +1,4 @@
-"""A short look at a scene before the real work: the error that each effect and each coarseness would leave, and the pace.
+"""A short look at a scene before the real work: the error that each effect or coarseness would leave, and the pace.
 
 Numbers in, numbers out: the effect plan (:mod:`mitsim.scene.plan`) reads them and decides. Every error is relative,
 ``||a - b|| / ||b||``, over up to four captures of the family. Two independent halves A and B see the same change with
@@ -15,7 +15,6 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.simulation import Simulation
@@ -23,7 +22,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.scene.plan import GROUPS, PHYSICAL, Evidence, Noise, Settings
-from mitsim.transport.histogram import Deposits
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.histogram import AMBIENT, INDIRECT, Deposits
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
@@ -32,11 +32,10 @@ ANCHOR_LADDER = (1, 2, 3, 5, 8)
 LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)
 CELL_CHOICES = ((1, False), (2, False), (2, True), (3, True), (4, True))
 _FIRST_JUDGE = 5
-_RATIO_PIXELS, _RATIO_SAMPLES = 4, 32
+_ANCHOR_SAMPLES = 4
 _CAPTURES = 4
 _CELL_SAMPLES = 16
-_EFFECT_SAMPLES = 2
-_TRACED_ANEW = ("mirrors", "aperture", "blur", "pixel-response")
+_DIRECT_SAMPLES, _OTHER_SAMPLES = 4, 2
 
 
 @dataclass(frozen=True)
@@ -92,14 +91,15 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
     return Evidence(
         depth=depth,
         layers=fine.layers,
-        anchor_error=_Anchors(fine, accuracy).errors(),
+        anchor_error=_anchor_errors(bench, base, family, accuracy, seed),
         layer_error=layer_error,
         cell_error=cell_error,
         effect_error=effect_error,
         noise=(fine.noise(), effects.noise()),
-        cells=fine.simulation.tracer.lanes,
-        seconds_per_path=fine.seconds_per_path,
-        seconds_per_bounced=max(effects.seconds_per_path, fine.seconds_per_path),
+        pixels=bench.n**2,
+        cells=effects.cells,
+        seconds_per_connection=fine.seconds_per_connection,
+        seconds_per_path=effects.seconds_per_path,
         seconds_per_frame=fine.seconds_per_frame,
         terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
         seconds=time.perf_counter() - started,
@@ -107,9 +107,9 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
 
 
 def _depth(bench: Bench, effects: frozenset[str], seed: int) -> float:
-    """Where the light is seen, 1 / mean(1/z) [mm], from one path through each projector pixel."""
+    """Where the light is seen, 1 / mean(1/z) [mm], from one ray of each projector pixel."""
     settings = Settings(depth=bench.geometry.scene_distance, effects=effects)
-    found = Simulation(bench, settings).tracer.trace(integer(seed, "pilot", "depth"))
+    found = Simulation(bench, settings).direct.trace(integer(seed, "pilot", "depth"))
     total = float(found.value.sum())
     if not total and not bench.loaded.mirrors:
         raise MitsimError(
@@ -127,15 +127,14 @@ class _Fine:
     def __init__(self, bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.family, self.accuracy, self.seed = bench, base, family, accuracy, seed
         self.simulation = Simulation(bench, base)
-        tracer = self.simulation.tracer
+        tracer = self.simulation.direct
         seeds = [integer(seed, "pilot", "fine", half) for half in range(2)]
         first = tracer.trace(seeds[0], 0, _CELL_SAMPLES)
         started = time.perf_counter()
         second = tracer.trace(seeds[1], 0, _CELL_SAMPLES)
-        self.seconds_per_path = (time.perf_counter() - started) / (tracer.lanes * _CELL_SAMPLES)
+        self.seconds_per_connection = (time.perf_counter() - started) / (tracer.lanes * _CELL_SAMPLES)
         few = [tracer.trace(one, 0, _CELL_SAMPLES // 4) for one in seeds]
-        shown = np.append(family.weights.any(axis=0)[family.labels], False)
-        first, second, *few = (found.where(shown[found.source]) for found in (first, second, *few))
+        first, second, *few = (_shown(found, family) for found in (first, second, *few))
         self.deposits, self.few = (first, second), (few[0], few[1])
         near, far = self._range()
         self.layers: dict[int, tuple[float, ...]] = {1: (base.depth,)}
@@ -198,11 +197,12 @@ class _Effects:
         self.bench, self.everything, self.family = bench, everything, family
         self.seeds = tuple(integer(seed, "pilot", "effects", half) for half in range(2))
         self.simulation = Simulation(bench, everything)
-        self._trace(self.simulation)
+        self.direct, self.other = self._direct(self.simulation), self._other(self.simulation)
         started = time.perf_counter()
-        self.deposits = self._trace(self.simulation)
-        self.seconds_per_path = (time.perf_counter() - started) / (2 * self.simulation.tracer.lanes * _EFFECT_SAMPLES)
-        self.frames = self._form(self.simulation, self.deposits)
+        self._other(self.simulation)
+        self.cells = self.simulation.other.lanes if self.simulation.other else 1
+        self.seconds_per_path = (time.perf_counter() - started) / (2 * self.cells * _OTHER_SAMPLES)
+        self.frames = self._form(self.simulation, self.direct, self.other)
 
     def errors(self, names: tuple[str, ...]) -> dict[str, float]:
         """Change of the frames when each effect is left out."""
@@ -210,90 +210,69 @@ class _Effects:
 
     def noise(self) -> Noise:
         """Monte Carlo error of one estimate of all that is not direct light, relative to all light."""
-        n = self.bench.n**2
-        other = tuple(found.where((found.order > 1) | (found.source == n)) for found in self.deposits)
-        first, second = self._form(self.simulation, other)
+        none = tuple(Deposits.none() for _ in self.seeds)
+        first, second = self._form(self.simulation, none, self.other)
         energy = float(np.vdot(*self.frames))
         spread = float(np.square(first - second).sum()) / 2
-        return Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, _EFFECT_SAMPLES, 0.5)
+        return Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, _OTHER_SAMPLES, 0.5)
 
     def _without(self, name: str) -> Halves:
         simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {name}))
-        deposits = self._trace(simulation) if name in _TRACED_ANEW else self.deposits
+        direct, other = self.direct, self.other
+        if name in ("aperture", "blur", "pixel-response"):
+            direct = self._direct(simulation)
+        if name in ("aperture", "blur", "pixel-response", "mirrors"):
+            other = self._other(simulation)
         if name == "interreflection":
-            deposits = tuple(found.where(found.order == 1) for found in deposits)
+            other = tuple(found.where(found.order != INDIRECT) for found in other)
         if name == "ambient":
-            deposits = tuple(found.where(found.source < self.bench.n**2) for found in deposits)
-        return self._form(simulation, deposits)
+            other = tuple(found.where(found.order != AMBIENT) for found in other)
+        return self._form(simulation, direct, other)
 
-    def _trace(self, simulation: Simulation) -> tuple[Deposits, ...]:
-        return tuple(simulation.tracer.trace(seed, 0, _EFFECT_SAMPLES) for seed in self.seeds)
+    def _direct(self, simulation: Simulation) -> tuple[Deposits, ...]:
+        return tuple(simulation.direct.trace(seed, 0, _DIRECT_SAMPLES) for seed in self.seeds)
 
-    def _form(self, simulation: Simulation, deposits: tuple[Deposits, ...]) -> Halves:
-        first, second = (_form(simulation, found, _EFFECT_SAMPLES, self.family) for found in deposits)
+    def _other(self, simulation: Simulation) -> tuple[Deposits, ...]:
+        if simulation.other is None:
+            return tuple(Deposits.none() for _ in self.seeds)
+        return tuple(simulation.other.trace(seed, 0, _OTHER_SAMPLES) for seed in self.seeds)
+
+    def _form(self, simulation: Simulation, direct: tuple[Deposits, ...], other: tuple[Deposits, ...]) -> Halves:
+        first, second = (
+            _form(simulation, one, _DIRECT_SAMPLES, self.family, two) for one, two in zip(direct, other, strict=True)
+        )
         return first, second
 
 
-class _Anchors:
-    """Error of the frames with fewer anchors.
+def _anchor_errors(bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int) -> dict[int, float]:
+    """Error of the frames with fewer anchors; every anchor is connected to the same points, so little noise is left.
 
-    The light of each class, seen from the sensor's centre, is scaled by how the light of all classes differs between an
-    anchor and the centre; both come from the same random paths. So the noise of single projector pixels is alike in all
-    answers and leaves their differences. Frames, not radiance: the falloff's error is odd in the scene's coordinates
-    and mostly cancels in a frame.
+    Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame.
     """
 
-    def __init__(self, fine: _Fine, accuracy: float) -> None:
-        self.fine, self.accuracy = fine, accuracy
-        self.coarse = Simulation(
-            fine.bench, replace(fine.base, linear=True), pixels=max(fine.bench.n // _RATIO_PIXELS, 1)
-        )
-        self.centre = tuple(self._light(1, half) for half in range(2))
-        self.classes = tuple(
-            fine.simulation.file(one, fine.family.labels, _CELL_SAMPLES).tocoo() for one in fine.deposits
-        )
-
-    def errors(self) -> dict[int, float]:
-        """By anchors a side; the last one's is extrapolated."""
-        return _ladder(ANCHOR_LADDER, self._frames, ANCHOR_LADDER.index(_FIRST_JUDGE), self.accuracy)
-
-    def _light(self, anchors: int, half: int) -> FloatArray:
-        """(anchors, rows, anchors, columns) light of all classes at the corners of coarse cells."""
-        settings = replace(self.fine.base, anchors=anchors, linear=True)
-        simulation = Simulation(
-            self.fine.bench, settings, common=True, pixels=max(self.fine.bench.n // _RATIO_PIXELS, 1)
-        )
-        found = simulation.tracer.trace(integer(self.fine.seed, "pilot", "anchors", half), 0, _RATIO_SAMPLES)
-        light = simulation.bundle.file(found, np.zeros(self.fine.bench.n**2, dtype=np.int64))[[0]].toarray()
-        rows, columns = simulation.bundle.cells
-        return np.asarray(light).reshape(anchors, rows, anchors, columns)
-
-    def _frames(self, anchors: int) -> Halves:
-        settings = replace(self.fine.base, anchors=anchors)
-        simulation = Simulation(self.fine.bench, settings)
-        first, second = (self._half(simulation, half) for half in range(2))
+    def frames(anchors: int) -> Halves:
+        simulation = Simulation(bench, replace(base, anchors=anchors))
+        loaded = bench.loaded
+        tracer = DirectTracer(loaded.scene, loaded.camera, simulation.source, anchors, simulation.geometry)
+        halves = (tracer.trace(integer(seed, "pilot", "anchors", half), 0, _ANCHOR_SAMPLES) for half in range(2))
+        first, second = (_anchored(simulation, _shown(found, family), family) for found in halves)
         return first, second
 
-    def _half(self, simulation: Simulation, half: int) -> FloatArray:
-        anchors, bundle, found = simulation.settings.anchors, simulation.bundle, self.classes[half]
-        centre = np.broadcast_to(
-            self.centre[half], (anchors, *self.centre[half].shape[1:2], anchors, self.centre[half].shape[3])
-        )
-        ratio = np.divide(self._light(anchors, half), centre, out=np.zeros(centre.shape), where=centre > 0)
-        row, column = np.divmod(found.col, bundle.cells[1])
-        beside = self.coarse.bundle.shares(bundle.grid.rows.centre(row), bundle.grid.columns.centre(column))
-        lines, places, values = [], [], []
-        for a, b in np.ndindex(anchors, anchors):
-            scale = sum(share * ratio[a, y, b, x] for y, x, share in beside)
-            line = a * bundle.cells[0] + row
-            lines.append(found.row)
-            places.append((line * anchors + b) * bundle.cells[1] + column)
-            values.append(found.data * scale)
-        entries = np.concatenate(values), (np.concatenate(lines), np.concatenate(places))
-        light = sparse.coo_array(entries, shape=(found.shape[0], bundle.size)).tocsr()
-        rows = np.arange(self.fine.family.weights.shape[1])
-        frames = ExpectedFrames(simulation.optics, [light[: len(rows)]], rows, self.fine.family.weights, 0)
-        return np.stack([frame.irradiance for frame in frames])
+    return _ladder(ANCHOR_LADDER, frames, ANCHOR_LADDER.index(_FIRST_JUDGE), accuracy)
+
+
+def _anchored(simulation: Simulation, found: Deposits, family: _Family) -> FloatArray:
+    """(captures, pixels, pixels) frames of light that was connected to every anchor."""
+    light = simulation.coarse.file(found, family.labels, _ANCHOR_SAMPLES)
+    rows = np.arange(family.weights.shape[1])
+    frames = ExpectedFrames(simulation.coarse_optics, [light[: len(rows)]], rows, family.weights, 0)
+    return np.stack([frame.irradiance for frame in frames])
+
+
+def _shown(found: Deposits, family: _Family) -> Deposits:
+    """Only the light of projector pixels that the family's captures show."""
+    shown = (family.weights != 0).any(axis=0)
+    return found.where(np.append(shown[family.labels], True)[found.source])
 
 
 def _ladder(
@@ -315,13 +294,17 @@ def _ladder(
     return {**errors, judge: errors[before] * min(gain, 1.0)}
 
 
-def _form(simulation: Simulation, found: Deposits, samples: int, family: _Family) -> FloatArray:
-    """(captures, pixels, pixels) frames of some deposits."""
+def _form(
+    simulation: Simulation, found: Deposits, samples: int, family: _Family, other: Deposits | None = None
+) -> FloatArray:
+    """(captures, pixels, pixels) frames of some direct light, and of other light in ``_OTHER_SAMPLES``."""
     light = simulation.file(found, family.labels, samples)
+    if other is not None:
+        light = light + simulation.file_other(other, family.labels, _OTHER_SAMPLES)
     rows = np.arange(family.weights.shape[1])
     exact = simulation.mirrored(family.labels)
-    expected = simulation.expected([light], rows, family.weights, 0, exact)
-    return np.stack([frame.irradiance for frame in expected])
+    frames = simulation.expected([light], rows, family.weights, 0, exact)
+    return np.stack([frame.irradiance for frame in frames])
 
 
 def _pace(simulation: Simulation, found: Deposits, samples: int, family: _Family) -> float:
@@ -329,13 +312,14 @@ def _pace(simulation: Simulation, found: Deposits, samples: int, family: _Family
     light = simulation.file(found, family.labels, samples)
     started = time.perf_counter()
     rows = np.arange(family.weights.shape[1])
-    list(ExpectedFrames(simulation.optics, [light[: len(rows)]] * GROUPS, rows, family.weights, 0))
+    list(ExpectedFrames(simulation.optics, [light.fine[: len(rows)]] * GROUPS, rows, family.weights, 0))
     return (time.perf_counter() - started) / len(family.weights)
 
 
 def _some(weights: FloatArray, most: int) -> FloatArray:
     """Up to ``most`` captures, evenly spread over the family."""
-    return weights[np.unique(np.linspace(0, len(weights) - 1, min(len(weights), most)).astype(int))]
+    chosen: FloatArray = weights[np.unique(np.linspace(0, len(weights) - 1, min(len(weights), most)).astype(int))]
+    return chosen
 
 
 def _difference(changed: Halves, judge: Halves) -> float:

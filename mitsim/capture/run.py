@@ -17,7 +17,7 @@ from mitsim.capture.bench import Bench, load_recipe
 from mitsim.capture.clock import Clock
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
 from mitsim.capture.folder import RunFolder, claimed, frame_name
-from mitsim.capture.light import Light, Progress, collect, make_plan, silent, uniform_light
+from mitsim.capture.light import Light, Progress, collect, make_plan, silent, speckle_of, uniform_light
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import Channel
 from mitsim.core.manifest import versions
@@ -101,7 +101,7 @@ def capture(
         with clock.stage("optics"):
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
             totals = _Totals.of(expected)
-        exposer = Exposer(bench, exposure.choose(bench, totals.peak), seed)
+        exposer = Exposer(bench, exposure.choose(bench, totals.peak), seed, speckle_of(bench, plan))
         folder.begin()
         folder.write_truth(reflectance, load_recipe().board_reflectance)
         writer = _Writer(family, folder, exposer)
@@ -224,7 +224,7 @@ class _Writer:
 
     def _expose(self, item: tuple[int, tuple[Capture, Frame]]) -> _Exposed:
         index, (shown, frame) = item
-        electrons = self.exposer.electrons(frame)
+        electrons = self.exposer.lit(frame, *shown.names)
         return _Exposed(
             index=index,
             shown=shown,

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from mitsim.capture.bench import Bench, SessionRecipe
 from mitsim.capture.clock import Clock
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
-from mitsim.capture.light import Light, Progress, collect, make_plan, uniform_light
+from mitsim.capture.light import Light, Progress, collect, make_plan, speckle_of, uniform_light
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import ExpectedFrames, Frame
@@ -111,12 +111,14 @@ class Session:
 
     def _noisy(self, side: str) -> Iterator[FloatArray]:
         """Electrons a second that a user computes from the noisy frame of each capture."""
-        exposer = Exposer(self.bench, self.exposure_s, self.seed)
+        exposer = Exposer(self.bench, self.exposure_s, self.seed, speckle_of(self.bench, self.plan))
         numbered = enumerate(self._expected(side, self.weights))
 
         def shoot(item: tuple[int, Frame]) -> FloatArray:
             index, frame = item
-            return exposer.rate(exposer.digital(exposer.electrons(frame), "calibration", side, index))
+            return exposer.rate(
+                exposer.digital(exposer.lit(frame, "calibration", side, index), "calibration", side, index)
+            )
 
         done = 0
         while True:

@@ -7,8 +7,8 @@ samples the choice that the plan made.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,24 +18,56 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 from mitsim.optics.diffraction import Spectrum
-from mitsim.optics.frames import Ambient, ClassFrames, ExpectedFrames, FrameOptics
+from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
 from mitsim.scene.plan import Settings
 from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.transport.direct import DirectTracer
 from mitsim.transport.factored import Paths, Tracer
-from mitsim.transport.histogram import Bundle, Deposits
+from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
+from mitsim.transport.source import Projector
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
+_ANCHORED = 8
+"""Samples to all of the sensor for each one to every anchor: differences between anchors are small."""
 AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over this range, in so many bands."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
+
+    ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees beyond
+    that, and ``smooth`` is indirect light: small or smooth, so coarse cells hold them well.
+    """
+
+    fine: sparse.csr_array
+    coarse: sparse.csr_array
+    smooth: sparse.csr_array
+
+    def __add__(self, other: Light) -> Light:
+        return Light(self.fine + other.fine, self.coarse + other.coarse, self.smooth + other.smooth)
+
+    def __truediv__(self, count: float) -> Light:
+        return Light(self.fine / count, self.coarse / count, self.smooth / count)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A tracer, the samples of it that the plan predicted, and how its light is filed (deposits, labels, samples)."""
+
+    tracer: DirectTracer | Tracer
+    predicted: float
+    file: Callable[[Deposits, Labels, int], Light]
 
 
 class Simulation:
     """A bench with settings; its parts are prepared when they are first asked for."""
 
-    def __init__(self, bench: Bench, settings: Settings, common: bool = False, pixels: int | None = None) -> None:
-        """``common``: anchors share their random numbers; ``pixels``: cells a side of the window, instead of its own."""
-        self.bench, self.settings, self.common = bench, settings, common
+    def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None) -> None:
+        """``pixels``: cells a side of the projector's window, instead of one a pixel."""
+        self.bench, self.settings = bench, settings
         on = settings.effects
         neutral: dict[str, float] = {}
         if "mask-thickness" not in on:
@@ -46,9 +78,11 @@ class Simulation:
         self.black = bench.projector.black_level if "black-level" in on else 0.0
         pixels = pixels or bench.n
         self.aim = self._grid(pixels, 1)
-        self.bundle = Bundle(
-            self._grid(pixels, settings.subdivision), settings.anchors, settings.depths, settings.linear
-        )
+        self.bundle = Bundle(self._grid(pixels, settings.subdivision), 1, settings.depths, settings.linear)
+        depths = settings.depths if settings.coarse_layers else (settings.depth,)
+        subdivision, linear = settings.coarse_cells
+        self.coarse = Bundle(self._grid(pixels, subdivision), settings.anchors, depths, linear)
+        self.smooth = replace(self.coarse, anchors=1)
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
         windows = self.bench.windows_at(self.settings.depth)
@@ -56,58 +90,103 @@ class Simulation:
         return aligned_grid(*windows, pixels, subdivision, stop, multiple=subdivision)
 
     @cached_property
-    def tracer(self) -> Tracer:
-        """Follows the paths that the settings ask for."""
-        on, bench = self.settings.effects, self.bench
-        source = bench.source
-        if "aperture" not in on:
-            source = replace(source, aperture=0.0)
-        if "blur" not in on:
-            source = replace(source, blur=0.0)
+    def source(self) -> Projector:
+        """The projector, ideal but for the effects that are on."""
+        on, source = self.settings.effects, self.bench.source
+        source = source if "aperture" in on else replace(source, aperture=0.0)
+        return source if "blur" in on else replace(source, blur=0.0)
+
+    @cached_property
+    def direct(self) -> DirectTracer:
+        """Follows direct light from the projector to the sensor's centre, or to all of it where anchors are used."""
+        loaded, spread = self.bench.loaded, self.settings.anchors > 1
+        return DirectTracer(loaded.scene, loaded.camera, self.source, 1, self.geometry, spread)
+
+    @cached_property
+    def anchored(self) -> DirectTracer | None:
+        """The same to every anchor."""
+        loaded, anchors = self.bench.loaded, self.settings.anchors
+        return DirectTracer(loaded.scene, loaded.camera, self.source, anchors, self.geometry) if anchors > 1 else None
+
+    @cached_property
+    def other(self) -> Tracer | None:
+        """Follows all other light from the sensor's centre; none where there is none."""
+        on, loaded = self.settings.effects, self.bench.loaded
         paths = Paths(
-            mirrors="mirrors" in on,
+            mirrors="mirrors" in on and loaded.mirrors,
             interreflection="interreflection" in on,
-            emitters=bench.loaded.lamps if self.lit_by_lamps else (),
+            emitters=loaded.lamps if self.lit_by_lamps else (),
         )
-        return Tracer(
-            bench.loaded.scene,
-            bench.loaded.camera,
-            source,
-            self.aim,
-            self.settings.anchors,
-            self.settings.depth,
-            paths,
-            self.common,
-            self.geometry,
-        )
+        if paths == Paths():
+            return None
+        depth = self.settings.depth
+        return Tracer(loaded.scene, loaded.camera, self.source, self.aim, 1, depth, paths, geometry=self.geometry)
 
     @cached_property
     def optics(self) -> FrameOptics:
-        """The mask's shadow in the projector's light."""
-        return self._optics(self.bench.spectrum)
+        """The mask's shadow in the projector's light, for light filed finely."""
+        return self._optics(self.bench.spectrum, self.bundle)
+
+    @cached_property
+    def coarse_optics(self) -> FrameOptics:
+        """The same for light filed coarsely."""
+        return self._optics(self.bench.spectrum, self.coarse)
+
+    @cached_property
+    def smooth_optics(self) -> FrameOptics:
+        """The same for indirect light."""
+        return self._optics(self.bench.spectrum, self.smooth)
 
     @cached_property
     def ambient_optics(self) -> FrameOptics:
         """The mask's shadow in the light of other lamps."""
-        return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS))
+        return self._optics(_bands(*AMBIENT_NM, AMBIENT_BANDS), self.bundle)
 
-    def _optics(self, spectrum: Spectrum) -> FrameOptics:
+    def _optics(self, spectrum: Spectrum, bundle: Bundle) -> FrameOptics:
         waves = spectrum if self.waves else None
-        bundle = self.bundle
         return FrameOptics(self.geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, waves)
 
-    def file(self, found: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        """(classes + 1, places) light of every class, and ambient light [W m^-2]."""
-        return self.bundle.file(found, labels, samples)
+    @cached_property
+    def mean_weights(self) -> FloatArray:
+        """(anchors,) weight of each anchor in the mean over the sensor."""
+        edges = self.geometry.pixel_edges
+        positions = anchor_positions(self.settings.anchors, self.geometry.half_width)
+        return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
+
+    def file(self, found: Deposits, labels: Labels, samples: int) -> Light:
+        """Light of :attr:`direct`, per sample."""
+        return self._light(fine=self.bundle.file(found, labels, samples))
+
+    def file_anchored(self, found: Deposits, labels: Labels, samples: int) -> Light:
+        """Light of :attr:`anchored` beyond its mean over the sensor, per sample."""
+        mean = self.smooth.file(found.averaged(self.mean_weights), labels, samples)
+        return self._light(coarse=self.coarse.file(found, labels, samples) - self.coarse.repeated(mean))
+
+    def file_other(self, found: Deposits, labels: Labels, samples: int) -> Light:
+        """Light of :attr:`other`, per sample."""
+        indirect = found.order == INDIRECT
+        fine = self.bundle.file(found.where(~indirect), labels, samples)
+        return self._light(fine=fine, smooth=self.smooth.file(found.where(indirect), labels, samples))
+
+    def _light(self, **parts: sparse.csr_array) -> Light:
+        rows = next(iter(parts.values())).shape[0]
+        sizes = {"fine": self.bundle.size, "coarse": self.coarse.size, "smooth": self.smooth.size}
+        return Light(**{name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()})
+
+    def tracers(self) -> dict[str, Stage]:
+        """What is traced: samples a group is predicted to need, and how the light is filed, by name."""
+        settings = self.settings
+        stages = {"direct": Stage(self.direct, settings.direct_samples, self.file)}
+        if self.anchored is not None:
+            stages["anchored"] = Stage(self.anchored, settings.direct_samples / _ANCHORED, self.file_anchored)
+        if self.other is not None:
+            stages["other"] = Stage(self.other, settings.other_samples, self.file_other)
+        return stages
 
     def flux(self, found: Deposits, samples: int) -> FloatArray:
         """(n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask."""
-        edges = self.geometry.pixel_edges
-        centres = (edges[:-1] + edges[1:]) / 2
-        positions = anchor_positions(self.settings.anchors, self.geometry.half_width)
-        mean = anchor_weights(positions, centres).mean(axis=0)
-        value = found.value * mean[found.anchor_row] * mean[found.anchor_column] * (found.order == 1) / samples
-        return np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1]
+        value = found.value * (found.order == DIRECT) / samples
+        return np.asarray(np.bincount(found.source, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
     def mirrored(self, labels: Labels) -> ClassFrames | None:
         """Frames of light that comes from the projector over mirrors alone, by class; None without such light.
@@ -124,20 +203,20 @@ class Simulation:
         return "diffraction" in self.settings.effects
 
     def expected(
-        self,
-        groups: Sequence[sparse.csr_array],
-        rows: Labels,
-        weights: FloatArray,
-        seed: int,
-        exact: ClassFrames | None = None,
+        self, groups: Sequence[Light], rows: Labels, weights: FloatArray, seed: int, exact: ClassFrames | None = None
     ) -> ExpectedFrames:
-        """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' first rows to classes."""
+        """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' rows to classes."""
         first = len(rows)
         emitted = self.black + (1 - self.black) * weights
-        ambient = None
+        more, ambient = [], []
+        if self.settings.anchors > 1:
+            more.append(Filed(self.coarse_optics, tuple(group.coarse[:first] for group in groups)))
+        if "interreflection" in self.settings.effects:
+            more.append(Filed(self.smooth_optics, tuple(group.smooth[:first] for group in groups)))
         if self.lit_by_lamps:
-            ambient = Ambient(self.ambient_optics, tuple(group[first:] for group in groups))
-        return ExpectedFrames(self.optics, [group[:first] for group in groups], rows, emitted, seed, ambient, exact)
+            ambient.append(Filed(self.ambient_optics, tuple(group.fine[first:] for group in groups)))
+        direct = [group.fine[:first] for group in groups]
+        return ExpectedFrames(self.optics, direct, rows, emitted, seed, more, ambient, exact)
 
     @property
     def lit_by_lamps(self) -> bool:

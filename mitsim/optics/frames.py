@@ -1,9 +1,9 @@
 """Frames in closed form: from light per (anchor, tan-angle cell) to irradiance on every sensor pixel, and its error.
 
 A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
-distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and its
-columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that hold light enter the product: for k x k shifting dots that
-is one in k of each.
+distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and
+its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
+hold light enter the product: for k x k shifting dots that is one in k of each.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ class ClassFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class Ambient:
-    """Light that every capture holds alike: its optics, and independent estimates (1, cells) each."""
+class Filed:
+    """Independent estimates of light, (rows, cells) each, and the optics that fits the cells they are filed in."""
 
     optics: FrameOptics
     groups: tuple[sparse.csr_array, ...]
@@ -156,24 +156,26 @@ class ExpectedFrames:
         labels: IntArray,
         weights: FloatArray,
         seed: int,
-        ambient: Ambient | None = None,
+        more: Sequence[Filed] = (),
+        ambient: Sequence[Filed] = (),
         exact: ClassFrames | None = None,
     ) -> None:
         """``groups``: independent estimates of the light, (rows, cells) each; their mean is used.
 
         ``labels``: (rows,) class 0..C-1 of each row, a projector pixel or a class of them; ``weights``: (captures, C)
-        fraction of full power that each class emits; ``seed``: of the random signs; ``ambient``: light of every
-        capture, its groups paired with these; ``exact``: frames of some classes without Monte Carlo error.
+        fraction of full power that each class emits; ``seed``: of the random signs; ``more``: further
+        light of the same rows in other cells, and ``ambient``: light (1, cells) of every capture, their groups paired
+        with these; ``exact``: frames of some classes without Monte Carlo error.
         """
-        self._optics, self._groups, self._seed = optics, tuple(groups), seed
-        self._mean = _mean_of(self._groups)
+        self._lights = (Filed(optics, tuple(groups)), *more)
+        self._seed = seed
         classes, rows = weights.shape[1], labels.size
         indicator = sparse.csr_array((np.ones(rows), (labels, np.arange(rows))), shape=(classes, rows))
         self._mixed = classes <= min(_LARGEST_BASIS, len(weights))
         self._shares = np.eye(classes) if self._mixed else weights
         self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(weights) @ indicator)
         self._weights = weights
-        self._ambient, self._exact = ambient, exact
+        self._ambient, self._exact = tuple(ambient), exact
         self._formed: tuple[FloatArray, FloatArray] | None = None
         self._always: tuple[FloatArray, FloatArray] | None = None
 
@@ -199,7 +201,7 @@ class ExpectedFrames:
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) deviations of their groups."""
         chosen = self._basis[start:stop]
-        found = _formed(self._optics, chosen @ self._mean, [chosen @ group for group in self._groups], self._seed)
+        found = _formed(self._lights, chosen, self._seed)
         if self._exact is not None:
             shares = self._shares[start:stop][:, self._exact.classes]
             for frame, share in zip(found[0], shares, strict=True):
@@ -208,10 +210,9 @@ class ExpectedFrames:
         return found
 
     def _frames(self, irradiance: FloatArray, deviation: FloatArray) -> Iterator[Frame]:
-        if self._ambient is not None and self._always is None:
-            lamps = self._ambient.groups
-            self._always = _formed(self._ambient.optics, _mean_of(lamps), lamps, self._seed)
-        count = len(self._groups)
+        if self._ambient and self._always is None:
+            self._always = _formed(self._ambient, sparse.csr_array(np.ones((1, 1))), self._seed)
+        count = len(self._lights[0].groups)
         pairs = count * (count - 1)
         for frame, one in zip(irradiance, deviation, strict=True):
             if self._always is not None:
@@ -227,23 +228,25 @@ def _mean_of(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
     return sum(groups[1:], groups[0]) / len(groups)
 
 
-def _formed(
-    optics: FrameOptics, light: sparse.csr_array, parts: Sequence[sparse.csr_array], seed: int
-) -> tuple[FloatArray, FloatArray]:
-    """Frames (b, pixels, pixels) of each row of ``light``, and the deviations of its groups ``parts``, as signs see them."""
-    pixels, groups = optics.pixels, len(parts)
+def _formed(lights: Sequence[Filed], basis: sparse.csr_array, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and deviations of the groups as signs see them."""
+    pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
     probes = _probes(pixels, seed)
-    frames = np.empty((light.shape[0], pixels, pixels))
-    deviations = np.zeros((light.shape[0], pixels * groups * probes.shape[1] if groups > 1 else 1))
+    mixed = [(light.optics, [basis @ group for group in light.groups]) for light in lights]
+    means = [_mean_of(parts) for _, parts in mixed]
+    frames = np.zeros((basis.shape[0], pixels, pixels))
+    deviations = np.zeros((basis.shape[0], pixels * groups * probes.shape[1] if groups > 1 else 1))
 
     def form(row: int) -> None:
-        flat, mean = _row(light, row)
-        frames[row] = optics.frame(flat, mean)
-        if groups > 1:
-            probed = optics.probe(flat, _aligned(flat, [_row(part, row) for part in parts]), probes)
-            deviations[row] = (probed - np.tile(frames[row] @ probes, groups)).ravel()
+        for (optics, parts), light in zip(mixed, means, strict=True):
+            flat, mean = _row(light, row)
+            frame = optics.frame(flat, mean)
+            frames[row] += frame
+            if groups > 1:
+                probed = optics.probe(flat, _aligned(flat, [_row(part, row) for part in parts]), probes)
+                deviations[row] += (probed - np.tile(frame @ probes, groups)).ravel()
 
-    in_threads(form, range(light.shape[0]))
+    in_threads(form, range(basis.shape[0]))
     return frames, deviations
 
 

@@ -25,7 +25,10 @@ _NUMBERS = (
     *("translate", "scale", "rotate", "lookat", "matrix"),
 )
 _LIGHT = ("spectrum", "rgb")
-_REFLECTANCES = ("reflectance", "diffuse_reflectance", "albedo", "base_color")
+_REFLECTANCES = (
+    *("reflectance", "diffuse_reflectance", "albedo", "base_color"),
+    *("specular_reflectance", "specular_transmittance"),
+)
 
 
 def check_file(path: Path, defines: Mapping[str, str]) -> None:

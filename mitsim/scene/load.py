@@ -23,8 +23,8 @@ class LoadedScene:
     """A scene ready for transport.
 
     ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
-    pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all other
-    emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions.
+    pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
+    other emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions.
     """
 
     path: Path
@@ -54,7 +54,8 @@ def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_proje
     defines = dict(defines or {})
     check_file(path, defines)
     try:
-        scene = mi.load_file(str(path), parallel=False, **defines)
+        # Without optimize, for that merges rectangles of one material into a mesh that has lost their boxes and names.
+        scene = mi.load_file(str(path), parallel=False, optimize=False, **defines)
     except MitsimError:
         raise
     except (RuntimeError, ValueError, TypeError, KeyError) as error:

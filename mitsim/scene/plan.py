@@ -1,15 +1,15 @@
 """The effect plan: from measured evidence and an accuracy to what is simulated, why, and what it costs.
 
-Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels. An effect is
-simulated when leaving it out would change the frames by more than that. Discretisations of effects that are on (how many
-anchors, layers, cells) each take a part of the budget, and sampling gets what is left of its square.
+Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels. An effect
+is simulated when leaving it out would change the frames by more than that. Discretisations of effects that are on (how
+many anchors, layers, cells) each take a part of the budget, and sampling gets what is left of its square.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from mitsim.core.errors import MitsimError
@@ -23,9 +23,15 @@ PHYSICAL = (
 """Effects that are simulated or not; ``anchors`` and ``layers`` are effects with a number."""
 SWITCHES = ("anchors", "layers", *PHYSICAL)
 _RESIDUAL = 0.5
-_FLOOR = 0.3
+_FLOOR = 0.7
+"""Sampling may always take this part of the accuracy, however much of it the rest has spent."""
 _SAMPLING_MARGIN = 0.95
-_FEWEST_SAMPLES = 1.0
+_FLAGGED = 1.5
+"""Every effect is held to the accuracy by itself; their sum is reported, and flagged above this much of it."""
+_FEWEST_SAMPLES = 1e-3
+_COARSE = 0.4
+_OF_OTHER = frozenset({"interreflection", "ambient", "mirrors"})
+"""Effects whose light is followed from the camera."""
 GROUPS = 8
 """Independent estimates of the light, whose spread tells the Monte Carlo error."""
 
@@ -57,6 +63,11 @@ class Settings:
         cells a side of a projector pixel, and whether light is split between their corners.
     effects
         those of :data:`PHYSICAL` that are simulated.
+    direct_samples, other_samples
+        samples a projector pixel of direct light, and a cell of all other light, that each group is predicted to need.
+    coarse_cells, coarse_layers
+        cells for what anchors see beyond their mean, and for indirect light: like ``subdivision`` and ``linear``, and
+        whether they have all layers or one.
     """
 
     depth: float
@@ -65,6 +76,10 @@ class Settings:
     subdivision: int = 1
     linear: bool = False
     effects: frozenset[str] = frozenset()
+    direct_samples: float = 1.0
+    other_samples: float = 1.0
+    coarse_cells: tuple[int, bool] = (1, False)
+    coarse_layers: bool = False
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -117,13 +132,13 @@ class Evidence:
     effect_error
         error of leaving out each effect of :data:`PHYSICAL` that the scene or its devices have.
     noise
-        of one estimate: of direct light, and of all other light.
-    cells
-        paths of one sample with one anchor.
-    seconds_per_path, seconds_per_bounced
-        pace of the tracer, without and with interreflection.
+        of one estimate, relative to all light: of direct light, and of all other light.
+    pixels, cells
+        connections of one sample of direct light with one anchor, and paths of one sample of other light.
+    seconds_per_connection, seconds_per_path
+        pace of the two.
     seconds_per_frame
-        of forming a frame with one anchor, one layer and a geometric shadow.
+        of forming a frame with one anchor, one layer, a geometric shadow and a cell a projector pixel.
     terms
         terms of the shadow, wave-optical over geometric.
     """
@@ -135,9 +150,10 @@ class Evidence:
     cell_error: Mapping[tuple[int, bool], float]
     effect_error: Mapping[str, float]
     noise: tuple[Noise, Noise]
+    pixels: int
     cells: int
+    seconds_per_connection: float
     seconds_per_path: float
-    seconds_per_bounced: float
     seconds_per_frame: float
     terms: float
     seconds: float
@@ -200,15 +216,19 @@ def decide(
         linear=cells[1],
         effects=on,
     )
+    coarse = _coarse(evidence, settings, accuracy)
+    settings = replace(settings, coarse_cells=coarse.cells, coarse_layers=coarse.layers)
     left_out = {name: error for name, error in evidence.effect_error.items() if name not in on}
     left = math.hypot(
         evidence.anchor_error[anchors],
         evidence.layer_error[layers],
         evidence.cell_error[cells],
+        coarse.error,
         *left_out.values(),
     )
     target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - left**2, (_FLOOR * accuracy) ** 2))
     cost = _Cost(evidence, settings, captures, target)
+    settings = replace(settings, direct_samples=cost.direct_samples, other_samples=cost.other_samples)
     effects = (
         _anchors(anchors, evidence, accuracy, cost),
         _layers(layers, evidence, accuracy, cost),
@@ -227,38 +247,72 @@ def decide(
     )
 
 
+@dataclass(frozen=True)
+class _Coarse:
+    """Cells and layers of the light that is small or smooth, and the error that they and one anchor for it leave."""
+
+    cells: tuple[int, bool]
+    layers: bool
+    error: float
+
+
+def _coarse(evidence: Evidence, settings: Settings, accuracy: float) -> _Coarse:
+    """The coarsest choice that fits: its error counts only for the part of the light that is filed in it."""
+    part = evidence.anchor_error[1] if settings.anchors > 1 else 0.0
+    # What is followed from the camera is seen from the sensor's centre alone.
+    seen = sum(evidence.effect_error.get(name, 0.0) for name in settings.effects & {"interreflection", "ambient"})
+    centre = min(seen, 1.0) * evidence.anchor_error[1]
+    if "interreflection" in settings.effects:
+        part = math.hypot(part, evidence.effect_error["interreflection"])
+    count = len(settings.depths)
+    choices = [
+        _Coarse(cells, layers, part * math.hypot(error, evidence.layer_error[count if layers else 1]))
+        for cells, error in evidence.cell_error.items()
+        for layers in ((False, True) if count > 1 else (False,))
+    ]
+    best = min(choices, key=lambda choice: choice.error)
+    chosen = next((one for one in choices if one.error <= _COARSE * accuracy), best)
+    return replace(chosen, error=math.hypot(centre, chosen.error))
+
+
 class _Cost:
     """Seconds of a capture with some settings, by the paces that the pilot measured."""
 
     def __init__(self, evidence: Evidence, settings: Settings, captures: int, target: float) -> None:
         self.evidence, self.settings, self.captures = evidence, settings, captures
         single = target * math.sqrt(GROUPS)
-        noisy = evidence.noise if settings.effects & {"interreflection", "ambient"} else evidence.noise[:1]
-        # Every anchor's paths help: a pixel's light is interpolated between them.
-        needed = max(noise.samples_for(single / math.sqrt(len(noisy))) for noise in noisy)
-        self.samples = max(_FEWEST_SAMPLES, needed / settings.anchors**2)
+        self.other = bool(settings.effects & _OF_OTHER)
+        direct, other = (0.5, 0.85) if self.other else (1.0, 0.0)
+        self.direct_samples = max(1.0, evidence.noise[0].samples_for(single * direct))
+        self.other_samples = max(1.0, evidence.noise[1].samples_for(single * other)) if self.other else 0.0
 
     @property
     def total(self) -> float:
-        return self.tracing(self.settings.anchors, self.bounced) + self.forming(
-            self.settings.anchors, len(self.settings.depths), "diffraction" in self.settings.effects
+        waves = "diffraction" in self.settings.effects
+        return (
+            self.direct(self.settings.anchors)
+            + self.followed
+            + self.forming(self.settings.anchors, len(self.settings.depths), waves)
         )
 
     @property
-    def bounced(self) -> bool:
-        return "interreflection" in self.settings.effects
+    def followed(self) -> float:
+        return GROUPS * self.other_samples * self.evidence.cells * self.evidence.seconds_per_path
 
-    def tracing(self, anchors: int, bounced: bool) -> float:
-        pace = self.evidence.seconds_per_bounced if bounced else self.evidence.seconds_per_path
-        return GROUPS * self.samples * anchors**2 * self.evidence.cells * pace
+    def direct(self, anchors: int) -> float:
+        connections = 1 + (anchors**2 / 8 if anchors > 1 else 0)
+        return GROUPS * self.direct_samples * connections * self.evidence.pixels * self.evidence.seconds_per_connection
 
     def forming(self, anchors: int, layers: int, waves: bool) -> float:
         terms = self.evidence.terms if waves else 1.0
-        return self.captures * anchors * layers * terms * self.evidence.seconds_per_frame
+        fine = layers * self.settings.subdivision**2
+        coarse = (layers if self.settings.coarse_layers else 1) * self.settings.coarse_cells[0] ** 2
+        parts = (anchors**2 if anchors > 1 else 0) + ("interreflection" in self.settings.effects)
+        return self.captures * terms * self.evidence.seconds_per_frame * (fine + parts * coarse)
 
 
 def _count(errors: Mapping[int, float], accuracy: float, forced: bool | None) -> int:
-    """One when that is good enough, else the fewest that leave a part of the accuracy (the most known, failing that)."""
+    """One if that is good enough, else the fewest that leave a part of the accuracy (failing that, the most known)."""
     if forced is False or (forced is None and errors[1] <= accuracy):
         return 1
     several = [count for count in sorted(errors) if count > 1]
@@ -271,7 +325,9 @@ def _anchors(anchors: int, evidence: Evidence, accuracy: float, cost: _Cost) -> 
         reason = f"falloff, gloss and parallax over the sensor: one anchor leaves {errors[1]:.1e}"
         return Effect("anchors", "off", f"{reason} of {accuracy:g} allowed", errors[1], 0.0)
     reason = f"falloff, gloss and parallax: {anchors}x{anchors} anchors leave {errors[anchors]:.1e}"
-    seconds = cost.tracing(anchors, cost.bounced) * (1 - 1 / anchors**2)
+    waves, layers = "diffraction" in cost.settings.effects, len(cost.settings.depths)
+    seconds = cost.direct(anchors) - cost.direct(1)
+    seconds += cost.forming(anchors, layers, waves) - cost.forming(1, layers, waves)
     return Effect("anchors", "approximate", reason, errors[1], seconds)
 
 
@@ -319,8 +375,8 @@ def _physical(
 
 def _seconds(name: str, cost: _Cost) -> float:
     anchors, layers = cost.settings.anchors, len(cost.settings.depths)
-    if name == "interreflection":
-        return max(cost.tracing(anchors, True) - cost.tracing(anchors, False), 0.0)
+    if name in _OF_OTHER:
+        return cost.followed
     if name == "diffraction":
         return cost.forming(anchors, layers, True) - cost.forming(anchors, layers, False)
     return 0.0
@@ -350,7 +406,7 @@ def _warnings(
     layers: int,
     cells: tuple[int, bool],
 ) -> tuple[str, ...]:
-    if left <= accuracy:
+    if left <= _FLAGGED * accuracy:
         return ()
     parts = {
         f"{anchors}x{anchors} anchors": evidence.anchor_error[anchors],

@@ -12,6 +12,7 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.light import Light
+from mitsim.capture.simulation import Light as Estimate
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.shadow import Directions
 from mitsim.scene.plan import Settings
@@ -33,7 +34,12 @@ def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Lig
     places = (row + first[0]) * grid.columns.count + column + first[1]
     flux = reflectance.ravel() * board_flux
     light = sparse.csr_array((flux, (pixels, places)), shape=(bench.n**2 + 1, simulation.bundle.size))
-    return Light((light,), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True)
+    coarse, smooth = (
+        sparse.csr_array((bench.n**2 + 1, which.size)) for which in (simulation.coarse, simulation.smooth)
+    )
+    return Light(
+        (Estimate(light, coarse, smooth),), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True
+    )
 
 
 def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -> tuple[FloatArray, FloatArray]:

@@ -1,7 +1,7 @@
 """From paths to light per cell: deposits in, a sparse matrix out, light[row, layer x (anchor, cell) x (anchor, cell)].
 
-A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the last
-row. A path's light is split between the two layers (in 1/z) that enclose its depth, and filed either in the cell
+A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the
+last row. A path's light is split between the two layers (in 1/z) that enclose its depth, and filed either in the cell
 that holds its direction (``linear`` off: right when cells and projector pixels coincide) or between the four nearest
 cell corners, so that its direction is kept to first order (``linear`` on).
 """
@@ -9,7 +9,7 @@ cell corners, so that its direction is kept to first order (``linear`` on).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,8 @@ from mitsim.transport.cells import CellAxis, CellGrid
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+AMBIENT, DIRECT, INDIRECT = 0, 1, 2
+"""Kinds of light, the ``order`` of a deposit."""
 Bins = list[tuple[IntArray, FloatArray]]
 
 
@@ -40,7 +42,7 @@ class Deposits:
     value
         (m,) irradiance [W m^-2].
     order
-        (m,) surfaces that scattered the light, mirrors not counted: 1 is direct light.
+        (m,) 1 for direct light of the projector, 2 for its indirect light, 0 for ambient light.
     """
 
     source: IntArray
@@ -56,6 +58,18 @@ class Deposits:
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
         """All parts in one."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+    @classmethod
+    def none(cls) -> Deposits:
+        """No light at all."""
+        index, number = np.zeros(0, dtype=np.int64), np.zeros(0)
+        return cls(index, index, index, number, number, number, number, np.zeros(0, dtype=np.int16))
+
+    def averaged(self, weights: FloatArray) -> Deposits:
+        """Light of one anchor: the mean over all of them, with ``weights`` (anchors,) along rows and columns."""
+        none = np.zeros_like(self.source)
+        value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
+        return replace(self, anchor_row=none, anchor_column=none, value=value)
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> Deposits:
         """The chosen entries."""
@@ -125,6 +139,20 @@ class Bundle:
             for y, in_row in self._bins(self.grid.rows, row)
             for x, in_column in self._bins(self.grid.columns, column)
         ]
+
+    def repeated(self, light: sparse.csr_array) -> sparse.csr_array:
+        """Light that was filed with one anchor, (rows, size / anchors^2), as if every anchor saw it."""
+        found = light.tocoo()
+        height, width = self.cells
+        layer, place = np.divmod(found.col.astype(np.int64), height * width)
+        row, column = np.divmod(place, width)
+        places = [
+            ((layer * self.anchors + a) * height + row) * self.anchors * width + b * width + column
+            for a, b in np.ndindex(self.anchors, self.anchors)
+        ]
+        copies = self.anchors**2
+        entries = np.tile(found.data, copies), (np.tile(found.row, copies), np.concatenate(places))
+        return sparse.coo_array(entries, shape=(light.shape[0], self.size)).tocsr()
 
     @staticmethod
     def _inside(axis: CellAxis, tau: FloatArray) -> npt.NDArray[np.bool_]:

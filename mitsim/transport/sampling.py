@@ -50,3 +50,13 @@ def _scrambled(bits: Any, seed: Any) -> Any:
 def _unit(bits: Any) -> Any:
     """[0, 1) from the upper 24 bits, all that a float32 holds."""
     return mi.Float(bits >> 8) * (1 / 2**24)
+
+
+def panchromatic(radiance: Any) -> Any:
+    """One number for a spectrum, by a flat response: the mean over channels, or over wavelength 360-830 nm.
+
+    In spectral variants the radiance has been divided by the density of its sampled wavelengths, so the mean over
+    samples is an integral; dividing by the range makes a flat spectrum of 1 count as 1, as in the other variants.
+    """
+    mean = dr.mean(radiance)
+    return mean / (mi.MI_CIE_MAX - mi.MI_CIE_MIN) if mi.is_spectral else mean
