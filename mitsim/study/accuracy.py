@@ -33,7 +33,7 @@ from mitsim.core.manifest import prepare_output, versions, write_json
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.scene.plan import Evidence, Plan, Settings, decide
 from mitsim.study import plots
-from mitsim.study.knobs import Variant, rounds, variants, without
+from mitsim.study.knobs import Variant, at_once, sampled, variants, without
 from mitsim.study.metrics import relative_error
 from mitsim.study.solver_cost import SolverRow, solver_costs
 
@@ -43,6 +43,7 @@ SAMPLES = (16, 64, 256)
 QUOTED = 1e-3
 PATIENCE = 10.0
 _JUDGE_MARGIN = 3.0
+_EFFECT_SAMPLES = 8
 _NOT_IN_REFERENCE = frozenset({"diffraction", "black-level", "mask-thickness"})
 _SERIES = {
     "accuracy": "plan at an accuracy",
@@ -219,6 +220,8 @@ class _Study:
             subdivision=4,
             linear=True,
             effects=frozenset(pilot.applicable(self.bench)),
+            coarse_cells=(4, True),
+            coarse_layers=True,
         )
         return replace(plan, settings=settings, sampling_target=plan.accuracy / _JUDGE_MARGIN)
 
@@ -240,7 +243,8 @@ class _Study:
     def _timed(self, variant: Variant) -> tuple[float, FloatArray, float]:
         """Seconds, frames and Monte Carlo error; one sample beforehand compiles the kernels."""
         bench, plan = variant.bench, variant.plan
-        collect(bench, plan, self.labels, self.weights, self.seed, by_pixel=False, target=rounds(0))
+        once = replace(plan, settings=sampled(plan.settings, 1))
+        collect(bench, once, self.labels, self.weights, self.seed, by_pixel=False, target=at_once)
         started = time.perf_counter()
         light = collect(
             bench, plan, self.labels, self.weights, self.seed, self.progress, by_pixel=False, target=variant.target
@@ -251,10 +255,10 @@ class _Study:
     def _effects(self, names: frozenset[str]) -> Iterator[EffectRow]:
         """Each effect that the scene has, switched off; as many samples with and without, so that noise cancels."""
         plan = self.plans[QUOTED]
-        full = replace(plan, settings=replace(plan.settings, effects=names))
-        seconds, frames, _ = self._timed(Variant("effects", "all", self.bench, full, rounds(1)))
+        full = replace(plan, settings=replace(sampled(plan.settings, _EFFECT_SAMPLES), effects=names))
+        seconds, frames, _ = self._timed(Variant("effects", "all", self.bench, full, at_once))
         for name, settings in without(full.settings, names):
-            changed = Variant("effects", f"no {name}", self.bench, replace(full, settings=settings), rounds(1))
+            changed = Variant("effects", f"no {name}", self.bench, replace(full, settings=settings), at_once)
             less, other, _ = self._timed(changed)
             yield EffectRow(name, relative_error(other, frames), seconds - less)
 

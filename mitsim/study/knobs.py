@@ -15,7 +15,7 @@ ANCHORS = (1, 2, 3, 5)
 LAYERS = (1, 2, 4, 8)
 LINE_WIDTH_NM = 2.0
 """Assumed width of a laser diode's line, for the finer spectrum."""
-_GROWTH = 8
+SAMPLES = (1, 8, 64)
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,14 @@ class Variant:
     target: Target | None = None
 
 
-def rounds(count: int) -> Target:
-    """A target that is met after 8^count samples a cell in each group, whatever the error."""
-    left = [count]
+def at_once(_: ExpectedFrames) -> float:
+    """A target that any error meets: sampling stops after its first round, half of what the settings predict."""
+    return float("inf")
 
-    def target(_: ExpectedFrames) -> float:
-        left[0] -= 1
-        return float("inf") if left[0] < 0 else 1e-30
 
-    return target
+def sampled(settings: Settings, samples: int) -> Settings:
+    """Settings under which the first round takes so many samples of a projector pixel and of a cell in each group."""
+    return replace(settings, direct_samples=2.0 * samples, other_samples=2.0 * samples)
 
 
 def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Iterator[Variant]:
@@ -50,17 +49,16 @@ def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> I
     def changed(knob: str, setting: str, settings: Settings) -> Variant:
         return Variant(knob, setting, bench, replace(plan, settings=settings))
 
-    for power in range(3):
-        samples = GROUPS * _GROWTH**power
-        if _seconds(now, evidence, samples) <= patience:
-            yield Variant("samples", f"{samples} samples a cell", bench, plan, rounds(power))
+    for samples in SAMPLES:
+        fixed = sampled(now, samples)
+        if _seconds(fixed, evidence) <= patience:
+            yield Variant("samples", f"{GROUPS * samples} samples", bench, replace(plan, settings=fixed), at_once)
     for subdivision, linear in CELLS:
         name = f"{subdivision}x{subdivision} a pixel, {'split' if linear else 'even'}"
         yield changed("cells", name, replace(now, subdivision=subdivision, linear=linear))
     for anchors in ANCHORS:
-        # As many paths as the plan's: a pixel's light is interpolated between the anchors.
         settings = replace(now, anchors=anchors)
-        if _seconds(settings, evidence, GROUPS) <= patience:
+        if _seconds(settings, evidence) <= patience:
             yield changed("anchors", f"{anchors}x{anchors}", settings)
     for layers in LAYERS:
         if layers in evidence.layers and (layers > 1 or len(evidence.layers) > 1):
@@ -68,7 +66,7 @@ def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> I
             yield changed("layers", str(layers), replace(now, layers=depths))
     yield changed("bounces", "one reflection", replace(now, effects=now.effects - {"interreflection"}))
     bounced = replace(now, effects=now.effects | {"interreflection"})
-    if _seconds(bounced, evidence, GROUPS) <= patience:
+    if _seconds(bounced, evidence) <= patience:
         yield changed("bounces", "all, roulette", bounced)
     yield from (Variant("wavelengths", name, lit, plan) for name, lit in _spectra(bench))
 
@@ -99,7 +97,10 @@ def _spectra(bench: Bench) -> Iterator[tuple[str, Bench]]:
         yield name, replace(bench, projector=model.model_copy(update=changes))
 
 
-def _seconds(settings: Settings, evidence: Evidence, samples: int) -> float:
-    """Tracing so many samples of every cell and anchor, by the pilot's pace."""
-    pace = evidence.seconds_per_bounced if "interreflection" in settings.effects else evidence.seconds_per_path
-    return samples * settings.anchors**2 * evidence.cells * pace
+def _seconds(settings: Settings, evidence: Evidence) -> float:
+    """Tracing the samples that the settings predict, at the pilot's pace."""
+    connections = settings.direct_samples * evidence.pixels * (1 + settings.anchors**2 / 8)
+    seconds = connections * evidence.seconds_per_connection
+    if settings.effects & {"interreflection", "ambient", "mirrors"}:
+        seconds += settings.other_samples * evidence.cells * evidence.seconds_per_path
+    return GROUPS * seconds

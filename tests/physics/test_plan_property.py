@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 PATTERNS, CAPTURES = "dots:7", 4
 PLANNED, MEASURED = 0, 4711
 UNDECIDED, FEW = 0.25, 2
-QUICK, CAREFUL = Effort(effects=1, anchors=6, layers=5), Effort(effects=4, anchors=24, layers=8)
+QUICK, CAREFUL = Effort(direct=16, other=2, layers=5), Effort(direct=32, other=8, layers=12)
 SCENES = (
     *("photograph", "corner", "cards", "colour_chart", "compact_disc", "cookie_bag", "gift_card", "keystone"),
     *("lamp_bench", "metal_blade", "mirror", "resolution_target"),

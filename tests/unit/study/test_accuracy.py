@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.light import collect, make_plan, silent
+from mitsim.scene.plan import GROUPS
 from mitsim.study import accuracy, plots
 from mitsim.study.accuracy import AccuracyStudy, study_accuracy
-from mitsim.study.knobs import rounds, variants, without
+from mitsim.study.knobs import at_once, sampled, variants, without
 from mitsim.study.solver_cost import make_problem, solver_costs
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -101,7 +103,14 @@ def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
     labels, weights = bench.family(PATTERNS).classes()
     plan = make_plan(bench, labels, weights, 1e-3, SEED)
     evidence = pilot.measure(bench, labels, weights, 1e-3, SEED)
-    turned = {"cells": {"subdivision", "linear"}, "anchors": {"anchors"}, "bounces": {"effects"}, "layers": {"layers"}}
+    samples = {"direct_samples", "other_samples"}
+    turned = {
+        "samples": samples,
+        "cells": {"subdivision", "linear"},
+        "anchors": {"anchors"},
+        "bounces": {"effects"},
+        "layers": {"layers"},
+    }
     for variant in variants(bench, plan, evidence, 100.0):
         now, then = plan.settings, variant.plan.settings
         differ = {name for name in now.__dataclass_fields__ if getattr(now, name) != getattr(then, name)}
@@ -110,11 +119,13 @@ def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
         assert variant.bench.spectrum.weights.sum() == pytest.approx(1)
 
 
-def test_rounds_fix_the_number_of_samples(bench: Bench) -> None:
+def test_sampled_fixes_the_number_of_samples(bench: Bench) -> None:
     labels, weights = bench.family(PATTERNS).classes()
     plan = make_plan(bench, labels, weights, 1e-3, SEED)
-    counts = [collect(bench, plan, labels, weights, 0, target=rounds(count)).paths for count in range(3)]
-    assert counts[1] == 8 * counts[0] and counts[2] == 64 * counts[0]
+    plan = replace(plan, settings=replace(plan.settings, anchors=1, effects=frozenset()))
+    for samples in (1, 8):
+        fixed = replace(plan, settings=sampled(plan.settings, samples))
+        assert collect(bench, fixed, labels, weights, 0, target=at_once).paths == GROUPS * samples * bench.n**2
 
 
 def test_without_names_each_effect_once(bench: Bench) -> None:
