@@ -41,7 +41,7 @@ _INTERPLAY = 0.05
 
 @dataclass(frozen=True)
 class Effort:
-    """Samples of one group, a projector pixel of direct light and a cell of other light; layers where there is depth."""
+    """Samples of one group, a projector pixel of direct light and a cell of other light; layers for depth."""
 
     direct: int
     other: int
