@@ -220,7 +220,7 @@ class _Study:
             subdivision=4,
             linear=True,
             effects=frozenset(pilot.applicable(self.bench)),
-            coarse_cells=(4, True),
+            coarse_cells=(2, True),
             coarse_layers=True,
         )
         return replace(plan, settings=settings, sampling_target=plan.accuracy / _JUDGE_MARGIN)

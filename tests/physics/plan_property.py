@@ -177,9 +177,12 @@ class _Look:
 
     def _all_lit(self, simulation: Simulation, seed: int) -> np.ndarray:
         """(pixels, pixels) frame of every projector pixel lit, from two samples, whose noise all pixels average."""
-        found = simulation.direct.trace(integer(seed, "direct"), 0, 2)
-        light = simulation.file(found, np.zeros_like(self.labels), 2).fine
-        return np.asarray(_products_of(simulation.optics, light[[0]])[0])
+        one = np.zeros_like(self.labels)
+        light = simulation.file(simulation.direct.trace(integer(seed, "direct"), 0, 2), one, 2)
+        if simulation.other is not None:
+            light += simulation.file_other(simulation.other.trace(integer(seed, "other"), 0, 2), one, 2)
+        frames = _products_of(simulation.optics, light.fine[[0]])
+        return np.asarray((frames + _products_of(simulation.smooth_optics, light.smooth[[0]]))[0])
 
 
 def _products_of(optics: FrameOptics, light: sparse.csr_array) -> np.ndarray:
