@@ -118,7 +118,13 @@ def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path) -> N
         assert {"estimator", "setting", "seconds", "error", "mc_error"} <= row.keys()
         assert row["estimator"] in ("factored", "reference") and isinstance(row["setting"], str)
         assert number(row["seconds"], 1e-6) and number(row["error"], 1e-9) and number(row["mc_error"], 1e-9)
+        assert isinstance(row["knob"], str) and isinstance(row["on_front"], bool)
     assert {row["estimator"] for row in study["rows"]} == {"factored", "reference"}
+    assert study["effects"] and all({"name", "error_if_off", "seconds"} <= effect.keys() for effect in study["effects"])
+    assert study["solver"] and number(study["sensor_noise"], 1e-6, 1)
+    assert {"mc_error", "systematic_error", "seconds", "seed"} <= study["judge"].keys()
+    written = {path.name for path in (tmp_path / "study").iterdir()}
+    assert written == {"accuracy.json", "accuracy.png", "effects.png", "solver.png"}
 
 
 def test_study_diffraction(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
