@@ -92,7 +92,7 @@ def capture(
     with claimed(Path(output), digest, configuration, resume) as folder:
         with clock.stage("plan"):
             plan = make_plan(bench, labels, weights, accuracy, seed, effects)
-        target = _NoiseTarget(bench, exposure, noise_fraction, seed) if noise_fraction is not None else None
+        target = NoiseTarget(bench, exposure, noise_fraction, seed) if noise_fraction is not None else None
         with clock.stage("transport"):
             light = collect(bench, plan, labels, weights, seed, progress, by_pixel=False, target=target)
         with clock.stage("truth"):
@@ -125,7 +125,7 @@ def capture(
 
 
 @dataclass(frozen=True)
-class _NoiseTarget:
+class NoiseTarget:
     """Monte Carlo error at which more sampling buys nothing: a part of the sensor's own relative noise."""
 
     bench: Bench
