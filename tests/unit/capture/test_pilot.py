@@ -1,0 +1,178 @@
+"""The pilot's predictions come true: what it says that leaving something out changes is what careful runs find.
+
+The scene calls for everything at once: a sensor of 24 mm near a ball and a corner, under a sky. Each prediction is held
+against frames of many more samples; the pilot sees a few, so a factor of 1.5 either way is its promise here.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture import pilot
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.simulation import Simulation
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
+from mitsim.scene.patterns import parse_patterns
+from mitsim.scene.plan import PHYSICAL, Evidence, Settings
+
+pytestmark = pytest.mark.usefixtures("variant")
+N = 16
+SHOWN = [0, 5, 10, 15]  # the captures of dots:4 that the pilot looks at: evenly spread
+EXTRA = """<emitter type="constant"><spectrum name="radiance" value="0.02"/></emitter>
+    <shape type="sphere"><point name="center" x="-25" y="10" z="330"/> <float name="radius" value="30"/>
+        <bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></bsdf></shape>
+    <shape type="rectangle"><transform name="to_world"><scale x="60" y="60"/><rotate y="1" angle="90"/>
+        <translate x="-50" z="350"/></transform>
+        <bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></bsdf></shape>"""
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    print_ = np.random.default_rng(4).integers(20, 256, (48, 48))
+    return open_bench(
+        shared_scene("pilot", reflectance=print_, extra=EXTRA, pitch=0.375, mask_feature=0.3),
+        variant,
+        check_camera=False,
+    )
+
+
+def measured(bench: Bench, seed: int, accuracy: float = 1e-3) -> Evidence:
+    return pilot.measure(bench, *parse_patterns("dots:4", N).classes(), accuracy, seed)
+
+
+@pytest.fixture(scope="module")
+def evidence(bench: Bench) -> Evidence:
+    return measured(bench, seed=3)
+
+
+def frames(bench: Bench, settings: Settings, direct: int = 64, other: int = 24) -> np.ndarray:
+    """(4, pixels, pixels) of the captures that the pilot looks at, from many samples."""
+    labels, weights = parse_patterns("dots:4", N).classes()
+    made, counts = Simulation(bench, settings), {"direct": direct, "anchored": direct // 4, "other": other}
+    parts = [
+        stage.file(stage.tracer.trace(integer(77, name), 0, counts[name]), labels, counts[name])
+        for name, stage in made.tracers().items()
+    ]
+    light = sum(parts[1:], parts[0])
+    expected = made.expected([light], np.arange(16), weights[SHOWN], 0, made.mirrored(labels))
+    return np.stack([frame.irradiance for frame in expected])
+
+
+def change(one: np.ndarray, judge: np.ndarray) -> float:
+    return float(np.linalg.norm(one - judge) / np.linalg.norm(judge))
+
+
+def promised(found: float, actual: float) -> bool:
+    return 1 / 1.5 < found / actual < 1.5
+
+
+def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
+    assert set(evidence.effect_error) == {"interreflection", "ambient", "diffraction", "black-level", "speckle"} & set(
+        pilot.applicable(bench)
+    )
+    assert set(evidence.effect_error) <= set(PHYSICAL)
+    assert {1, 2, 3, 5} <= set(evidence.anchor_error) <= set(pilot.ANCHOR_LADDER)
+    assert {1, 2, 3, 4} <= set(evidence.layer_error) <= set(pilot.LAYER_LADDER)
+    assert set(evidence.cell_error) == set(pilot.CELL_CHOICES)
+    for errors in (evidence.anchor_error, evidence.layer_error):
+        assert all(value >= 0 for value in errors.values()) and errors[1] > errors[max(errors)]
+    for pace in (evidence.seconds_per_connection, evidence.seconds_per_path, evidence.seconds_per_frame):
+        assert 0 < pace < evidence.seconds
+    assert evidence.pixels == N * N and evidence.terms == len(bench.spectrum.weights)
+
+
+def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
+    """The light is seen from the ball's top (300 mm) to the sheet (400 mm); layers are equidistant in 1/z."""
+    assert 330 < evidence.depth < 400
+    assert evidence.layers[1] == (evidence.depth,)
+    for count, depths in evidence.layers.items():
+        if count > 1:
+            assert len(depths) == count and depths[0] == pytest.approx(400, rel=1e-3)
+            assert 299 < depths[-1] < 320
+            assert np.diff(1 / np.array(depths), 2) == pytest.approx(np.zeros(count - 2), abs=1e-9)
+
+
+@pytest.mark.parametrize("effect", ["interreflection", "ambient"])
+def test_effects_come_true(bench: Bench, evidence: Evidence, effect: str) -> None:
+    names = frozenset(pilot.applicable(bench)) - {"speckle"}
+    full = Settings(depth=evidence.depth, linear=True, effects=names)
+    judge = frames(bench, full)
+    actual = change(frames(bench, replace(full, effects=names - {effect})), judge)
+    assert actual > 5e-3, "the scene has to call for it"
+    assert promised(evidence.effect_error[effect], actual)
+
+
+def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
+    base = Settings(depth=evidence.depth, coarse_cells=(2, True), linear=True, subdivision=2)
+    judge = frames(bench, replace(base, anchors=5), 256)
+    actual = change(frames(bench, base, 256), judge)
+    assert actual > 2e-3
+    assert promised(evidence.anchor_error[1], actual)
+
+
+def test_layers_come_true(bench: Bench, evidence: Evidence) -> None:
+    base = Settings(depth=evidence.depth, linear=True, subdivision=2, effects=frozenset({"diffraction"}))
+    judge = frames(bench, replace(base, layers=evidence.layers[4]), 256)
+    actual = change(frames(bench, base, 256), judge)
+    assert actual > 2e-3
+    assert promised(evidence.layer_error[1], actual)
+
+
+def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
+    """Spread of six estimates of direct light with sixteen samples; and of other light with two."""
+    effects = {0: frozenset({"diffraction"}), 1: frozenset(pilot.applicable(bench)) - {"speckle"}}
+    labels, weights = parse_patterns("dots:4", N).classes()
+    everything = frames(bench, Settings(depth=evidence.depth, linear=True, effects=effects[1]))
+    for kind in (0, 1):
+        made = Simulation(bench, Settings(depth=evidence.depth, linear=True, effects=effects[kind]))
+        tracer, file = (made.direct, made.file) if kind == 0 else (made.other, made.file_other)
+        samples = int(evidence.noise[kind].samples)
+        groups = [file(tracer.trace(integer(9, kind, index), 0, samples), labels, samples) for index in range(6)]
+        found = [
+            np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), weights[SHOWN], 0)])
+            for light in groups
+        ]
+        spread = np.sqrt(np.square(np.std(found, axis=0, ddof=1)).sum())
+        norm = np.linalg.norm(np.mean(found, axis=0) if kind == 0 else everything)
+        # Two halves tell a spread with few degrees of freedom.
+        assert 0.4 < evidence.noise[kind].error / (spread / norm) < 2.5
+        assert 0.5 <= evidence.noise[kind].rate <= 1
+
+
+def test_the_pilot_is_reproducible(bench: Bench, evidence: Evidence) -> None:
+    again, other = measured(bench, seed=3), measured(bench, seed=4)
+    for name in ("depth", "layers", "anchor_error", "layer_error", "cell_error", "effect_error", "noise"):
+        assert getattr(again, name) == getattr(evidence, name)
+    assert other.effect_error != evidence.effect_error and other.anchor_error != evidence.anchor_error
+
+
+def test_a_flat_scene_needs_no_layers(small_scene: Callable[..., Path]) -> None:
+    found = measured(open_bench(small_scene()), 0)
+    assert found.depth == 400.0 and found.layer_error == {1: 0.0} and found.layers == {1: (400.0,)}
+    assert found.effect_error["interreflection"] == 0 and "ambient" not in found.effect_error
+
+
+def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:
+    away = open_bench(small_scene(projector_turn='<rotate y="1" angle="180"/>'))
+    with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
+        measured(away, seed=0)
+    black = open_bench(small_scene("black"), defines={"albedo": "0"})
+    with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
+        measured(black, seed=0)
+
+
+def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    assert "ambient" in pilot.applicable(bench) and "mirrors" not in pilot.applicable(bench)
+    projector = tmp_path / "projector.toml"
+    projector.write_text('name = "ideal"\neffective_wavelength_nm = 562.0\n')
+    assert pilot.applicable(open_bench(small_scene(), projector=projector)) == ("interreflection", "diffraction")
+    projector.write_text(
+        'name = "all"\neffective_wavelength_nm = 562.0\ncontrast_ratio = 100.0\naperture_radius_mm = 1.0\n'
+        "blur_pixels = 0.5\nspeckle_contrast = 0.01\n"
+    )
+    found = pilot.applicable(open_bench(small_scene(), projector=projector))
+    assert found == ("interreflection", "diffraction", "aperture", "blur", "black-level", "speckle")
