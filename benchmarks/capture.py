@@ -1,10 +1,10 @@
 """`mitsim capture` of 49 dots at 512x512 to 1e-3: cold from the shell, warm in one process, and against the reference.
 
-    python benchmarks/capture.py [--json FILE] [--repeat 5]
+    python benchmarks/capture.py [--json FILE] [--repeat 5] [--scene cookie_bag --scene compact_disc]
 
 Cold: a new process, with an empty kernel cache and LLVM probe (a temporary HOME), from the shell to its exit. Warm:
 medians of later captures in one process. The reference's time at equal error is measured at a feasible error and
-extrapolated by 1/sqrt(samples).
+extrapolated by 1/sqrt(samples). With ``--scene`` only the warm seconds of these scenes are measured.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ def cold() -> dict[str, float]:
     return found
 
 
-def warm(repeat: int) -> dict[str, float]:
+def warm(repeat: int, scene: Path = SCENE) -> dict[str, float]:
     """Median seconds by stage over ``repeat`` captures after a first one."""
-    bench = open_bench(SCENE)
+    bench = open_bench(scene)
     runs = []
     with tempfile.TemporaryDirectory() as folder:
         for index in range(repeat + 1):
@@ -59,7 +59,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--scene", action="append", default=[])
     options = parser.parse_args()
+    if options.scene:
+        report(
+            {
+                "warm_seconds": {
+                    name: warm(options.repeat, shipped("scenes", name, "scene.xml")) for name in options.scene
+                },
+                **_circumstances(options.repeat),
+            },
+            options.json,
+        )
+        return
     with tempfile.TemporaryDirectory() as folder:
         study = study_accuracy(open_bench(SCENE), folder, PATTERNS, 0, lambda stage, fraction: None)
     result = {
@@ -67,15 +79,22 @@ def main() -> None:
         "warm_seconds": warm(options.repeat),
         "speedup_at_equal_error": study.speedup_at_equal_error,
         "accuracy_rows": study.payload()["rows"],
-        "repeat": options.repeat,
-        "seed": 0,
-        "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
-        "versions": versions(),
+        **_circumstances(options.repeat),
     }
+    report(result, options.json)
+
+
+def _circumstances(repeat: int) -> dict[str, object]:
+    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
+    return {"repeat": repeat, "seed": 0, "machine": machine, "versions": versions()}
+
+
+def report(result: dict[str, object], path: Path | None) -> None:
+    """Print a result, and write it to ``path``."""
     text = json.dumps(result, indent=1)
     print(text)
-    if options.json:
-        options.json.write_text(text + "\n")
+    if path:
+        path.write_text(text + "\n")
 
 
 if __name__ == "__main__":

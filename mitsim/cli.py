@@ -292,7 +292,7 @@ def render(
 
 @app.command()
 def study(
-    name: Annotated[str, typer.Argument(help="accuracy", metavar="NAME")],
+    name: Annotated[str, typer.Argument(help="accuracy or diffraction", metavar="NAME")],
     scene: Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene")] = Path("photograph"),
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of the study")] = Path("study-output"),
     patterns: Patterns = "dots:7",
@@ -302,7 +302,7 @@ def study(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """An experiment with a plot and JSON; `accuracy` shows what accuracy costs in time."""
+    """An experiment with plots and JSON: what `accuracy` costs in time, what `diffraction` at the mask does."""
     from mitsim.study import STUDIES
 
     if name not in STUDIES:

@@ -125,3 +125,7 @@ class Exposer:
                     continue
                 yield rate if half is None else half - rate, shown.row, shown.column
                 half = None
+
+    def _measured(self, frame: Frame, *names: str | int) -> FloatArray:
+        """Noisy electrons a second of the frame ``names``."""
+        return self.rate(self.digital(self.lit(frame, *names), *names))

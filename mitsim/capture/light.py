@@ -23,6 +23,7 @@ __all__ = [
     "Light",
     "Plan",
     "Progress",
+    "Settings",
     "check_accuracy",
     "collect",
     "make_plan",

@@ -85,9 +85,13 @@ class Simulation:
         self.smooth = replace(self.coarse, anchors=1)
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
+        """Cells as far as the sensor's edge sees through the field stop: directions are those from its centre.
+
+        The same for any number of anchors and layers, so that their light can be compared.
+        """
         windows = self.bench.windows_at(self.settings.depth)
-        stop = self.geometry.tan_half_fov
-        return aligned_grid(*windows, pixels, subdivision, stop, multiple=subdivision)
+        reach = self.geometry.tan_half_fov + self.geometry.half_width / self.settings.depth
+        return aligned_grid(*windows, pixels, subdivision, reach, multiple=subdivision)
 
     @cached_property
     def source(self) -> Projector:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -20,13 +21,14 @@ from mitsim.core.parallel import in_threads, workers
 from mitsim.core.seeds import stream
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 from mitsim.optics.diffraction import Spectrum
-from mitsim.optics.shadow import Directions
+from mitsim.optics.shadow import Directions, SeparableTerms
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 _AT_ONCE = 32
 _LARGEST_BASIS = 256
 _PROBES = 8
+_SHADOWS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ class FrameOptics:
         self._layers = [
             [
                 (_stack(_corrected(left, rows), weights), _stack(_corrected(right, columns), weights))
-                for left, right in geometry.shadow_terms(rows, columns, depth, spectrum)
+                for left, right in _shadow(geometry, _Plain.of(rows), _Plain.of(columns), depth, _lines(spectrum))
             ]
             for depth in depths
         ]
@@ -295,6 +297,35 @@ def _aligned(flat: npt.NDArray[np.int64], parts: Sequence[tuple[npt.NDArray[np.i
     for line, (places, light) in zip(values, parts, strict=True):
         line[order[np.searchsorted(flat[order], places)]] = light
     return values
+
+
+@dataclass(frozen=True)
+class _Plain:
+    """Directions as plain values, which compare and hash."""
+
+    centres: bytes
+    width: float
+
+    @classmethod
+    def of(cls, directions: Directions) -> _Plain:
+        return cls(directions.centres.tobytes(), directions.width)
+
+    @property
+    def directions(self) -> Directions:
+        return Directions(np.frombuffer(self.centres), self.width)
+
+
+def _lines(spectrum: Spectrum | None) -> tuple[bytes, bytes] | None:
+    return None if spectrum is None else (spectrum.wavelengths_nm.tobytes(), spectrum.weights.tobytes())
+
+
+@lru_cache(maxsize=_SHADOWS)
+def _shadow(
+    geometry: CameraGeometry, rows: _Plain, columns: _Plain, depth: float, lines: tuple[bytes, bytes] | None
+) -> SeparableTerms:
+    """The mask's shadow; the last few are kept, for a plan asks for the same ones many times."""
+    spectrum = None if lines is None else Spectrum(np.frombuffer(lines[0]), np.frombuffer(lines[1]))
+    return geometry.shadow_terms(rows.directions, columns.directions, depth, spectrum)
 
 
 def _corrected(factor: FloatArray, directions: Directions) -> FloatArray:

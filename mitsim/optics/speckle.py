@@ -1,9 +1,9 @@
 """Laser speckle on the sensor: from irradiance to one realisation of what coherent light makes of it.
 
-Integrated speckle after Goodman (Speckle Phenomena in Optics, section 4.6): light that averages over M independent modes
-(polarisations, laser lines, grains within a pixel, moments of a scanned beam) follows a gamma distribution of mean 1 and
-standard deviation C = M^(-1/2), the speckle contrast. Sensor pixels are independent: a grain lambda z / D of an
-illuminated patch D = 120 mm is 2 um at 400 mm, below a pixel. Contrast 0 passes light through unchanged.
+Integrated speckle after Goodman (Speckle Phenomena in Optics, section 4.6): light that averages over M independent
+modes (polarisations, laser lines, grains within a pixel, moments of a scanned beam) follows a gamma distribution of
+mean 1 and standard deviation C = M^(-1/2), the speckle contrast. Sensor pixels are independent: a grain lambda z / D of
+an illuminated patch D = 120 mm is 2 um at 400 mm, below a pixel. Contrast 0 passes light through unchanged.
 """
 
 from __future__ import annotations

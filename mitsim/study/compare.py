@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,6 +14,7 @@ from mitsim.capture.light import Light, Plan, Progress
 from mitsim.capture.run import board_flux
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.sensor.chain import Digital, electrons_from_irradiance
 from mitsim.study.ideal import ideal_factors, ideal_light
@@ -87,10 +90,7 @@ class Comparison:
     def _recovery(
         self, family: PatternFamily, expected: ExpectedFrames, model: Prepared, exposure_s: float, seed: int
     ) -> Recovery:
-        frames = model.accumulator()
-        with single_threaded_blas():
-            for measurement, row, column in Exposer(self.bench, exposure_s, seed).measurements(family, expected):
-                frames.add(measurement, row, column)
+        (frames,) = accumulate(Exposer(self.bench, exposure_s, seed), family, expected, [model])
         solution = model.solve(frames, "auto")
         return Recovery(
             solution.image,
@@ -107,4 +107,21 @@ class Comparison:
         return light.merged().frames(*family.classes(), self.seed)
 
     def _peak_time(self, expected: ExpectedFrames) -> float:
-        return Exposure().choose(self.bench, max(float(frame.irradiance.max()) for frame in expected))
+        return peak_time(self.bench, expected)
+
+
+def peak_time(bench: Bench, expected: ExpectedFrames) -> float:
+    """Exposure time [s] of a family at equal peak: its brightest pixel fills the default part of the full well."""
+    return Exposure().choose(bench, max(float(frame.irradiance.max()) for frame in expected))
+
+
+def accumulate(
+    exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared]
+) -> list[Accumulator]:
+    """One noisy exposure of a family's frames, added up for each model."""
+    sums = [model.accumulator() for model in models]
+    with single_threaded_blas():
+        for measurement, row, column in exposer.measurements(family, expected):
+            for frames in sums:
+                frames.add(measurement, row, column)
+    return sums

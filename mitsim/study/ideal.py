@@ -6,16 +6,22 @@ reflectance and the mean flux of the rendered bench, so exposure and noise are t
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.light import Light
+from mitsim.capture.bench import Bench, PatternFamily
+from mitsim.capture.light import Light, Settings
 from mitsim.capture.simulation import Light as Estimate
 from mitsim.capture.simulation import Simulation
-from mitsim.optics.shadow import Directions
-from mitsim.scene.plan import Settings
+from mitsim.optics.camera import CameraGeometry
+from mitsim.optics.diffraction import Spectrum
+from mitsim.optics.frames import ExpectedFrames, FrameOptics
+from mitsim.optics.mask import MaskKind
+from mitsim.optics.separable import best_term, centred
+from mitsim.optics.shadow import Directions, SeparableTerms
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -52,3 +58,40 @@ def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -
     left, right = bench.geometry.shadow_terms(rows, columns, bench.geometry.scene_distance)[-1]
     scale = np.sqrt(board_flux * electrons_per_joule)
     return left * scale, right * scale
+
+
+class IdealCamera:
+    """The idealised camera with one mask in one light: projector pixels of the aligned plane to sensor pixels."""
+
+    def __init__(self, bench: Bench, mask: MaskKind, spectrum: Spectrum | None) -> None:
+        """``spectrum`` None: the geometric shadow."""
+        self.mask, self.spectrum = mask, spectrum
+        self.geometry: CameraGeometry = bench.geometry.model_copy(update={"mask": mask})
+        self._depth = bench.geometry.scene_distance
+        self._rows, self._columns = (Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows)
+        self.terms = self.geometry.shadow_terms(self._rows, self._columns, self._depth, spectrum)
+
+    @property
+    def centre(self) -> bool:
+        """Whether a solver takes row and column means off its frames."""
+        return self.mask == "flatcam"
+
+    def points(self) -> SeparableTerms:
+        """The same operator for point sources at the centres of the projector's pixels."""
+        rows, columns = (Directions(pixels.centres, 0.0) for pixels in (self._rows, self._columns))
+        return self.geometry.shadow_terms(rows, columns, self._depth, self.spectrum)
+
+    @cached_property
+    def factors(self) -> tuple[FloatArray, FloatArray]:
+        """(pixels, n) left and right factor of the nearest separable operator, of transmissions."""
+        best = best_term(centred(self.terms) if self.centre else self.terms)
+        return best.left, best.right
+
+    def frames(self, family: PatternFamily, flux: FloatArray, seed: int) -> ExpectedFrames:
+        """Frames of a family when each projector pixel puts ``flux`` (n, n) [W m^-2] on the sensor without the mask."""
+        light = sparse.csr_array(sparse.diags_array(flux.ravel()))
+        return ExpectedFrames(self._optics, (light,), *family.classes(), seed)
+
+    @cached_property
+    def _optics(self) -> FrameOptics:
+        return FrameOptics(self.geometry, self._rows, self._columns, (self._depth,), 1, self.spectrum)

@@ -293,3 +293,44 @@ def _figure(
         axes.spines[side].set_visible(False)
     axes.tick_params(labelsize=_FONT - 1)
     return figure, axes
+
+
+def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str, width: float = 8.6) -> Figure:
+    """PSNR [dB] of each system by the factors that its solver used, rows (system, factors, PSNR), first on top."""
+    systems = list(dict.fromkeys(system for system, _, _ in rows))
+    factors = list(dict.fromkeys(name for _, name, _ in rows))
+    figure, axes = _figure(width, 1.3 + 0.46 * len(systems))
+    for place, system in enumerate(reversed(systems)):
+        here = [value for one, _, value in rows if one == system]
+        axes.plot([min(here), max(here)], [place, place], color="#d1d5db", lw=2, zorder=1)
+    for index, name in enumerate(factors):
+        values = [(value, len(systems) - 1 - systems.index(one)) for one, kind, value in rows if kind == name]
+        style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
+        axes.plot(*zip(*values, strict=True), ls="", ms=8, label=name, zorder=3, **style)
+    axes.set_yticks(range(len(systems)), reversed(systems), fontsize=_FONT - 2)
+    axes.set_xlabel("PSNR of the image [dB]", fontsize=_FONT)
+    axes.grid(True, axis="x", color=_GRID)
+    axes.set_axisbelow(True)
+    figure.suptitle(message, fontsize=_FONT)
+    figure.legend(fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=len(factors))
+    return figure
+
+
+def shadow_profiles(
+    position_mm: ArrayLike, profiles: Mapping[str, ArrayLike], reach_mm: float, message: str, width: float = 8.6
+) -> Figure:
+    """Shadows {light: relative irradiance of each sensor pixel of one row} within ``reach_mm`` of the middle."""
+    figure, axes = _figure(width, 0.4 * width)
+    position = np.asarray(position_mm, dtype=np.float64)
+    inside = np.abs(position) <= reach_mm
+    for index, (name, values) in enumerate(profiles.items()):
+        shown = np.asarray(values, dtype=np.float64)[inside]
+        style = {"color": PALETTE[index % len(PALETTE)], "ls": _STYLES[index % len(_STYLES)]}
+        axes.plot(position[inside], shown, lw=1.8, label=name, **style)
+    axes.set_xlabel("position on the sensor [mm]", fontsize=_FONT)
+    axes.set_ylabel("irradiance, open sensor = 1 [1]", fontsize=_FONT)
+    axes.grid(True, color=_GRID)
+    axes.set_axisbelow(True)
+    axes.set_title(message, fontsize=_FONT)
+    axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    return figure

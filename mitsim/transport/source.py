@@ -113,7 +113,8 @@ class Source:
             step = dr.opaque(mi.Float, self.projector.blur) * focus
             image += mi.Vector3f(spot.x * self._pixel_at_unit[0], spot.y * self._pixel_at_unit[1], 0) * step
         at = dr.zeros(mi.SurfaceInteraction3f)
-        at.p = self._to_world @ image
+        # A point plus a vector is a vector to Mitsuba, and vectors are not moved.
+        at.p = self._to_world @ mi.Point3f(image)
         ds, weight = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
         strength = weight * (dr.square(image.z) * image.z / dr.norm(image))
         return self._pixel(ds.uv), strength, active & (ds.pdf > 0)

@@ -48,9 +48,11 @@ def pattern(bits: np.ndarray, feature: float, s: np.ndarray) -> np.ndarray:
     return np.where((index >= 0) & (index < len(bits)), bits[np.clip(index, 0, len(bits) - 1)], 0.0)
 
 
-def propagated(field: np.ndarray, step: float, distance: float, paraxial: bool = True) -> np.ndarray:
+def propagated(
+    field: np.ndarray, step: float, distance: float, paraxial: bool = True, nm: float = LAMBDA_NM
+) -> np.ndarray:
     """The field after ``distance`` along its last axis, without the common phase."""
-    f, wavelength = np.fft.fftfreq(field.shape[-1], step), LAMBDA_NM * 1e-6
+    f, wavelength = np.fft.fftfreq(field.shape[-1], step), nm * 1e-6
     if paraxial:
         transfer = np.exp(-1j * np.pi * wavelength * distance * f**2)
     else:
@@ -80,16 +82,18 @@ def by_plane_wave(geometry: CameraGeometry, tau: float, depth: float) -> np.ndar
     return pixel_means(np.abs(field) ** 2, s, edges[:-1], edges[1:])
 
 
-def by_point_source(geometry: CameraGeometry, tau: float, depth: float, paraxial: bool = True) -> np.ndarray:
+def by_point_source(
+    geometry: CameraGeometry, tau: float, depth: float, paraxial: bool = True, nm: float = LAMBDA_NM
+) -> np.ndarray:
     """(pixels,) means of |U|^2 for the source's own field on the mask, propagated by d; relative to an open mask."""
     d, s = geometry.mask_distance, grid(1 << 16)
-    wavelength = LAMBDA_NM * 1e-6
+    wavelength = nm * 1e-6
     if paraxial:
         source = np.exp(1j * np.pi * (s - tau * depth) ** 2 / (wavelength * (depth - d)))
     else:
         source = np.exp(2j * np.pi / wavelength * np.hypot(s - tau * depth, depth - d))
     mask = pattern(code(geometry.mask_order), geometry.mask_feature, s)
-    field = propagated(source * mask, STEP, d, paraxial)
+    field = propagated(source * mask, STEP, d, paraxial, nm)
     # Energy spreads over z / (z - d) of the width that it had at the mask.
     means = pixel_means(np.abs(field) ** 2, s, geometry.pixel_edges[:-1], geometry.pixel_edges[1:])
     return means / (1 - d / depth)

@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 from scipy.signal import max_len_seq
 
+from mitsim.capture.light import collect, make_plan
 from mitsim.optics.beams import SpecularFrames, beam_frames, geometric_terms
 from mitsim.scene.patterns import parse_patterns
+from mitsim.transport.aperture import aperture_scene_parts, register
 from mitsim.transport.beams import trace_beams
 from mitsim.transport.mirrors import MirrorTracer
 from mitsim.transport.source import Projector
+from tests.physics.test_diffraction import by_point_source
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE, REFLECTANCE, D, FEATURE, PITCH = 128, 151250.0, 0.8, 2.0, 0.06, 0.01172
@@ -319,3 +322,106 @@ def test_rays_are_better_than_float32(variant: str) -> None:
         flat = -(rig.place[:2] + 800 * tangent)[:, ::-1]
         exact = flat if shape is not ball_shape else ball(tangent, rig.place, centre, radius)[0]
         assert np.abs(found.sensor - exact).max() < off
+
+
+# ---- the whole pipeline on the shipped scene
+
+
+SHIPPED, ANGLE = 0.9, np.radians(4.2654)
+"""Reflectance and turn of the mirror in scenes/mirror, which stands at (0, 0, 400)."""
+
+
+def shipped_image() -> "Rig":
+    return Rig((60, 0, 0)).mirrored(((0.0, 0.0, 400.0), np.array([np.sin(ANGLE), 0.0, -np.cos(ANGLE)])))
+
+
+def pipeline_light(bench, diffraction: bool):
+    """The plan with mirrors and the light it collects, under uniform light."""
+    forced = {"diffraction": diffraction, "black-level": False, "mirrors": True}
+    plan = make_plan(bench, UNIFORM, np.ones((1, 1)), 2e-3, seed=3, forced=forced)
+    return plan, collect(bench, plan, UNIFORM, np.ones((1, 1)), seed=3, by_pixel=False)
+
+
+def mirror_part(light) -> np.ndarray:
+    """What the frame holds beyond the light that camera paths found."""
+    whole = next(iter(light.frames(UNIFORM, np.ones((1, 1)), 0))).irradiance
+    traced = light.simulation.expected(light.groups, np.zeros(1, np.int64), np.ones((1, 1)), 0)
+    return whole - next(iter(traced)).irradiance
+
+
+def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) -> None:
+    """Ray optics. What is left of the frame without the analytic glint is what the reference sees: the board alone."""
+    bench = shipped_bench("mirror")
+    plan, light = pipeline_light(bench, diffraction=False)
+    assert "mirrors" in plan.settings.effects
+    image, u = shipped_image(), centres()
+    irradiance, row, column = image.irradiance(u[:, None], u)
+    assert ((row > 0) & (row < N) & (column > 0) & (column < N)).all()
+    masks = [code_mean(image.shadow(u - PITCH / 2, axis), image.shadow(u + PITCH / 2, axis)) for axis in (0, 1)]
+    glint = SHIPPED * irradiance * np.outer(*masks)
+    assert relative(mirror_part(light), glint) < 2e-3
+
+    whole = next(iter(light.frames(UNIFORM, np.ones((1, 1)), 0))).irradiance
+    board = np.zeros_like(whole)
+    squares = np.zeros_like(whole)
+    passes = 8
+    for seed in range(passes):
+        one = np.array(mi.render(bench.loaded.scene, spp=4, seed=50 + seed), np.float64)[..., 0]
+        board, squares = board + one / passes, squares + one**2 / passes
+    error = np.sqrt(((squares - board**2) / (passes - 1)).sum())
+    assert glint.sum() > 50 * error, "the reference is sharp enough to tell the glint from nothing"
+    assert abs((whole - glint).sum() - board.sum()) < 5 * error + 2e-3 * board.sum()
+    assert abs(whole.sum() - board.sum()) > 50 * error
+
+
+def test_the_shipped_mirror_in_wave_optics(shipped_bench, variant: str) -> None:
+    """A point source's shadow by its own propagated field, line by line; the mask separates, so does its field."""
+    bench = shipped_bench("mirror")
+    _, light = pipeline_light(bench, diffraction=True)
+    image, u = shipped_image(), centres()
+    irradiance, _, _ = image.irradiance(u[:, None], u)
+    geometry, depth = bench.geometry, float(image.place[2])
+    # Index coordinates of the source over its depth: rows run along -y, columns along -x.
+    taus = -image.place[1] / depth, -image.place[0] / depth
+    lines = zip((638.0, 520.0, 445.0), np.array([0.4757, 0.3348, 0.1895]) * [638.0, 520.0, 445.0], strict=True)
+    shadow, photons = np.zeros((512, 512)), 0.0
+    for nm, share in lines:
+        shadow += share * np.outer(*(by_point_source(geometry, tau, depth, nm=nm) for tau in taus))
+        photons += share
+    glint = SHIPPED * irradiance * shadow / photons
+    found = mirror_part(light)
+    assert relative(found, glint) < 3e-3
+    geometric = [code_mean(image.shadow(u - PITCH / 2, axis), image.shadow(u + PITCH / 2, axis)) for axis in (0, 1)]
+    assert relative(SHIPPED * irradiance * np.outer(*geometric), glint) > 0.1
+
+
+# ---- a projector of finite aperture
+
+
+def test_a_perfect_mirror_with_an_aperture_in_the_reference(variant: str) -> None:
+    """Camera paths find a lens by chance: its light is the beams', whose point source is that lens, made small.
+
+    Paths that hit the lens: 4e6 x 1.6e-2, so the mean is good to half a percent.
+    """
+    register()
+    place, radius = (30.0, 0.0, 400.0), 20.0
+    rig = Rig((60, 0, 0))
+    pinhole = rig.scene(mask="open", pixels=64, pitch=0.09375, mirror=mirror(place, BACK))
+    parts = aperture_scene_parts(pinhole.emitters()[0], radius, 400.0)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 8},
+            "camera": pinhole.sensors()[0],
+            "mirror": mirror(place, BACK),
+            **parts,
+        }
+    )
+    passes = [float(np.array(mi.render(scene, spp=256, seed=seed)).mean()) for seed in range(16)]
+    mean, error = np.mean(passes), np.std(passes, ddof=1) / 4
+    u = centres(64, 0.09375)
+    analytic = REFLECTANCE * rig.mirrored((place, BACK)).irradiance(u[:, None], u)[0].mean()
+    beams = rig.frames(pinhole, UNIFORM).irradiance.mean()
+    assert beams == pytest.approx(analytic, rel=1e-4)
+    assert 5 * error < 0.03 * analytic
+    assert abs(mean - analytic) < 5 * error + 1e-3 * analytic

@@ -127,6 +127,23 @@ def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path) -> N
     assert written == {"accuracy.json", "accuracy.png", "effects.png", "solver.png"}
 
 
+def test_study_diffraction(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
+    study = call("study", "diffraction", lab.scene, *options).payload
+    assert {"shadows", "quality", "scene", "patterns", "output"} <= study.keys()
+    for row in study["shadows"]:
+        assert row["mask"] in ("separable", "flatcam") and isinstance(row["light"], str)
+        assert number(row["wavelengths"], 0) and number(row["terms"], 1)
+        for key in ("point_source", "scene_pixel", "factor", "separability", "separability_centred"):
+            assert number(row[key], 0, 2), row
+    for row in study["quality"]:
+        assert row["frames"] in ("idealised", "rendered") and isinstance(row["factors"], str)
+        assert number(row["psnr_db"], -50, 100) and number(row["psnr_best_db"], row["psnr_db"], 100)
+        assert number(row["loss_db"], -50, 100) and number(row["residual"]) and row["status"]
+    names = ["diffraction.json", "quality.png", "shadow.png"]
+    assert sorted(path.name for path in (tmp_path / "study").iterdir()) == names
+
+
 def test_doctor(call: Callable[..., Any]) -> None:
     found = call("doctor", "--json", "--quiet", "--variant", "llvm_ad_mono").payload
     assert found["ok"] is True, found

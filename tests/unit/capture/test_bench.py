@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import load_recipe, open_bench
-from mitsim.capture.light import grid_for
+from mitsim.capture.bench import Bench, load_recipe, open_bench
+from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.transport.factored import Tracer
+from mitsim.scene.plan import Settings
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -41,10 +41,9 @@ def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[...
     bench = open_bench(small_scene(sheet_z=330, **place))
     sheet = open_bench(small_scene("sheet", **place), defines={"albedo": "0.9"})
 
-    def light(which: object) -> np.ndarray:
-        scene = which.loaded
-        tracer = Tracer(scene.scene, scene.camera, which.source, grid_for(which, 2), 1)
-        return np.asarray(tracer.batch(4).light.todense())
+    def light(which: Bench) -> np.ndarray:
+        simulation = Simulation(which, Settings(depth=400.0, subdivision=2))
+        return simulation.file(simulation.direct.trace(4, 0, 4), np.arange(16**2), 4).fine.toarray()
 
     board, known = light(bench.with_board(0.9)), light(sheet)
     assert known.sum() > 0

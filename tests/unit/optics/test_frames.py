@@ -11,8 +11,15 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from mitsim.optics.camera import CameraGeometry, anchor_positions
-from mitsim.optics.frames import ExpectedFrames, FrameOptics, relative_error
+from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
+from mitsim.optics.frames import (
+    ClassFrames,
+    ExpectedFrames,
+    Filed,
+    FrameOptics,
+    _corrected,
+    relative_error,
+)
 from mitsim.optics.mask import Mask
 from mitsim.optics.shadow import Directions
 
@@ -87,8 +94,13 @@ def board_light(edges: np.ndarray, anchors: int) -> tuple[np.ndarray, np.ndarray
 
 def factored(kind: str, cells: int, anchors: int) -> np.ndarray:
     edges = np.linspace(*WINDOW, cells + 1)
-    optics = FrameOptics(CAMERA.model_copy(update={"mask": kind}), edges, edges, Z, anchors)
+    optics = cell_optics(CAMERA.model_copy(update={"mask": kind}), edges, edges, anchors)
     return optics.frame(*board_light(edges, anchors))[np.ix_(ROWS, COLUMNS)]
+
+
+def cell_optics(camera: CameraGeometry, rows: np.ndarray, columns: np.ndarray, anchors: int = 1) -> FrameOptics:
+    """Light that is even in cells, at the board's depth."""
+    return FrameOptics(camera, Directions.cells(rows), Directions.cells(columns), (Z,), anchors)
 
 
 def error(kind: str, cells: int, anchors: int) -> float:
@@ -118,7 +130,7 @@ def test_cells_converge_at_least_with_the_square_of_their_size() -> None:
 def test_orientation_of_rows_and_columns() -> None:
     """Light in one cell: its shadow is the outer product of the two factors, rows by rows."""
     rows, columns = np.linspace(-0.2, 0.2, 5), np.linspace(-0.1, 0.3, 8)
-    optics = FrameOptics(CAMERA, rows, columns, Z, 1)
+    optics = cell_optics(CAMERA, rows, columns)
     ((left, right),) = CAMERA.shadow_terms(Directions.cells(rows), Directions.cells(columns), Z)
     frame = optics.frame(np.array([3 * 7 + 1]), np.array([2.0]))
     assert np.allclose(frame, 2 * np.outer(left[:, 3], right[:, 1]), rtol=1e-14)
@@ -129,7 +141,7 @@ def test_orientation_of_rows_and_columns() -> None:
 def test_both_orders_of_the_product_agree_with_the_dense_one(lit: str) -> None:
     rng = np.random.default_rng(1)
     rows, columns = np.linspace(-0.2, 0.2, 13), np.linspace(-0.2, 0.2, 16)
-    optics = FrameOptics(CAMERA.model_copy(update={"mask": "flatcam"}), rows, columns, Z, 1)
+    optics = cell_optics(CAMERA.model_copy(update={"mask": "flatcam"}), rows, columns)
     light = np.zeros((12, 15))
     place = (slice(2, 4), slice(None)) if lit == "few rows" else (slice(None), slice(7, 9))
     light[place] = rng.random(light[place].shape)
@@ -143,16 +155,109 @@ def test_both_orders_of_the_product_agree_with_the_dense_one(lit: str) -> None:
 
 def test_no_light_is_a_black_frame() -> None:
     edges = np.linspace(*WINDOW, 5)
-    optics = FrameOptics(CAMERA, edges, edges, Z, 1)
+    optics = cell_optics(CAMERA, edges, edges)
     assert not optics.frame(np.empty(0, np.int64), np.empty(0)).any()
 
 
-def test_total_is_the_open_irradiance() -> None:
+@pytest.mark.parametrize("anchors", [1, 3])
+def test_the_mean_of_an_open_frame_is_the_irradiance(anchors: int) -> None:
+    """Through an open mask a frame's mean is the light itself, by the anchors' mean weights."""
     edges = np.linspace(*WINDOW, 9)
-    optics = FrameOptics(CAMERA.model_copy(update={"mask": "open", "mask_feature": 6.0}), edges, edges, Z, 3)
-    flat, light = board_light(edges, 3)
-    frame = optics.frame(flat, light)
-    assert optics.total(sparse.csr_array(light[None, :])) == pytest.approx([frame.mean()], rel=1e-12)
+    camera = CAMERA.model_copy(update={"mask": "open", "mask_feature": 6.0})
+    flat, light = board_light(edges, anchors)
+    frame = cell_optics(camera, edges, edges, anchors).frame(flat, light)
+    middle = (CAMERA.pixel_edges[:-1] + CAMERA.pixel_edges[1:]) / 2
+    mean = anchor_weights(anchor_positions(anchors, CAMERA.half_width), middle).mean(axis=0)
+    expected = np.einsum("a,b,aibj->", mean, mean, light.reshape(anchors, 8, anchors, 8))
+    assert frame.mean() == pytest.approx(expected, rel=1e-12)
+
+
+# ---- layers, and light between cell corners
+
+
+def test_layers_add_up() -> None:
+    """Light in two layers casts the sum of two shadows, each with its own magnification."""
+    rng, edges, depths = np.random.default_rng(5), np.linspace(-0.2, 0.2, 11), (60.0, 20.0)
+    camera = CAMERA.model_copy(update={"mask": "flatcam"})
+    light = rng.random((2, 400))
+    directions = Directions.cells(edges)
+    both = FrameOptics(camera, directions, directions, depths, 2)
+    single = [FrameOptics(camera, directions, directions, (depth,), 2) for depth in depths]
+    parts = [optics.frame(np.arange(400), values) for optics, values in zip(single, light, strict=True)]
+    assert np.allclose(both.frame(np.arange(800), light.ravel()), sum(parts), rtol=1e-12)
+    assert np.allclose(both.frame(np.arange(400) + 400, light[1]), parts[1], rtol=1e-12)
+    assert np.abs(single[0].frame(np.arange(400), light[1]) - parts[1]).max() > 0.05 * parts[1].max()
+
+
+def test_probes_see_the_frames_of_all_layers() -> None:
+    rng, directions = np.random.default_rng(6), Directions.cells(np.linspace(-0.2, 0.2, 11))
+    optics = FrameOptics(CAMERA, directions, directions, (60.0, 20.0), 2)
+    flat = np.sort(rng.choice(800, 150, replace=False))
+    lights, vectors = rng.random((3, 150)), rng.standard_normal((96, 5))
+    found = optics.probe(flat, lights, vectors)
+    expected = np.concatenate([optics.frame(flat, light) @ vectors for light in lights], axis=1)
+    assert np.allclose(found, expected, rtol=1e-10)
+
+
+def integral_by_corners(cells: int, correct: bool) -> float:
+    """Integral of f times a smooth light g, with g split between corners (exactly) and f known at them."""
+    edges = np.linspace(-1, 1, cells + 1)
+    factor = np.exp(2 * edges)[None, :]
+    if correct:
+        factor = _corrected(factor, Directions(edges, 0.0))
+    tau, weight = nodes(edges, 8)
+    light = weight * np.square(np.cos(np.pi * tau / 2)) ** 2
+    cell = np.repeat(np.arange(cells), 8)
+    upper = (tau - edges[cell]) / (2 / cells)
+    corners = np.bincount(cell, light * (1 - upper), cells + 1) + np.bincount(cell + 1, light * upper, cells + 1)
+    return float(factor[0] @ corners)
+
+
+def test_corners_reproduce_a_smooth_shadow_to_fourth_order() -> None:
+    """Halving the cells leaves a sixteenth; without the correction a quarter (linear interpolation)."""
+    tau, weight = nodes(np.linspace(-1, 1, 50), 8)
+    truth = float(weight @ (np.exp(2 * tau) * np.square(np.cos(np.pi * tau / 2)) ** 2))
+    errors = {
+        correct: [abs(integral_by_corners(cells, correct) / truth - 1) for cells in (8, 16, 32)]
+        for correct in (False, True)
+    }
+    for coarse, fine in pairwise(errors[False]):
+        assert coarse / fine == pytest.approx(4, rel=0.1)
+    for coarse, fine in pairwise(errors[True]):
+        assert coarse / fine == pytest.approx(16, rel=0.25)
+    assert errors[True][0] < 0.1 * errors[False][0]
+
+
+def test_the_correction_leaves_straight_lines_and_cells_alone() -> None:
+    edges = np.linspace(-0.2, 0.3, 12)
+    line = np.stack([2 - 3 * edges, np.full(12, 0.7)])
+    assert np.allclose(_corrected(line, Directions(edges, 0.0)), line, rtol=1e-12)
+    curve = np.stack([edges**2, np.sin(9 * edges)])
+    assert np.array_equal(_corrected(curve, Directions(edges, 0.05)), curve)
+    assert np.array_equal(_corrected(curve[:, :2], Directions(edges[:2], 0.0)), curve[:, :2])
+
+
+def test_a_board_filed_between_corners_is_the_board() -> None:
+    """The same quadrature as for even cells; light that is even over the window, split exactly."""
+
+    def found(cells: int) -> float:
+        edges = np.linspace(*WINDOW, cells + 1)
+        tau, weight = nodes(edges, 5)
+        cell = np.repeat(np.arange(cells), 5)
+        upper = (tau - edges[cell]) / (edges[1] - edges[0])
+        split = np.zeros((cells + 1, tau.size))
+        split[cell, np.arange(tau.size)] = (1 - upper) * weight
+        split[cell + 1, np.arange(tau.size)] += upper * weight
+        squared = np.square(tau)[:, None] + np.square(tau)[None, :]
+        light = split @ (1 + squared) ** -2 @ split.T
+        corners = Directions(edges, 0.0)
+        frame = FrameOptics(CAMERA, corners, corners, (Z,), 1).frame(np.arange(light.size), light.ravel())
+        even = factored("separable", 192, 1)
+        return float(np.linalg.norm(frame[np.ix_(ROWS, COLUMNS)] - even) / np.linalg.norm(even))
+
+    errors = [found(cells) for cells in (24, 48, 96)]
+    # The shadow's kinks (features' edges) hold the order between two and four.
+    assert errors[0] > 3.5 * errors[1] and errors[1] > 3.5 * errors[2] and errors[2] < 2e-4
 
 
 # ---- families of frames
@@ -173,7 +278,7 @@ def small_optics(pixels: int = 40) -> FrameOptics:
     # Features three times smaller than a cell's shadow: the cells look different to the sensor.
     fine = {"pixels": pixels, "pixel_pitch": 6.0 / pixels, "mask_order": 9, "mask_feature": 0.02}
     camera = CAMERA.model_copy(update=fine)
-    return FrameOptics(camera, edges, edges, Z, 1)
+    return cell_optics(camera, edges, edges)
 
 
 LABELS = np.arange(PIXELS) % 4
@@ -255,3 +360,108 @@ def test_what_interpolation_leaves_below_zero_is_reported() -> None:
     assert only.sum() == PIXELS and dark.sum() == -PIXELS
     (frame,) = ExpectedFrames(optics, [dark, dark], LABELS, weights, 0)
     assert not frame.irradiance.any() and frame.removed == 0.0
+
+
+# ---- ambient light, light in other cells, and exact light beside the groups'
+
+
+SPLIT = np.arange(PIXELS) % 12
+MANY = np.random.default_rng(12).random((3, 12))
+"""Twelve classes for three captures: formed capture by capture, not mixed from classes."""
+BESIDE = {"mixed": (LABELS, FAMILIES["mixing"]), "by capture": (SPLIT, MANY)}
+
+
+def ambient_groups(count: int, seed: int = 31) -> tuple[sparse.csr_array, ...]:
+    return tuple(group[[0]] for group in random_groups(count, seed, 0.3))
+
+
+def alike(found: ExpectedFrames, other: ExpectedFrames) -> None:
+    """Same frames and same variances."""
+    for one, two in zip(found, other, strict=True):
+        assert np.allclose(one.irradiance, two.irradiance, rtol=1e-10, atol=1e-12 * two.irradiance.max())
+        assert one.variance == pytest.approx(two.variance, rel=1e-9)
+
+
+@pytest.mark.parametrize("family", BESIDE)
+def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
+    """Weight 1 even where the projector is dark; its estimates deviate together with their groups'."""
+    labels, weights = BESIDE[family]
+    weights = weights.copy()
+    weights[1] = 0
+    optics, groups, lamps = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3)
+    plain = list(ExpectedFrames(optics, groups, labels, weights, 5))
+    lit = ExpectedFrames(optics, groups, labels, weights, 5, ambient=[Filed(optics, lamps)])
+    mean = np.asarray(sum(lamps[1:], lamps[0]).todense()).ravel() / 3
+    expected = optics.frame(np.arange(CELLS**2), mean)
+    for with_lamps, without in zip(lit, plain, strict=True):
+        assert np.allclose(with_lamps.irradiance, without.irradiance + expected, rtol=1e-10)
+    # The same as a projector pixel of its own that always shines.
+    more = [sparse.vstack([group, lamp], format="csr") for group, lamp in zip(groups, lamps, strict=True)]
+    always = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
+    alike(lit, ExpectedFrames(optics, more, np.append(labels, weights.shape[1]), always, 5))
+    assert next(iter(lit)).variance > 0 and plain[1].variance == 0
+
+
+def test_ambient_light_of_two_kinds() -> None:
+    """Fine and coarse cells: their frames add, and so do the deviations of paired groups, before they are squared."""
+    optics, groups, lamps, others = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3), ambient_groups(3, 32)
+    apart = ExpectedFrames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, lamps), Filed(optics, others)])
+    summed = tuple(a + b for a, b in zip(lamps, others, strict=True))
+    alike(apart, ExpectedFrames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, summed)]))
+
+
+def test_ambient_light_has_a_shadow_of_its_own() -> None:
+    optics, other, lamps = small_optics(), small_optics(), ambient_groups(2)
+    edges = np.linspace(*WINDOW, CELLS + 1)
+    other = cell_optics(CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15, "mask": "open"}), edges, edges)
+    groups = random_groups(2, 7, 0.2)
+    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, ambient=[Filed(other, lamps)])
+    plain = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0)
+    mean = np.asarray((lamps[0] + lamps[1]).todense()).ravel() / 2
+    expected = other.frame(np.arange(CELLS**2), mean)
+    assert np.allclose(next(iter(frames)).irradiance - next(iter(plain)).irradiance, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("family", BESIDE)
+def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
+    """Filed in the same cells it is as if it had been added; errors of one path go together, so they add first."""
+    labels, weights = BESIDE[family]
+    optics, groups, more = small_optics(), random_groups(3, 7, 0.2), random_groups(3, 8, 0.2)
+    apart = ExpectedFrames(optics, groups, labels, weights, 5, more=[Filed(optics, tuple(more))])
+    alike(apart, ExpectedFrames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
+
+
+def test_more_light_in_cells_of_its_own() -> None:
+    edges = np.linspace(*WINDOW, 4)
+    camera = CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15})
+    coarse, optics = cell_optics(camera, edges, edges), small_optics()
+    groups = random_groups(2, 7, 0.2)
+    more = tuple(sparse.csr_array(np.random.default_rng(seed).random((PIXELS, 9))) for seed in (1, 2))
+    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, more=[Filed(coarse, more)])
+    plain = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0)
+    light = np.asarray((more[0] + more[1]).todense())[LABELS == 2].sum(axis=0) / 2
+    difference = list(frames)[2].irradiance - list(plain)[2].irradiance
+    assert np.allclose(difference, coarse.frame(np.arange(9), light), rtol=1e-9)
+
+
+@pytest.mark.parametrize("family", [*BESIDE, "identity", "many"])
+def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
+    """Classes 1 and 3 bring frames of their own, without error, in families of either kind and over several blocks."""
+    families = {**BESIDE, "identity": (LABELS, np.eye(4)), "many": (SPLIT, np.random.default_rng(2).random((70, 80)))}
+    labels, weights = families[family]
+    optics, groups = small_optics(8), random_groups(2, 7, 0.2)
+    brought = np.random.default_rng(3).random((2, 8, 8))
+    exact = ClassFrames(np.array([1, 3]), brought)
+    with_it = list(ExpectedFrames(optics, groups, labels, weights, 0, exact=exact))
+    without = list(ExpectedFrames(optics, groups, labels, weights, 0))
+    assert len(with_it) == len(weights)
+    for found, plain, row in zip(with_it, without, weights, strict=True):
+        expected = plain.irradiance + row[1] * brought[0] + row[3] * brought[1]
+        assert np.allclose(found.irradiance, expected, rtol=1e-10)
+        assert found.variance == pytest.approx(plain.variance, rel=1e-12)
+
+
+def test_one_group_has_no_variance_to_tell() -> None:
+    frames = ExpectedFrames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
+    assert all(frame.variance == 0 and frame.irradiance.any() for frame in frames)
+    assert relative_error(frames) == 0

@@ -25,7 +25,7 @@ def refusal(path: Path, defines: dict[str, str] | None = None, **options: bool) 
 
 def test_a_good_scene_loads(small_scene: Write) -> None:
     loaded = load_scene(small_scene(mask="flatcam", mask_distance=3))
-    assert loaded.pixels.n == 16 and loaded.other_emitters == 0
+    assert loaded.pixels.n == 16 and loaded.lamps == () and not loaded.mirrors
     geometry = loaded.camera.geometry
     assert (geometry.pixels, geometry.mask, geometry.mask_distance) == (64, "flatcam", 3)
     assert geometry.pixel_pitch == pytest.approx(0.01172)
@@ -39,9 +39,27 @@ def test_defines_reach_the_scene(small_scene: Write) -> None:
     assert values == [pytest.approx(0.25)]
 
 
-def test_other_emitters_are_counted(small_scene: Write) -> None:
+def test_other_emitters_are_lamps(small_scene: Write) -> None:
     light = '<emitter type="constant"><spectrum name="radiance" value="1"/></emitter>'
-    assert load_scene(small_scene(extra=light)).other_emitters == 1
+    loaded = load_scene(small_scene(extra=light))
+    (lamp,) = loaded.lamps
+    assert lamp.class_name() == "ConstantBackgroundEmitter" and loaded.projector.class_name() == "Projector"
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "mirrors"),
+    [
+        ('<bsdf type="conductor"/>', True),
+        ('<bsdf type="dielectric"/>', True),
+        ('<bsdf type="twosided"><bsdf type="conductor"/></bsdf>', True),
+        ('<bsdf type="plastic"/>', True),  # its coating reflects in a single direction
+        ('<bsdf type="roughconductor"><float name="alpha" value="0.05"/></bsdf>', False),
+        ('<bsdf type="diffuse"/>', False),
+    ],
+)
+def test_mirrors_are_seen(small_scene: Write, bsdf: str, mirrors: bool) -> None:
+    loaded = load_scene(small_scene(extra=f'<shape type="sphere"><float name="radius" value="5"/>{bsdf}</shape>'))
+    assert loaded.mirrors == mirrors
 
 
 @pytest.mark.parametrize(
@@ -133,7 +151,7 @@ def test_a_scene_without_projector_is_for_render_only(small_scene: Write) -> Non
     path.write_text(text[:start] + '<emitter type="constant"/>' + text[end:])
     assert '0 emitters of type "projector"' in refusal(path)
     loaded = load_scene(path, needs_projector=False)
-    assert loaded.grid is None and loaded.other_emitters == 1
+    assert loaded.grid is None and loaded.projector is None and len(loaded.lamps) == 1
     with pytest.raises(MitsimError, match="without its projector"):
         _ = loaded.pixels
 

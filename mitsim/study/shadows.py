@@ -1,0 +1,80 @@
+"""Shadows of a camera's masks in several lights: how far from the geometric shadow, how far from one separable term."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.capture.bench import Bench
+from mitsim.optics.diffraction import Spectrum
+from mitsim.optics.separable import best_term, centred, relative_difference
+from mitsim.optics.shadow import Directions
+from mitsim.study.ideal import IdealCamera
+from mitsim.study.metrics import relative_error
+
+FloatArray = npt.NDArray[np.float64]
+BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
+GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
+
+
+@dataclass(frozen=True)
+class ShadowRow:
+    """One mask in one light against its geometric shadow; relative rms differences of operators, no unit.
+
+    ``terms``: separable terms of the operator. ``point_source`` and ``scene_pixel``: difference from the geometric
+    shadow, for point sources at the centres of projector pixels and averaged over these pixels. ``factor``: difference
+    of the factor that a solver uses on one side. ``separability``: what the best single separable term leaves of the
+    operator, and ``separability_centred`` once row and column means are taken off its frames.
+    """
+
+    mask: str
+    light: str
+    wavelengths: int
+    terms: int
+    point_source: float
+    scene_pixel: float
+    factor: float
+    separability: float
+    separability_centred: float
+
+
+def lights(bench: Bench) -> dict[str, Spectrum | None]:
+    """The study's lights by name; None is light that does not diffract."""
+    edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
+    return {
+        GEOMETRIC: None,
+        LINE: Spectrum(np.array([bench.projector.effective_wavelength_nm]), np.ones(1)),
+        PROJECTOR: bench.spectrum,
+        BROADBAND: Spectrum((edges[:-1] + edges[1:]) / 2, np.full(BROADBAND_BANDS, 1 / BROADBAND_BANDS)),
+    }
+
+
+def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
+    """One light's system compared with the geometric one of the same mask."""
+    system, geometric = systems[light], systems[GEOMETRIC]
+    factor, assumed = system.factors[0], geometric.factors[0]
+    # (left, right) and (-left, -right) are one camera.
+    sign = 1.0 if np.vdot(factor, assumed) >= 0 else -1.0
+    return ShadowRow(
+        mask=system.mask,
+        light=light,
+        wavelengths=len(system.spectrum.weights) if system.spectrum else 0,
+        terms=len(system.terms),
+        point_source=relative_difference(system.points(), geometric.points()),
+        scene_pixel=relative_difference(system.terms, geometric.terms),
+        factor=relative_error(sign * factor, assumed),
+        separability=best_term(system.terms).residual,
+        separability_centred=best_term(centred(system.terms)).residual,
+    )
+
+
+def point_profiles(bench: Bench) -> dict[str, FloatArray]:
+    """(pixels,) shadow of a point on the axis along one side of the sensor, through the separable mask, by light."""
+    camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
+    return {
+        name: best_term(camera.shadow_terms(axis, axis, camera.scene_distance, spectrum)).left[:, 0]
+        for name, spectrum in lights(bench).items()
+    }

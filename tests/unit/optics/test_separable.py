@@ -1,0 +1,64 @@
+"""Operators of separable terms against the dense four-dimensional ones that they stand for."""
+
+import numpy as np
+import pytest
+
+from mitsim.optics.separable import best_term, centred, relative_difference
+
+Terms = list[tuple[np.ndarray, np.ndarray]]
+
+
+def random_terms(count: int, seed: int) -> Terms:
+    """Factors (7, 4) and (6, 5): no two sizes are equal, so that no axis can be mistaken."""
+    random = np.random.default_rng(seed)
+    return [(random.normal(size=(7, 4)), 3 * random.normal(size=(6, 5))) for _ in range(count)]
+
+
+def dense(terms: Terms) -> np.ndarray:
+    """(7 * 4, 6 * 5) matrix with the operator's entries, left indices against right ones."""
+    return sum(np.einsum("ir,jc->irjc", left, right).reshape(28, 30) for left, right in terms)
+
+
+@pytest.mark.parametrize("count", [2, 3, 40])
+def test_the_best_term_is_the_first_singular_pair_of_the_dense_operator(count: int) -> None:
+    terms = random_terms(count, 1)
+    whole = dense(terms)
+    left, values, right = np.linalg.svd(whole)
+    best = best_term(terms)
+    assert np.allclose(dense([(best.left, best.right)]), values[0] * np.outer(left[:, 0], right[0]), atol=1e-10)
+    assert best.residual == pytest.approx(np.linalg.norm(values[1:]) / np.linalg.norm(values), rel=1e-10)
+    error = np.linalg.norm(whole - dense([(best.left, best.right)])) / np.linalg.norm(whole)
+    assert best.residual == pytest.approx(error, rel=1e-10)
+
+
+def test_one_term_is_its_own_best_term_balanced_and_of_the_same_sign() -> None:
+    ((left, right),) = random_terms(1, 2)
+    best = best_term([(left, right)])
+    assert best.residual < 1e-14
+    scale = np.sqrt(np.linalg.norm(right) / np.linalg.norm(left))
+    assert np.allclose(best.left, scale * left) and np.allclose(best.right, right / scale)
+
+
+def test_the_same_operator_in_other_terms_does_not_differ() -> None:
+    terms = random_terms(2, 3)
+    (left, right), second = terms
+    split = [(0.25 * left, right), second, (left, 0.75 * right)]
+    assert relative_difference(split, terms) < 1e-7
+    assert best_term(split).residual == pytest.approx(best_term(terms).residual, rel=1e-10)
+    assert best_term([(left, right), (2 * left, right)]).residual < 1e-14
+
+
+def test_the_difference_is_relative_to_the_second_operator() -> None:
+    one, other = random_terms(3, 4), random_terms(2, 5)
+    expected = np.linalg.norm(dense(one) - dense(other)) / np.linalg.norm(dense(other))
+    assert relative_difference(one, other) == pytest.approx(expected, rel=1e-10)
+
+
+def test_centred_factors_give_centred_frames() -> None:
+    """Whatever the scene, frames lose the means of their rows and columns, and nothing else."""
+    terms = random_terms(3, 6)
+    scene = np.random.default_rng(7).normal(size=(4, 5))
+    frame = sum(left @ scene @ right.T for left, right in terms)
+    frame -= frame.mean(axis=0)
+    frame -= frame.mean(axis=1, keepdims=True)
+    assert np.allclose(sum(left @ scene @ right.T for left, right in centred(terms)), frame)

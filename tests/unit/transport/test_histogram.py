@@ -1,0 +1,176 @@
+"""Paths to light per cell: nothing lost, nothing moved, kinds and layers kept apart."""
+
+import numpy as np
+import pytest
+
+from mitsim.optics.shadow import Directions
+from mitsim.transport.cells import CellAxis, CellGrid
+from mitsim.transport.histogram import AMBIENT, DIRECT, Bundle, Deposits
+
+PIXELS = 9  # a projector of 3 x 3
+GRID = CellGrid(CellAxis(-0.2, 0.05, 8), CellAxis(-0.1, 0.02, 15), 1)
+DEPTHS = (500.0, 300.0, 250.0)
+
+
+def deposits(count: int = 400, seed: int = 3, inside: bool = True) -> Deposits:
+    """Light from everywhere to everywhere: two anchors a side, all pixels and ambient light."""
+    rng = np.random.default_rng(seed)
+    source = rng.integers(0, PIXELS + 1, count)
+    low, high = ((-0.2, 0.2), (-0.1, 0.2)) if inside else ((-0.4, 0.4), (-0.3, 0.5))
+    row, column = rng.uniform(*low, count), rng.uniform(*high, count)
+    if not inside:
+        row, column = rng.uniform(-0.4, 0.4, count), rng.uniform(-0.3, 0.5, count)
+    return Deposits(
+        source=source,
+        anchor_row=rng.integers(0, 2, count),
+        anchor_column=rng.integers(0, 2, count),
+        row=row,
+        column=column,
+        inverse_depth=1 / rng.uniform(240, 520, count),
+        value=rng.uniform(0.5, 2, count),
+        order=np.where(source == PIXELS, AMBIENT, DIRECT).astype(np.int16),
+    )
+
+
+def one(row: float, column: float, **changes: object) -> Deposits:
+    """One path of value 1."""
+    values = {"source": 0, "anchor_row": 0, "anchor_column": 0, "row": row, "column": column}
+    values |= {"inverse_depth": 1 / 400, "value": 1.0, "order": 1, **changes}
+    kinds = {"row": float, "column": float, "inverse_depth": float, "value": float, "order": np.int16}
+    return Deposits(**{name: np.array([value], dtype=kinds.get(name, np.int64)) for name, value in values.items()})
+
+
+def bundle(depths: tuple[float, ...] = (400.0,), linear: bool = True, anchors: int = 2) -> Bundle:
+    return Bundle(GRID, anchors, depths, linear)
+
+
+def unpacked(made: Bundle, light: np.ndarray) -> np.ndarray:
+    """(rows, layers, anchors, y, anchors, x)"""
+    shape = (len(made.depths), made.anchors, made.cells[0], made.anchors, made.cells[1])
+    return np.asarray(light).reshape(-1, *shape)
+
+
+LABELS = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])
+WAYS = [(depths, linear) for depths in ((400.0,), DEPTHS) for linear in (False, True)]
+
+
+@pytest.mark.parametrize(("depths", "linear"), WAYS)
+def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...], linear: bool) -> None:
+    made, found = bundle(depths, linear), deposits()
+    light = made.file(found, LABELS, samples=4)
+    assert light.shape == (4, made.size)
+    lines = np.append(LABELS, 3)[found.source]
+    assert np.asarray(light.sum(axis=1)).ravel() == pytest.approx(np.bincount(lines, found.value) / 4, rel=1e-12)
+
+
+@pytest.mark.parametrize(("depths", "linear"), WAYS)
+def test_anchors_are_kept_apart(depths: tuple[float, ...], linear: bool) -> None:
+    made, found = bundle(depths, linear), deposits()
+    light = unpacked(made, made.file(found, LABELS).toarray()).sum(axis=(0, 1, 3, 5))
+    for a, b in np.ndindex(2, 2):
+        mine = (found.anchor_row == a) & (found.anchor_column == b)
+        assert light[a, b] == pytest.approx(found.value[mine].sum(), rel=1e-12)
+
+
+def test_an_even_cell_holds_the_light_that_falls_in_it() -> None:
+    made = bundle(linear=False, anchors=1)
+    light = unpacked(made, made.file(one(-0.2 + 2.99 * 0.05, -0.1 + 7.01 * 0.02), LABELS).toarray())[0, 0, 0, :, 0]
+    assert light[2, 7] == 1 and light.sum() == 1
+    assert made.cells == GRID.shape
+
+
+def test_light_between_corners_keeps_its_mean_direction() -> None:
+    """First moments of the corners are those of the paths, row by row; a cell's centre would miss by half a cell."""
+    made, found = bundle(anchors=1), deposits()
+    found = Deposits(**{**vars(found), "anchor_row": 0 * found.anchor_row, "anchor_column": 0 * found.anchor_column})
+    light = unpacked(made, made.file(found, LABELS).toarray())[:, 0, 0, :, 0, :]
+    assert made.cells == (9, 16)
+    for line in range(4):
+        mine = np.append(LABELS, 3)[found.source] == line
+        assert light[line].sum(axis=1) @ GRID.rows.edges == pytest.approx(found.value[mine] @ found.row[mine])
+        assert light[line].sum(axis=0) @ GRID.columns.edges == pytest.approx(found.value[mine] @ found.column[mine])
+
+
+def test_a_path_lights_only_the_corners_of_its_cell() -> None:
+    made = bundle(anchors=1)
+    light = unpacked(made, made.file(one(-0.2 + 2.25 * 0.05, -0.1 + 7.5 * 0.02), LABELS).toarray())[0, 0, 0, :, 0]
+    assert light[2:4, 7:9] == pytest.approx(np.outer([0.75, 0.25], [0.5, 0.5]))
+    assert light.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("depth", [480.0, 300.0, 260.0])
+def test_layers_keep_the_mean_inverse_depth(depth: float) -> None:
+    """Split in 1/z, in which the shadow is nearly linear: between the two layers around it and no other."""
+    made = bundle(DEPTHS, anchors=1)
+    light = unpacked(made, made.file(one(0.0, 0.0, inverse_depth=1 / depth), LABELS).toarray()).sum(
+        axis=(0, 2, 3, 4, 5)
+    )
+    assert light.sum() == pytest.approx(1) and light @ (1 / np.array(DEPTHS)) == pytest.approx(1 / depth)
+    distance = [abs(1 / layer - 1 / depth) for layer in DEPTHS]
+    assert set(np.flatnonzero(light > 1e-9)) <= set(np.argsort(distance)[:2])
+
+
+@pytest.mark.parametrize(("depth", "layer"), [(700.0, 0), (np.inf, 0), (240.0, 2)])
+def test_light_beyond_the_layers_goes_to_the_nearest(depth: float, layer: int) -> None:
+    made = bundle(DEPTHS, anchors=1)
+    light = unpacked(made, made.file(one(0.0, 0.0, inverse_depth=1 / depth), LABELS).toarray()).sum(
+        axis=(0, 2, 3, 4, 5)
+    )
+    assert light == pytest.approx(np.eye(3)[layer])
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_light_from_outside_the_grid_is_dropped(linear: bool) -> None:
+    made, found = bundle(linear=linear), deposits(inside=False)
+    inside = (found.row >= -0.2) & (found.row < 0.2) & (found.column >= -0.1) & (found.column < 0.2)
+    assert 0.1 < inside.mean() < 0.9
+    light, kept = made.file(found, LABELS), made.file(found.where(inside), LABELS)
+    assert light.sum() == pytest.approx(found.value[inside].sum(), rel=1e-12)
+    assert abs(light - kept).sum() == 0
+
+
+def test_ambient_light_has_the_last_row() -> None:
+    made = bundle()
+    light = made.file(one(0.0, 0.0, source=PIXELS, order=0), LABELS)
+    assert np.flatnonzero(light.toarray().any(axis=1)).tolist() == [3]
+    by_pixel = made.file(one(0.0, 0.0, source=PIXELS, order=0), np.arange(PIXELS))
+    assert by_pixel.shape[0] == PIXELS + 1 and by_pixel[[PIXELS]].sum() == pytest.approx(1)
+
+
+def test_no_light_is_an_empty_matrix() -> None:
+    made = bundle(DEPTHS)
+    light = made.file(Deposits.none(), LABELS)
+    assert light.shape == (4, made.size) and light.nnz == 0
+
+
+def test_parts_join_in_order() -> None:
+    found = deposits()
+    first = np.arange(400) < 150
+    joined = Deposits.joined([found.where(first), Deposits.none(), found.where(~first)])
+    assert all(np.array_equal(getattr(joined, name), getattr(found, name)) for name in vars(found))
+    assert joined.source.dtype == np.int64
+
+
+def test_directions_for_the_shadow() -> None:
+    """Cells are boxes; corners are points."""
+    even, split = bundle(linear=False), bundle(linear=True)
+    assert np.allclose(even.rows.centres, GRID.rows.edges[:-1] + 0.025) and even.rows.width == pytest.approx(0.05)
+    assert np.allclose(split.columns.centres, GRID.columns.edges) and split.columns.width == 0
+    assert isinstance(split.rows, Directions) and np.allclose(split.rows.centres, GRID.rows.edges)
+
+
+def test_light_averaged_over_the_anchors() -> None:
+    """The mean of bilinear weights: the light of each anchor times its row's and its column's weight."""
+    found, weights = deposits(), np.array([0.7, 0.3])
+    light = unpacked(bundle(), bundle().file(found, LABELS).toarray())
+    mean = unpacked(bundle(anchors=1), bundle(anchors=1).file(found.averaged(weights), LABELS).toarray())
+    assert np.allclose(mean[:, :, 0, :, 0], np.einsum("a,b,claybx->clyx", weights, weights, light), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("depths", "linear"), WAYS)
+def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...], linear: bool) -> None:
+    made, single = bundle(depths, linear), bundle(depths, linear, anchors=1)
+    light = single.file(deposits().averaged(np.array([0.5, 0.5])), LABELS)
+    shown, one = unpacked(made, made.repeated(light).toarray()), unpacked(single, light.toarray())
+    for a, b in np.ndindex(2, 2):
+        assert np.array_equal(shown[:, :, a, :, b], one[:, :, 0, :, 0])

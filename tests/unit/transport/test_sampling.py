@@ -1,0 +1,90 @@
+"""Random numbers of the tracer: stratified in their first two dimensions, unbiased, and independent between streams.
+
+Gates on random quantities are five standard deviations of what uniform numbers would give, at fixed seeds.
+"""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.transport.sampling import generator, stratified
+
+pytestmark = pytest.mark.usefixtures("variant")
+SIGMAS = 5.0
+
+
+def points(samples: int, streams: int = 1, seed: int = 7, first: int = 0) -> np.ndarray:
+    """(streams, samples, 2) points ``first``.. of some streams of one seed."""
+    lane = np.arange(streams * samples)
+    index, stream = mi.UInt32(first + lane % samples), mi.UInt32(lane // samples)
+    found = stratified(index, generator(mi.UInt32(seed), stream))
+    return np.stack([np.array(found.x), np.array(found.y)], axis=1).reshape(streams, samples, 2).astype(np.float64)
+
+
+@pytest.mark.parametrize("power", [0, 1, 3, 4, 7, 10])
+@pytest.mark.parametrize("seed", [0, 12345])
+def test_every_prefix_is_a_net(power: int, seed: int) -> None:
+    """2^k points put one in each box of every partition into 2^j x 2^(k-j) equal boxes: a (0, 2)-sequence in base 2."""
+    count = 2**power
+    for found in points(count, streams=5, seed=seed):
+        assert found.min() >= 0 and found.max() < 1
+        for j in range(power + 1):
+            across = np.floor(found[:, 0] * 2**j).astype(int)
+            along = np.floor(found[:, 1] * 2 ** (power - j)).astype(int)
+            boxes = across * 2 ** (power - j) + along
+            assert len(np.unique(boxes)) == count, f"boxes of 2^-{j} x 2^-{power - j}"
+
+
+def test_later_blocks_of_the_sequence_are_nets_too() -> None:
+    """Points 16..31 and 48..63: a batch that goes on where another stopped stratifies as well."""
+    for first in (16, 48):
+        (found,) = points(16, first=first)
+        boxes = np.floor(found * 4).astype(int) @ [4, 1]
+        assert len(np.unique(boxes)) == 16
+
+
+def test_the_sequence_does_not_depend_on_where_a_batch_starts() -> None:
+    (whole,) = points(64)
+    (late,) = points(32, first=32)
+    assert np.array_equal(whole[32:], late)
+
+
+def test_each_point_is_uniform_over_the_scramblings() -> None:
+    """Point 0 (the origin before scrambling) and point 5 of 2^14 streams: chi-square of an 8 x 8 histogram."""
+    streams = 2**14
+    found = points(6, streams)
+    for index in (0, 5):
+        counts = np.histogram2d(*found[:, index].T, bins=8, range=[[0, 1], [0, 1]])[0]
+        expected = streams / 64
+        chi = float((np.square(counts - expected) / expected).sum())
+        assert abs(chi - 63) < SIGMAS * np.sqrt(2 * 63)
+    fine = (found[:, 0] * 2**24 % 2**12) / 2**12  # the low half of the bits is random as well
+    assert np.abs(fine.mean(axis=0) - 0.5).max() < SIGMAS * np.sqrt(1 / 12 / streams)
+
+
+def test_streams_dimensions_and_seeds_are_independent() -> None:
+    """Correlations of the first point between neighbouring streams, its two dimensions, and neighbouring seeds."""
+    streams = 2**14
+    found, other = points(1, streams)[:, 0], points(1, streams, seed=8)[:, 0]
+    gate = SIGMAS / np.sqrt(streams)
+    assert abs(np.corrcoef(found[:, 0], found[:, 1])[0, 1]) < gate
+    for axis in (0, 1):
+        assert abs(np.corrcoef(found[1:, axis], found[:-1, axis])[0, 1]) < gate
+        assert abs(np.corrcoef(found[:, axis], other[:, axis])[0, 1]) < gate
+
+
+def test_an_average_over_a_step_converges_faster_than_random_points() -> None:
+    """A corner of a cell in another pixel: 256 points leave below a fifth of sqrt(p (1 - p) / 256)."""
+    found = points(256, streams=512)
+    inside = (found[..., 0] + 0.4 * found[..., 1] < 0.7).mean(axis=1)
+    assert inside.mean() == pytest.approx(0.5, abs=SIGMAS * inside.std() / np.sqrt(512))
+    assert inside.std() < 0.2 * np.sqrt(0.25 / 256)
+
+
+def test_the_generator_is_its_seeds_and_streams() -> None:
+    def draw(seed: int, stream: int) -> list[float]:
+        rng = generator(mi.UInt32(seed), mi.UInt32(stream))
+        return [float(np.array(rng.next_float32())[0]) for _ in range(3)]
+
+    assert draw(1, 2) == draw(1, 2)
+    assert len({*draw(1, 2), *draw(2, 1), *draw(1, 3)}) == 9
