@@ -149,7 +149,7 @@ def study_accuracy(bench: Bench, output: Path | str, patterns: str, seed: int, p
     for row in found.rows:
         series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
     figures = {
-        "accuracy.png": plots.pareto(series, noise=found.sensor_noise),
+        "accuracy.png": plots.pareto(series, noise=found.sensor_noise, apart=(_SERIES["bounces"],)),
         "effects.png": plots.effect_costs([(e.name, e.error_if_off, e.seconds) for e in found.effects], QUOTED),
         "solver.png": plots.solver_costs(found.solver),
     }

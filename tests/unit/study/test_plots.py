@@ -97,6 +97,7 @@ def test_pareto_rings_the_front_and_draws_the_noise() -> None:
     ring = lines["best for its time"]
     assert list(zip(*ring.get_data(), strict=True)) == [(1.0, 0.5), (3.0, 0.1), (4.0, 0.05)]
     assert list(np.asarray(lines["sensor noise, 2.0e-01"].get_ydata())) == [0.2, 0.2]
+    assert [line.get_linestyle() for line in plots.pareto(series, apart=["b"]).axes[0].lines[:2]] == ["-", "None"]
     given = plots.pareto(series, front=[(2.0, 0.6)]).axes[0]
     assert [list(line.get_xdata()) for line in given.lines if line.get_label() == "best for its time"] == [[2.0]]
 
