@@ -344,11 +344,13 @@ def test_effects_are_switched_by_the_user(bench: Bench, captured: CaptureResult,
     assert row["state"] == "off" and "by --effects" in row["reason"]
     assert any("no diffraction" in warning for warning in done.warnings)
     first, second = (
-        read_frame(Path(one.output) / FILES[4])[0]["electrons"] / one.exposure_s for one in (captured, done)
+        np.stack([read_frame(Path(one.output) / name)[0]["electrons"] for name in FILES]) / one.exposure_s
+        for one in (captured, done)
     )
     change = np.linalg.norm(first - second) / np.linalg.norm(first)
     assert change > 0.1
-    assert row["error_if_off"] == pytest.approx(change, rel=0.3)
+    # The pilot looks with cells of a whole projector pixel, half a mask feature here: too coarse for the fringes.
+    assert 0.6 < row["error_if_off"] / change < 2
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ Few electrons (1 % of full well) make the sensor's noise the only error that cou
 
 import json
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +17,19 @@ from mitsim.capture.light import make_plan
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame
 from mitsim.optics.shadow import centred_edges, scene_factor
-from mitsim.scene.plan import PHYSICAL
+from mitsim.scene.plan import PHYSICAL, Plan
 from mitsim.study.calibration import CalibrationResult, calibrate
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
 CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16), ("separable", "pair", 13)]
-GEOMETRIC = dict.fromkeys(PHYSICAL, False)
-"""Direct light through a geometric mask is what the closed forms here describe."""
 Done = tuple[Bench, CalibrationResult, Calibration]
+
+
+def geometric_plan(*arguments: object) -> Plan:
+    """Direct light through a geometric mask, in cells that are the projector's pixels: exact on the board."""
+    plan = make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
+    return replace(plan, settings=replace(plan.settings, subdivision=1, linear=False))
 
 
 def recipe(mode: str, fraction: float = 0.01) -> object:
@@ -44,7 +48,7 @@ def session(
             bench = open_bench(shared_scene(f"{mask}{n}", mask=mask, n=n), variant)
             folder = tmp_path_factory.mktemp("calibration") / "cal"
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr("mitsim.capture.session.make_plan", partial(make_plan, forced=GEOMETRIC))
+                patch.setattr("mitsim.capture.session.make_plan", geometric_plan)
                 made[key] = (bench, *calibrate(bench, folder, 1e-3, seed=2, recipe=recipe(mode)))
         return made[key]
 

@@ -190,9 +190,10 @@ def test_layers_add_up() -> None:
 
 
 def test_probes_see_the_frames_of_all_layers() -> None:
-    rng, directions = np.random.default_rng(6), Directions.cells(np.linspace(-0.2, 0.2, 11))
-    optics = FrameOptics(CAMERA, directions, directions, (60.0, 20.0), 2)
-    flat = np.sort(rng.choice(800, 150, replace=False))
+    rng, rows = np.random.default_rng(6), Directions.cells(np.linspace(-0.2, 0.2, 11))
+    columns = Directions.cells(np.linspace(-0.1, 0.3, 9))
+    optics = FrameOptics(CAMERA, rows, columns, (60.0, 20.0), 2)
+    flat = np.sort(rng.choice(640, 150, replace=False))
     lights, vectors = rng.random((3, 150)), rng.standard_normal((96, 5))
     found = optics.probe(flat, lights, vectors)
     expected = np.concatenate([optics.frame(flat, light) @ vectors for light in lights], axis=1)

@@ -1,0 +1,195 @@
+"""Direct light from the projector's side: how much, from which pixel, to which anchor, seen where.
+
+Boards have closed forms; gates on Monte Carlo means are five standard deviations of independent seeds.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.core.errors import MitsimError
+from mitsim.optics.camera import CameraGeometry, anchor_positions
+from mitsim.transport import direct
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.histogram import DIRECT, Deposits
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, Z, RADIANCE = 16, 400.0, 0.5 * 111000 / 400**2
+SIGMAS = 5.0
+
+
+def tracer(bench: Bench, anchors: int = 1, geometry: CameraGeometry | None = None, **lens: float) -> DirectTracer:
+    loaded = bench.loaded
+    return DirectTracer(loaded.scene, loaded.camera, replace(bench.source, **lens), anchors, geometry)
+
+
+@pytest.fixture(scope="module")
+def white(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    return open_bench(shared_scene("white"), variant)
+
+
+@pytest.fixture(scope="module")
+def large(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    """A sensor of 40 mm (pixels of 0.625 mm): its anchors see the board from clearly different places."""
+    return open_bench(shared_scene("large", pitch=0.625, fov=30), variant, check_camera=False)
+
+
+def falloff(tau_row: np.ndarray, tau_column: np.ndarray, row: float = 0.0, column: float = 0.0) -> np.ndarray:
+    return (1 + np.square(tau_row - row / Z) + np.square(tau_column - column / Z)) ** -2
+
+
+def expected(row: float = 0.0, column: float = 0.0, exponent: float = 0.0) -> np.ndarray:
+    """(n^2,) irradiance of each projector pixel at a sensor point: L times the integral of its tan-angles' falloff."""
+    node, weight = np.polynomial.legendre.leggauss(4)
+    tau = ((np.arange(N) + 0.5)[:, None] + node / 2) * 0.3 / N - 0.15
+    value = falloff(tau.ravel()[:, None], tau.ravel()[None, :], row, column) ** (1 + exponent / 4)
+    weights = np.tile(weight * 0.15 / N, N)
+    cells = (weights[:, None] * value * weights[None, :]).reshape(N, 4, N, 4).sum(axis=(1, 3))
+    return RADIANCE * cells.ravel()
+
+
+def by_pixel(found: Deposits, samples: int) -> np.ndarray:
+    return np.bincount(found.source, found.value, minlength=N * N) / samples
+
+
+def test_every_pixels_light_is_its_irradiance_at_every_anchor(large: Bench) -> None:
+    """Pixel by pixel and anchor by anchor. The falloff inside a pixel is all that varies between rays."""
+    found = tracer(large, 2).trace(3, 0, 16)
+    positions = anchor_positions(2, large.geometry.half_width)
+    for a, b in np.ndindex(2, 2):
+        mine = found.where((found.anchor_row == a) & (found.anchor_column == b))
+        light, truth = by_pixel(mine, 16), expected(positions[a], positions[b])
+        # It changes by 2 % over a pixel at most; sixteen stratified points leave a twentieth of that.
+        assert np.abs(light / truth - 1).max() < 1.5e-3
+        assert light.sum() == pytest.approx(truth.sum(), rel=1e-4)
+
+
+def test_a_pixel_is_seen_where_it_lights_the_board(white: Bench) -> None:
+    """Directions in index coordinates: row r from -0.15 + r 0.3/n on, and evenly over the pixel."""
+    found = tracer(white).trace(1, 0, 64)
+    row, column = np.divmod(found.source, N)
+    inside = (found.row + 0.15) * N / 0.3 - row, (found.column + 0.15) * N / 0.3 - column
+    for place in inside:
+        assert place.min() > -1e-4 and place.max() < 1 + 1e-4
+        assert np.histogram(place, 8, (0, 1))[0].std() < 0.02 * len(place) / 8
+    assert 1 / found.inverse_depth == pytest.approx(np.full(len(found.value), 400.0), rel=1e-6)
+    assert (found.order == DIRECT).all() and not found.anchor_row.any() and not found.anchor_column.any()
+
+
+def test_all_anchors_see_the_same_points(large: Bench) -> None:
+    """Four anchors: the same tan-angles from the sensor's centre, so their differences carry no noise of places."""
+    found = tracer(large, 2).trace(5, 0, 2)
+    places = [np.sort(found.row[(found.anchor_row == a) & (found.anchor_column == b)]) for a, b in np.ndindex(2, 2)]
+    assert all(np.array_equal(places[0], other) for other in places[1:]) and len(np.unique(places[0])) > N * N
+
+
+def test_a_spread_sensor_is_the_mean_over_it(large: Bench) -> None:
+    """Random points of the sensor, filed as one anchor: the mean of the irradiance over the sensor."""
+    loaded = large.loaded
+    spread = DirectTracer(loaded.scene, loaded.camera, large.source, 1, spread=True)
+    totals = np.array([by_pixel(spread.trace(seed, 0, 16), 16).sum() for seed in range(8)])
+    node, weight = np.polynomial.legendre.leggauss(4)
+    half = large.geometry.half_width
+    mean = sum(v * w / 4 * expected(half * x, half * y).sum() for x, v in zip(node, weight, strict=True)
+               for y, w in zip(node, weight, strict=True))  # fmt: skip
+    error = totals.std(ddof=1) / np.sqrt(8)
+    assert abs(totals.mean() - mean) < 7 * error + 1e-5 * mean  # five sigma of the t distribution of 7 degrees
+    assert error < 1e-3 * mean
+
+
+def test_a_patch_of_the_print_darkens_its_own_pixels(small_scene: Callable[..., Path]) -> None:
+    reflectance = np.full((N, N), 255)
+    reflectance[1, 4] = 0  # a texel of 8 mm: y in 48..56, x in 24..32; pixels are 7.5 mm, from 60 mm down
+    light = by_pixel(tracer(open_bench(small_scene(reflectance=reflectance))).trace(1, 0, 64), 64)
+    part = 1 - (light / expected()).reshape(N, N) * (0.5 * 1.0)  # the white of the print is 1, not the albedo 0.5
+    hidden = np.zeros((N, N))
+    hidden[0:2, 3:5] = np.outer([3.5 / 7.5, 4.5 / 7.5], [2 / 7.5, 6 / 7.5])
+    assert np.abs(part - hidden).max() < 0.02
+    assert np.abs(part - hidden.T).max() > 0.2
+
+
+def test_light_is_seen_where_it_was_reflected(small_scene: Callable[..., Path]) -> None:
+    """A sheet at 200 mm, half the rig's distance, where the window spans x from 0 to 60 mm: columns -0.30 to 0."""
+    found = tracer(open_bench(small_scene(sheet_z=200, fov=40))).trace(0, 0, 4)
+    assert found.column.min() == pytest.approx(-0.30, abs=0.01) and found.column.max() == pytest.approx(0, abs=0.01)
+    assert np.abs(found.row).max() == pytest.approx(0.15, abs=0.01)
+    assert 1 / found.inverse_depth == pytest.approx(np.full(len(found.value), 200.0), rel=1e-6)
+
+
+def test_a_ball_casts_its_shadow(small_scene: Callable[..., Path]) -> None:
+    """Points of the sheet that the ball hides from the projector are not lit, those it hides from the camera not seen.
+
+    The ball (radius 20 at z = 200) hides x^2 + y^2 < 40^2 or so of the sheet from the camera, and a place near
+    x = -60 from the projector at x = 60.
+    """
+    ball = '<shape type="sphere"><point name="center" x="0" y="0" z="200"/><float name="radius" value="20"/></shape>'
+    found = tracer(open_bench(small_scene(extra=ball))).trace(0, 0, 16)
+    sheet = found.inverse_depth < 1 / 395
+    x, y = -found.column[sheet] / found.inverse_depth[sheet], -found.row[sheet] / found.inverse_depth[sheet]
+    assert not (np.hypot(x, y) < 39.5).any() and (np.hypot(x, y) < 42).any()
+    assert not (np.hypot(x + 59, y) < 36).any(), "the shadow beside it"
+    assert (np.abs(1 / found.inverse_depth[~sheet] - 190) < 11).all() and (~sheet).mean() > 0.02
+
+
+def test_the_field_stop_cuts(small_scene: Callable[..., Path]) -> None:
+    found = tracer(open_bench(small_scene(fov=10))).trace(0, 0, 4)
+    stop = np.tan(np.radians(5))
+    assert np.abs(found.row).max() <= stop * (1 + 1e-6) and np.abs(found.row).max() > 0.95 * stop
+    assert np.abs(found.column).max() <= stop * (1 + 1e-6)
+
+
+def test_the_pixels_response(white: Bench) -> None:
+    """cos^n, as the geometry says: the falloff's power grows by n/4."""
+    geometry = white.geometry.model_copy(update={"angular_exponent": 6.0})
+    light = by_pixel(tracer(white, 1, geometry).trace(2, 0, 16), 16)
+    assert light == pytest.approx(expected(exponent=3.0 * 4 / 2), rel=2e-3)
+    assert by_pixel(tracer(white).trace(2, 0, 16), 16) == pytest.approx(expected(), rel=1e-3)
+
+
+@pytest.mark.parametrize("lens", [{"aperture": 4.0, "focus": 200.0}, {"blur": 0.7}])
+def test_lens_and_spot_keep_a_pixels_light_and_spread_it(white: Bench, lens: dict[str, float]) -> None:
+    """Circle of radius a |z - f| / f = 4 mm on the sheet; a normal spot of 0.7 pixels of 7.5 mm. Pixel (8, 8)."""
+    found = tracer(white, **lens).trace(1, 0, 4096)
+    mine = found.where(found.source == 8 * N + 8)
+    assert mine.value.sum() / 4096 == pytest.approx(expected()[8 * N + 8], rel=2e-3)
+    spread = 4.0**2 / 4 if "aperture" in lens else (0.7 * 7.5) ** 2
+    for place in (mine.row, mine.column):
+        assert np.var(place * 400) == pytest.approx(7.5**2 / 12 + spread, rel=SIGMAS * np.sqrt(2 / 4096))
+        assert np.mean(place * 400) == pytest.approx(3.75, abs=SIGMAS * 8 / 64)
+
+
+def test_a_sharp_lens_is_the_pinhole(white: Bench) -> None:
+    pinhole, lens = (tracer(white, **kind).trace(1, 0, 4) for kind in ({}, {"aperture": 4.0, "focus": 400.0}))
+    assert by_pixel(lens, 4) == pytest.approx(by_pixel(pinhole, 4), rel=1e-3)
+    row, column = np.divmod(lens.source, N)
+    assert ((lens.row + 0.15) * N / 0.3 - row).min() > -1e-3 and ((lens.column + 0.15) * N / 0.3 - column).max() < 1.001
+
+
+def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    trace = tracer(white)
+    assert trace.lanes == N * N and tracer(white, 3).lanes == 9 * N * N
+    whole, again, other = trace.trace(1, 0, 4), trace.trace(1, 0, 4), trace.trace(2, 0, 4)
+    assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
+    assert not np.isin(whole.row, other.row).any()
+    # A sequence in pieces, in samples or in launches, is the same sequence.
+    pieces = Deposits.joined([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
+    monkeypatch.setattr(direct, "_LANES_PER_LAUNCH", 300)
+    launches = trace.trace(1, 0, 4)
+    for parts in (pieces, launches):
+        assert np.array_equal(parts.source, whole.source) and np.allclose(parts.row, whole.row, atol=1e-6)
+        assert np.allclose(parts.value, whole.value, rtol=1e-5)
+
+
+def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:
+    # Put there after loading: a file that says NaN is refused before Mitsuba sees it.
+    bench = open_bench(small_scene())
+    parameters = mi.traverse(bench.loaded.projector)
+    parameters["scale"] = float("nan")
+    parameters.update()
+    with pytest.raises(MitsimError, match="NaN"):
+        tracer(bench).trace(0)
