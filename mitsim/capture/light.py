@@ -31,6 +31,7 @@ __all__ = [
     "decide",
     "make_plan",
     "pinhole_view",
+    "scene_facts",
     "silent",
     "speckle_of",
     "uniform_light",
