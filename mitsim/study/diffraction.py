@@ -85,7 +85,7 @@ class DiffractionStudy:
     output: str
 
     def loss_db(self, frames: str, mask: str, light: str, patterns: str, factors: str) -> float:
-        """PSNR [dB] lost against frames without diffraction, solved with the factors that are right for them."""
+        """PSNR [dB] lost against the same frames without diffraction, solved with the factors that fit them."""
         right = CALIBRATED if frames == "rendered" else ASSUMED
         return self._psnr(frames, mask, GEOMETRIC, patterns, right) - self._psnr(frames, mask, light, patterns, factors)
 
