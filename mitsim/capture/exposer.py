@@ -116,9 +116,7 @@ class Exposer:
         numbered = zip(family.captures, expected, strict=True)
         half: FloatArray | None = None
         while chunk := list(islice(numbered, FRAMES_AT_ONCE)):
-            rates = in_threads(
-                lambda item: self.rate(self.digital(self.lit(item[1], *item[0].names), *item[0].names)), chunk
-            )
+            rates = in_threads(lambda item: self._measured(item[1], *item[0].names), chunk)
             for (shown, _), rate in zip(chunk, rates, strict=True):
                 if shown.sign == 1:
                     half = rate

@@ -17,17 +17,21 @@ from mitsim.capture.simulation import Light as Estimate
 from mitsim.capture.simulation import Simulation
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
-from mitsim.scene.plan import GROUPS, Plan, SceneFacts, Settings, check_accuracy, decide
+from mitsim.scene.plan import GROUPS, Evidence, Plan, SceneFacts, Settings, check_accuracy, decide
 
 __all__ = [
+    "GROUPS",
+    "Evidence",
     "Light",
     "Plan",
     "Progress",
     "Settings",
     "check_accuracy",
     "collect",
+    "decide",
     "make_plan",
     "pinhole_view",
+    "scene_facts",
     "silent",
     "speckle_of",
     "uniform_light",

@@ -24,14 +24,13 @@ import numpy.typing as npt
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench, PatternFamily
 from mitsim.capture.exposer import Exposure
-from mitsim.capture.light import Light, Progress, collect, scene_facts, silent
+from mitsim.capture.light import Evidence, Light, Plan, Progress, Settings, collect, decide, scene_facts, silent
 from mitsim.capture.render import projected, reference
 from mitsim.capture.run import NoiseTarget
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifest import prepare_output, versions, write_json
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.scene.plan import Evidence, Plan, Settings, decide
 from mitsim.study import plots
 from mitsim.study.knobs import Variant, at_once, sampled, variants, without
 from mitsim.study.metrics import relative_error
@@ -149,7 +148,7 @@ def study_accuracy(bench: Bench, output: Path | str, patterns: str, seed: int, p
     for row in found.rows:
         series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
     figures = {
-        "accuracy.png": plots.pareto(series, noise=found.sensor_noise),
+        "accuracy.png": plots.pareto(series, noise=found.sensor_noise, apart=(_SERIES["bounces"],)),
         "effects.png": plots.effect_costs([(e.name, e.error_if_off, e.seconds) for e in found.effects], QUOTED),
         "solver.png": plots.solver_costs(found.solver),
     }

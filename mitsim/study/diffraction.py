@@ -85,10 +85,9 @@ class DiffractionStudy:
     output: str
 
     def loss_db(self, frames: str, mask: str, light: str, patterns: str, factors: str) -> float:
-        """PSNR [dB] that is lost against the geometric shadow seen by a solver that is right to assume it."""
-        return self._psnr(frames, mask, GEOMETRIC, patterns, ASSUMED) - self._psnr(
-            frames, mask, light, patterns, factors
-        )
+        """PSNR [dB] lost against the same frames without diffraction, solved with the factors that fit them."""
+        right = CALIBRATED if frames == "rendered" else ASSUMED
+        return self._psnr(frames, mask, GEOMETRIC, patterns, right) - self._psnr(frames, mask, light, patterns, factors)
 
     def _psnr(self, *wanted: str) -> float:
         return next(
@@ -193,16 +192,23 @@ def _rendered(
     flux: float,
     seed: int,
 ) -> Iterator[QualityRow]:
-    """Rendered frames of the scene, solved with geometric factors and with those of a rendered noisy session."""
+    """Rendered frames of the scene, solved with geometric factors and with those of a rendered noisy session.
+
+    Without diffraction the same light of scene and board goes through the geometric shadow.
+    """
     session = Session(bench, load_recipe(), ACCURACY, seed, Clock(), lambda stage, part: None)
-    found = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
     assumed = ideal_factors(bench, flux, _electrons_per_joule(bench))
-    rays = replace(plan.settings, effects=plan.settings.effects - {"diffraction"})
-    seen = {GEOMETRIC: replace(light, simulation=Simulation(bench, rays)), PROJECTOR: light}
-    for name, here in seen.items():
-        known = {ASSUMED: assumed} if name == GEOMETRIC else {ASSUMED: assumed, CALIBRATED: (found.left, found.right)}
+    for name, effects in ((PROJECTOR, plan.settings.effects), (GEOMETRIC, plan.settings.effects - {"diffraction"})):
+        settings = replace(plan.settings, effects=effects)
+        scene = replace(light, simulation=Simulation(bench, settings)).merged()
+        board = replace(
+            session.plan.settings, effects=session.plan.settings.effects - (plan.settings.effects - effects)
+        )
+        session.light = replace(session.light, simulation=Simulation(session.board, board))
+        found = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
+        known = {ASSUMED: assumed, CALIBRATED: (found.left, found.right)}
         for family in families:
-            expected = here.merged().frames(*family.classes(), seed)
+            expected = scene.frames(*family.classes(), seed)
             exposer = Exposer(bench, peak_time(bench, expected), seed, speckle_of(bench, plan))
             yield from _rows("rendered", bench.geometry.mask, name, exposer, family, expected, known, image)
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.light import GROUPS, Evidence, Plan, Settings
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.scene.plan import GROUPS, Evidence, Plan, Settings
 
 Target = Callable[[ExpectedFrames], float]
 CELLS = ((1, False), (1, True), (2, True), (4, True))

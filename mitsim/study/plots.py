@@ -5,7 +5,7 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -132,17 +132,20 @@ def pareto(
     front: Sequence[Point] | None = None,
     noise: float | None = None,
     width: float = 8.6,
+    apart: Collection[str] = (),
 ) -> Figure:
     """Error against wall seconds of several ways to the same result, log-log, {name: [(seconds, error), ...]}.
 
     ``front`` are the points that nothing beats (found among all when not given), joined by a staircase: the best error
     to be had in a given time. ``noise``: relative error that the sensor's noise makes anyway, a horizontal line.
+    ``apart`` names series whose points are different things, not steps of one, and are not joined.
     """
     figure, axes = _figure(width, 0.55 * width)
     for index, (name, points) in enumerate(series.items()):
         seconds, error = zip(*sorted(points), strict=True)
         colour, marker = PALETTE[index % len(PALETTE)], _MARKERS[index % len(_MARKERS)]
-        axes.plot(seconds, error, marker + "-", color=colour, lw=1.2, ms=7, label=name, zorder=3)
+        line = "" if name in apart else "-"
+        axes.plot(seconds, error, marker, ls=line, color=colour, lw=1.2, ms=7, label=name, zorder=3)
     _draw_front(axes, pareto_front([p for points in series.values() for p in points]) if front is None else front)
     if noise is not None:
         axes.axhline(noise, color="#6b7280", lw=1.8, ls="--", label=f"sensor noise, {noise:.1e}")

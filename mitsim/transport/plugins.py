@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsim.transport import grating, lensless
+from mitsim.transport import aperture, grating, lensless
 
 
 def register() -> None:
@@ -15,3 +15,4 @@ def register() -> None:
     """
     lensless.register()
     grating.register()
+    aperture.register()

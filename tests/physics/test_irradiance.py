@@ -126,11 +126,10 @@ from pathlib import Path
 from mitsim.capture.bench import open_bench
 bench = open_bench(Path(sys.argv[2]), sys.argv[1])
 import mitsuba as mi
-from mitsim.capture.light import grid_for
-from mitsim.transport.factored import Tracer
+from mitsim.transport.direct import DirectTracer
 frame = np.array(mi.render(bench.loaded.scene, spp=64, seed=1), dtype=np.float64)[..., 0]
-tracer = Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid_for(bench, 8), 1)
-totals = [tracer.batch(seed).light.sum() for seed in range(24)]
+tracer = DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.source, 1)
+totals = [tracer.trace(seed, 0, 64).value.sum() / 64 for seed in range(24)]
 print(json.dumps({"reference": [frame.mean(), frame.std(ddof=1) / frame.size**0.5],
                   "factored": [np.mean(totals), np.std(totals, ddof=1) / 24**0.5]}))
 """
@@ -181,17 +180,13 @@ def centroid(frame: np.ndarray) -> tuple[float, float]:
 def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     """Frame of the factored estimator when projector pixel (r, c) emits ``light[r, c]`` of its power."""
     from mitsim.capture.bench import open_bench
-    from mitsim.capture.light import grid_for
-    from mitsim.optics.frames import ExpectedFrames, FrameOptics
-    from mitsim.transport.factored import Tracer
+    from mitsim.capture.simulation import Simulation
+    from mitsim.scene.plan import Settings
 
-    bench = open_bench(path)
-    grid = grid_for(bench, 4)
-    tracer = Tracer(bench.loaded.scene, bench.loaded.camera, bench.source, grid, anchors=2)
-    groups = [tracer.batch(seed).light for seed in range(4)]
-    optics = FrameOptics(bench.geometry, grid.rows.edges, grid.columns.edges, Z, 2)
+    simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)
-    return next(iter(ExpectedFrames(optics, groups, labels, light.reshape(1, -1), 0))).irradiance
+    groups = [simulation.file(simulation.direct.trace(seed, 0, 16), labels, 16) for seed in range(4)]
+    return next(iter(simulation.expected(groups, labels, light.reshape(1, -1), 0))).irradiance
 
 
 PIXELS = [(0, 0), (0, 15), (3, 11)]

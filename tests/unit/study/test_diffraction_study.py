@@ -133,6 +133,6 @@ def test_files_and_report(study: diffraction.DiffractionStudy) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["diffraction.json", "quality.png", "shadow.png"]
     kept = json.loads((folder / "diffraction.json").read_text())
     assert len(kept["shadows"]) == 8
-    assert len(kept["quality"]) == 2 * 2 * 7 + 2 * 3, "geometric light has one pair of factors, the others two"
+    assert len(kept["quality"]) == 2 * 2 * 7 + 2 * 2 * 2, "idealised: one pair of factors without diffraction"
     assert kept["seed"] == 1 and {"loss_db", "psnr_db", "residual", "status"} <= kept["quality"][0].keys()
     assert study.verdict in " ".join(study.lines())

@@ -97,6 +97,7 @@ def test_pareto_rings_the_front_and_draws_the_noise() -> None:
     ring = lines["best for its time"]
     assert list(zip(*ring.get_data(), strict=True)) == [(1.0, 0.5), (3.0, 0.1), (4.0, 0.05)]
     assert list(np.asarray(lines["sensor noise, 2.0e-01"].get_ydata())) == [0.2, 0.2]
+    assert [line.get_linestyle() for line in plots.pareto(series, apart=["b"]).axes[0].lines[:2]] == ["-", "None"]
     given = plots.pareto(series, front=[(2.0, 0.6)]).axes[0]
     assert [list(line.get_xdata()) for line in given.lines if line.get_label() == "best for its time"] == [[2.0]]
 
@@ -141,3 +142,19 @@ def test_no_pyplot_is_loaded() -> None:
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_quality_by_factors_shows_every_value_on_the_line_of_its_system() -> None:
+    rows = [("ray", "assumed", 40.0), ("wave", "assumed", 20.0), ("wave", "found", 41.0)]
+    figure = plots.quality_by_factors(rows, "a message")
+    axes = figure.axes[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["wave", "ray"], "the first stands on top"
+    marks = {line.get_label(): line.get_xydata().tolist() for line in axes.lines if line.get_marker() != "None"}
+    assert marks == {"assumed": [[40.0, 1.0], [20.0, 0.0]], "found": [[41.0, 0.0]]}
+    assert "dB" in axes.get_xlabel() and figure.get_suptitle() == "a message"
+
+
+def test_shadow_profiles_show_the_middle_of_the_sensor() -> None:
+    axes = plots.shadow_profiles([-1.0, -0.5, 0.0, 0.5, 1.0], {"rays": [1, 2, 3, 4, 5]}, 0.5, "a message").axes[0]
+    assert axes.lines[0].get_xydata().tolist() == [[-0.5, 2.0], [0.0, 3.0], [0.5, 4.0]]
+    assert "mm" in axes.get_xlabel() and axes.get_title() == "a message"
