@@ -191,17 +191,11 @@ CORNER = Case("corner", "separable", "uniform", 0, 1e-3, 4, BOUNCES)
 CARDS = Case("cards", "separable", "uniform", 0, 1.5e-3, 8)
 LAMP = Case("lamp_bench", "separable", "uniform", 0, 1e-3, 4, ("ambient",))
 BAG = Case("cookie_bag", "separable", "uniform", 0, 1.5e-3, 4, BOUNCES)
-DEFAULT = [
-    PHOTOGRAPH,
+DEFAULT = [PHOTOGRAPH, DOTS, CORNER, CARDS, LAMP, BAG, Case("compact_disc", "separable", "uniform", 0, 1e-3, 8)]
+LONGER = [
+    FLATCAM,
     Case("colour_chart", "separable", "uniform", 0, 5e-4, 8),
     Case("resolution_target", "separable", "uniform", 0, 1e-3, 8),
-    Case("compact_disc", "separable", "uniform", 0, 1e-3, 8),
-    FLATCAM,
-    DOTS,
-    CORNER,
-    CARDS,
-    LAMP,
-    BAG,
     Case("gift_card", "separable", "uniform", 0, 1.5e-3, 4),
     Case("metal_blade", "separable", "uniform", 0, 1.5e-3, 4),
     Case("keystone", "separable", "uniform", 0, 1e-3, 4),
@@ -222,7 +216,7 @@ FINER = [
         "compact_disc": BOUNCES,
     }.items()
 ]
-CASE_LIST = [*DEFAULT, *(pytest.param(case, marks=pytest.mark.slow) for case in FINER)]
+CASE_LIST = [*DEFAULT, *(pytest.param(case, marks=pytest.mark.slow) for case in LONGER + FINER)]
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +281,7 @@ GEOMETRIC = [name for name in MUTATIONS if "%" not in name]
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS)
-@pytest.mark.parametrize("case", [PHOTOGRAPH, FLATCAM, DOTS], ids=str)
+@pytest.mark.parametrize("case", [PHOTOGRAPH, DOTS], ids=str)
 def test_a_planted_mistake_is_seen(compare: Compare, mutation: str, case: Case) -> None:
     if case is DOTS and mutation not in GEOMETRIC:
         pytest.skip("the reference is blind to a percent under one of 49 dot patterns")
