@@ -45,7 +45,7 @@ def test_a_plan_as_json(call: Callable[..., Any], lab: Any) -> None:
         assert {"effects", "accuracy", "predicted_seconds"} <= set(block)
         rows = {row["name"]: row for row in block["effects"]}
         assert set(SWITCHES) <= set(rows) and len(rows) == len(block["effects"])
-        assert all(ROW <= set(row) and row["seconds"] >= 0 for row in rows.values())
+        assert all(set(row) >= ROW and row["seconds"] >= 0 for row in rows.values())
         assert block["accuracy"] == 0.02 and block["predicted_seconds"] > 0
     rows = {row["name"]: row for row in forced["effects"]}
     assert rows["diffraction"]["state"] == "off" and "--effects" in rows["diffraction"]["reason"]
