@@ -224,7 +224,9 @@ class _Effects:
         if name in ("aperture", "blur", "pixel-response", "mirrors"):
             other = self._other(simulation)
         if name == "interreflection":
-            other = tuple(found.where(found.order != INDIRECT) for found in other)
+            # Lamps' light bounces as well, and only paths that were never followed tell how much of it.
+            lamps = simulation.lit_by_lamps
+            other = self._other(simulation) if lamps else tuple(found.where(found.order != INDIRECT) for found in other)
         if name == "ambient":
             other = tuple(found.where(found.order != AMBIENT) for found in other)
         return self._form(simulation, direct, other)
