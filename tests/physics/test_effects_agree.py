@@ -32,7 +32,7 @@ from tests.physics.test_estimators_agree import (
     z_scores,
 )
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("variant")]
 SmallScene = Callable[..., Path]
 
 

@@ -73,8 +73,9 @@ def changes(shipped_bench: Callable[..., Bench]) -> Callable[[str, Effort], dict
     return measure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("accuracy", [1e-2, 1e-3])
-@pytest.mark.parametrize("scene", SCENES[:1])
+@pytest.mark.parametrize("scene", SCENES[:3])
 def test_the_plan_keeps_its_word(
     shipped_bench: Callable[..., Bench], changes: Callable[..., dict[str, Change]], scene: str, accuracy: float
 ) -> None:
