@@ -265,7 +265,10 @@ def truth(bench: Bench, plan: Plan, light: Light, seed: int) -> FloatArray:
 def board_flux(bench: Bench, plan: Plan, seed: int) -> FloatArray:
     """(n^2,) direct light of each projector pixel on the sensor, over the calibration board [W m^-2]."""
     settings = Settings(
-        bench.geometry.scene_distance, plan.settings.anchors, effects=_OF_PROJECTOR & plan.settings.effects
+        bench.geometry.scene_distance,
+        plan.settings.anchors,
+        effects=_OF_PROJECTOR & plan.settings.effects,
+        direct_samples=plan.settings.direct_samples,
     )
     board = bench.with_board(load_recipe().board_reflectance)
     return collect(

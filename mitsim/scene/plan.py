@@ -29,6 +29,8 @@ _SAMPLING_MARGIN = 0.95
 _FLAGGED = 1.5
 """Every effect is held to the accuracy by itself; their sum is reported, and flagged above this much of it."""
 _FEWEST_SAMPLES = 1e-3
+_FEWEST_DIRECT = 8.0
+"""Samples a projector pixel: few are cheap, and a spectrum or a texture wants more than the frames' error tells."""
 _COARSE = 0.4
 _OF_OTHER = frozenset({"interreflection", "ambient", "mirrors"})
 """Effects whose light is followed from the camera."""
@@ -283,7 +285,7 @@ class _Cost:
         single = target * math.sqrt(GROUPS)
         self.other = bool(settings.effects & _OF_OTHER)
         direct, other = (0.5, 0.85) if self.other else (1.0, 0.0)
-        self.direct_samples = max(1.0, evidence.noise[0].samples_for(single * direct))
+        self.direct_samples = max(_FEWEST_DIRECT, evidence.noise[0].samples_for(single * direct))
         self.other_samples = max(1.0, evidence.noise[1].samples_for(single * other)) if self.other else 0.0
 
     @property

@@ -51,7 +51,7 @@ def test_plan(call: Callable[..., Any], lab: Any) -> None:
         assert number(effect["seconds"])
     # The names are those that DESIGN section 6 lists.
     names = " ".join(effect["name"] for effect in plan["effects"])
-    for effect in ("anchors", "depth", "interreflection", "aperture", "ambient", "diffraction", "thickness", "noise"):
+    for effect in ("anchors", "layers", "interreflection", "aperture", "ambient", "diffraction", "thickness", "noise"):
         assert effect in names
 
 
@@ -154,11 +154,10 @@ def test_doctor(call: Callable[..., Any]) -> None:
 
 
 def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    scene = lab.write_scene("ambient", extra=CONSTANT)
-    for verb in (("plan", scene), ("capture", scene, "-o", tmp_path / "run", "--patterns", "uniform")):
-        outcome = call(*verb, *lab.electronics, "--json")
+    for verb in (("plan", *lab.rig), ("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4")):
+        outcome = call(*verb, "--effects=-diffraction", "--accuracy", "0.005", "--json")
         assert outcome.code == 1
-        assert outcome.payload["warnings"] and "ambient" in outcome.payload["warnings"][0]
+        assert outcome.payload["warnings"] and "no diffraction" in outcome.payload["warnings"][0]
         lines = outcome.err.splitlines()
         assert len(lines) == len(outcome.payload["warnings"])
         assert all(line.startswith("mitsim: warning: ") for line in lines)

@@ -17,7 +17,8 @@ import pytest
 
 from mitsim.core.frames import read_frame
 
-FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 45.0), "hadamard:4": (32, 55.0), "random:4": (16, 37.0)}
+# Frames of 2 % accuracy: how much better than that they happen to be decides over some dB of the Hadamard image.
+FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 45.0), "hadamard:4": (32, 45.0), "random:4": (16, 37.0)}
 """Frames, and the least PSNR [dB] of an image with automatic lambda."""
 
 
@@ -119,9 +120,9 @@ def test_lambda_by_value(recover: Callable[..., Any]) -> None:
 
 
 def test_total_variation(recover: Callable[..., Any]) -> None:
-    # Few data and a print of smooth parts: seeds 0 and 1 gave 5.7 and 6.0 dB over Tikhonov.
+    # Few data and a print of smooth parts: 2.8 dB over Tikhonov with the wave-optical shadow, 5.7 with the geometric one.
     found = recover("uniform", "--method", "tv")
-    assert found["psnr"] > recover("uniform")["psnr"] + 3
+    assert found["psnr"] > recover("uniform")["psnr"] + 2
     assert "total variation" in found["status"]
 
 
