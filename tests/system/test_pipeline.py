@@ -120,7 +120,7 @@ def test_lambda_by_value(recover: Callable[..., Any]) -> None:
 
 
 def test_total_variation(recover: Callable[..., Any]) -> None:
-    # Few data and a print of smooth parts: 2.8 dB over Tikhonov with the wave-optical shadow, 5.7 with the geometric one.
+    # Few data and a print of smooth parts: 2.8 dB over Tikhonov in the wave-optical shadow, 5.7 in the geometric one.
     found = recover("uniform", "--method", "tv")
     assert found["psnr"] > recover("uniform")["psnr"] + 2
     assert "total variation" in found["status"]
