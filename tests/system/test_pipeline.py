@@ -17,7 +17,8 @@ import pytest
 
 from mitsim.core.frames import read_frame
 
-# Frames of 2 % accuracy: how much better than that they happen to be decides over some dB of the Hadamard image.
+# Known defect: hadamard:4 gave above 55 dB before the transport was rewritten and gives 48 now, at any accuracy.
+# The cause is not known (suspect: the pilot judges cells badly at small n); the gate was lowered, restore it with the cure.
 FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 45.0), "hadamard:4": (32, 45.0), "random:4": (16, 37.0)}
 """Frames, and the least PSNR [dB] of an image with automatic lambda."""
 
@@ -120,7 +121,7 @@ def test_lambda_by_value(recover: Callable[..., Any]) -> None:
 
 
 def test_total_variation(recover: Callable[..., Any]) -> None:
-    # Few data and a print of smooth parts: 2.8 dB over Tikhonov in the wave-optical shadow, 5.7 in the geometric one.
+    # Few data and a print of smooth parts: 2.8 dB over Tikhonov now, 5.7 before; cause unknown, gate lowered from 3.
     found = recover("uniform", "--method", "tv")
     assert found["psnr"] > recover("uniform")["psnr"] + 2
     assert "total variation" in found["status"]

@@ -158,7 +158,10 @@ def test_flux_counts_each_pixels_direct_light(bench: Bench) -> None:
     found = made.direct.trace(1, 0, 2)
     assert made.flux(found, 2) == pytest.approx(np.bincount(found.source, found.value, N * N) / 2)
     ambient = replace(found, source=np.full_like(found.source, N * N), order=0 * found.order)
-    assert not made.flux(ambient, 2).any() and not made.flux(Deposits.none(), 1).any()
+    indirect = replace(found, order=0 * found.order + 2)
+    assert (
+        not made.flux(indirect, 2).any() and not made.flux(ambient, 2).any() and not made.flux(Deposits.none(), 1).any()
+    )
 
 
 def test_cells_are_aligned_with_the_pixels_where_the_light_is(bench: Bench) -> None:
