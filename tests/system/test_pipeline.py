@@ -18,7 +18,7 @@ import pytest
 from mitsim.core.frames import read_frame
 
 # Known defect: hadamard:4 gave above 55 dB before the transport was rewritten and gives 48 now, at any accuracy.
-# The cause is not known (suspect: the pilot judges cells badly at small n); the gate was lowered, restore it with the cure.
+# Cause unknown (suspect: the pilot judges cells badly at small n). The gate was lowered: restore it with the cure.
 FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 45.0), "hadamard:4": (32, 45.0), "random:4": (16, 37.0)}
 """Frames, and the least PSNR [dB] of an image with automatic lambda."""
 
