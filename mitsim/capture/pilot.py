@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -30,12 +29,11 @@ Labels = npt.NDArray[np.int64]
 Halves = tuple[FloatArray, FloatArray]
 ANCHOR_LADDER = (1, 2, 3, 5, 8)
 LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)
-CELL_CHOICES = ((1, False), (2, False), (2, True), (3, True), (4, True))
+CELL_LADDER = (1, 2, 4, 8)
 _FIRST_JUDGE = 5
-_ANCHOR_SAMPLES = 4
 _CAPTURES = 4
-_CELL_SAMPLES = 16
-_DIRECT_SAMPLES, _OTHER_SAMPLES = 4, 2
+_PIXELS = 64**2
+"""Few projector pixels are sampled more often, until they are as many samples as these pixels take."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +42,25 @@ class _Family:
 
     labels: Labels
     weights: FloatArray
+
+    @property
+    def _more(self) -> int:
+        return max(1, _PIXELS // self.labels.size)
+
+    @property
+    def fine(self) -> int:
+        """Samples a projector pixel to tell cells and layers apart."""
+        return 16 * self._more
+
+    @property
+    def direct(self) -> int:
+        """Samples a projector pixel to tell effects and anchors apart."""
+        return 4 * self._more
+
+    @property
+    def other(self) -> int:
+        """Samples a cell of light that is followed from the camera."""
+        return 2 * self._more
 
 
 def applicable(bench: Bench) -> tuple[str, ...]:
@@ -84,7 +101,7 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
     fine = _Fine(bench, base, family, accuracy, seed)
     layer_error = fine.layer_errors()
     cell_error = fine.cell_errors()
-    effects = _Effects(bench, replace(base, effects=frozenset(names), linear=True), family, seed)
+    effects = _Effects(bench, replace(base, effects=frozenset(names), subdivision=2), family, seed)
     effect_error = effects.errors(names)
     if "speckle" in names:
         effect_error["speckle"] = bench.projector.speckle_contrast
@@ -129,11 +146,11 @@ class _Fine:
         self.simulation = Simulation(bench, base)
         tracer = self.simulation.direct
         seeds = [integer(seed, "pilot", "fine", half) for half in range(2)]
-        first = tracer.trace(seeds[0], 0, _CELL_SAMPLES)
+        first = tracer.trace(seeds[0], 0, family.fine)
         started = time.perf_counter()
-        second = tracer.trace(seeds[1], 0, _CELL_SAMPLES)
-        self.seconds_per_connection = (time.perf_counter() - started) / (tracer.lanes * _CELL_SAMPLES)
-        few = [tracer.trace(one, 0, _CELL_SAMPLES // 4) for one in seeds]
+        second = tracer.trace(seeds[1], 0, family.fine)
+        self.seconds_per_connection = (time.perf_counter() - started) / (tracer.lanes * family.fine)
+        few = [tracer.trace(one, 0, family.fine // 4) for one in seeds]
         first, second, *few = (_shown(found, family) for found in (first, second, *few))
         self.deposits, self.few = (first, second), (few[0], few[1])
         near, far = self._range()
@@ -156,33 +173,32 @@ class _Fine:
         """Error by number of layers, judged by the most; the search stops where it is good enough."""
         if len(self.layers) == 1:
             return {1: 0.0}
-        frames = partial(self._frames, subdivision=1, linear=True)
-        return _ladder(self.layers, lambda count: frames(layers=self.layers[count]), 3, self.accuracy)
+        return _ladder(self.layers, lambda count: self._frames(self.layers[count], 2), 3, self.accuracy)
 
-    def cell_errors(self) -> dict[tuple[int, bool], float]:
-        """Error by cells, judged by the finest."""
-        frames = {choice: self._frames((), *choice) for choice in CELL_CHOICES}
-        judge = CELL_CHOICES[-1]
-        errors = {choice: _difference(frames[choice], frames[judge]) for choice in CELL_CHOICES[:-1]}
-        # Splitting between corners is of second order: cells half as large leave a quarter.
-        return {**errors, judge: errors[CELL_CHOICES[-2]] / 3}
+    def cell_errors(self) -> dict[int, float]:
+        """Error by cells a side of a projector pixel, judged by the finest that were tried."""
+        errors = _ladder(CELL_LADDER, lambda count: self._frames((), count), 2, self.accuracy)
+        judge, before = max(errors), max(count for count in errors if count < max(errors))
+        # Even cells are of second order: with k a side, the error falls with 1/k^2, and the judge has its own part.
+        whole = {count: error / (1 - (count / judge) ** 2) for count, error in errors.items() if count < judge}
+        return {**whole, judge: whole[before] * (before / judge) ** 2}
 
     def noise(self) -> Noise:
         """Monte Carlo error of one estimate, and how fast it falls."""
-        many = _noise(self._frames((), 1, True))
-        few = _noise(self._frames((), 1, True, self.few, _CELL_SAMPLES // 4))
+        many = _noise(self._frames((), 1))
+        few = _noise(self._frames((), 1, self.few, self.family.fine // 4))
         rate = math.log(few / many) / math.log(4) if many > 0 and few > 0 else 1.0
-        return Noise(many, _CELL_SAMPLES, min(max(rate, 0.5), 1.0))
+        return Noise(many, self.family.fine, min(max(rate, 0.5), 1.0))
 
     def _frames(
         self,
         layers: tuple[float, ...],
         subdivision: int,
-        linear: bool,
         deposits: tuple[Deposits, Deposits] | None = None,
-        samples: int = _CELL_SAMPLES,
+        samples: int | None = None,
     ) -> Halves:
-        settings = replace(self.base, layers=layers, subdivision=subdivision, linear=linear)
+        samples = samples or self.family.fine
+        settings = replace(self.base, layers=layers, subdivision=subdivision)
         simulation = Simulation(self.bench, settings)
         found = deposits or self.deposits
         halves = tuple(_form(simulation, one, samples, self.family) for one in found)
@@ -201,7 +217,7 @@ class _Effects:
         started = time.perf_counter()
         self._other(self.simulation)
         self.cells = self.simulation.other.lanes if self.simulation.other else 1
-        self.seconds_per_path = (time.perf_counter() - started) / (2 * self.cells * _OTHER_SAMPLES)
+        self.seconds_per_path = (time.perf_counter() - started) / (2 * self.cells * family.other)
         self.frames = self._form(self.simulation, self.direct, self.other)
 
     def errors(self, names: tuple[str, ...]) -> dict[str, float]:
@@ -214,7 +230,7 @@ class _Effects:
         first, second = self._form(self.simulation, none, self.other)
         energy = float(np.vdot(*self.frames))
         spread = float(np.square(first - second).sum()) / 2
-        return Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, _OTHER_SAMPLES, 0.5)
+        return Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.other, 0.5)
 
     def _without(self, name: str) -> Halves:
         simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {name}))
@@ -232,16 +248,16 @@ class _Effects:
         return self._form(simulation, direct, other)
 
     def _direct(self, simulation: Simulation) -> tuple[Deposits, ...]:
-        return tuple(simulation.direct.trace(seed, 0, _DIRECT_SAMPLES) for seed in self.seeds)
+        return tuple(simulation.direct.trace(seed, 0, self.family.direct) for seed in self.seeds)
 
     def _other(self, simulation: Simulation) -> tuple[Deposits, ...]:
         if simulation.other is None:
             return tuple(Deposits.none() for _ in self.seeds)
-        return tuple(simulation.other.trace(seed, 0, _OTHER_SAMPLES) for seed in self.seeds)
+        return tuple(simulation.other.trace(seed, 0, self.family.other) for seed in self.seeds)
 
     def _form(self, simulation: Simulation, direct: tuple[Deposits, ...], other: tuple[Deposits, ...]) -> Halves:
         first, second = (
-            _form(simulation, one, _DIRECT_SAMPLES, self.family, two) for one, two in zip(direct, other, strict=True)
+            _form(simulation, one, self.family.direct, self.family, two) for one, two in zip(direct, other, strict=True)
         )
         return first, second
 
@@ -256,7 +272,7 @@ def _anchor_errors(bench: Bench, base: Settings, family: _Family, accuracy: floa
         simulation = Simulation(bench, replace(base, anchors=anchors))
         loaded = bench.loaded
         tracer = DirectTracer(loaded.scene, loaded.camera, simulation.source, anchors, simulation.geometry)
-        halves = (tracer.trace(integer(seed, "pilot", "anchors", half), 0, _ANCHOR_SAMPLES) for half in range(2))
+        halves = (tracer.trace(integer(seed, "pilot", "anchors", half), 0, family.direct) for half in range(2))
         first, second = (_anchored(simulation, _shown(found, family), family) for found in halves)
         return first, second
 
@@ -265,7 +281,7 @@ def _anchor_errors(bench: Bench, base: Settings, family: _Family, accuracy: floa
 
 def _anchored(simulation: Simulation, found: Deposits, family: _Family) -> FloatArray:
     """(captures, pixels, pixels) frames of light that was connected to every anchor."""
-    light = simulation.coarse.file(found, family.labels, _ANCHOR_SAMPLES)
+    light = simulation.coarse.file(found, family.labels, family.direct)
     rows = np.arange(family.weights.shape[1])
     frames = ExpectedFrames(simulation.coarse_optics, [light[: len(rows)]], rows, family.weights, 0)
     return np.stack([frame.irradiance for frame in frames])
@@ -299,10 +315,10 @@ def _ladder(
 def _form(
     simulation: Simulation, found: Deposits, samples: int, family: _Family, other: Deposits | None = None
 ) -> FloatArray:
-    """(captures, pixels, pixels) frames of some direct light, and of other light in ``_OTHER_SAMPLES``."""
+    """(captures, pixels, pixels) frames of some direct light, and of other light in ``family.other``."""
     light = simulation.file(found, family.labels, samples)
     if other is not None:
-        light = light + simulation.file_other(other, family.labels, _OTHER_SAMPLES)
+        light = light + simulation.file_other(other, family.labels, family.other)
     rows = np.arange(family.weights.shape[1])
     exact = simulation.mirrored(family.labels)
     frames = simulation.expected([light], rows, family.weights, 0, exact)

@@ -78,10 +78,9 @@ class Simulation:
         self.black = bench.projector.black_level if "black-level" in on else 0.0
         pixels = pixels or bench.n
         self.aim = self._grid(pixels, 1)
-        self.bundle = Bundle(self._grid(pixels, settings.subdivision), 1, settings.depths, settings.linear)
+        self.bundle = Bundle(self._grid(pixels, settings.subdivision), 1, settings.depths)
         depths = settings.depths if settings.coarse_layers else (settings.depth,)
-        subdivision, linear = settings.coarse_cells
-        self.coarse = Bundle(self._grid(pixels, subdivision), settings.anchors, depths, linear)
+        self.coarse = Bundle(self._grid(pixels, settings.coarse_cells), settings.anchors, depths)
         self.smooth = replace(self.coarse, anchors=1)
 
     def _grid(self, pixels: int, subdivision: int) -> CellGrid:
@@ -91,7 +90,7 @@ class Simulation:
         """
         windows = self.bench.windows_at(self.settings.depth)
         reach = self.geometry.tan_half_fov + self.geometry.half_width / self.settings.depth
-        return aligned_grid(*windows, pixels, subdivision, reach, multiple=subdivision)
+        return aligned_grid(*windows, pixels, subdivision, reach)
 
     @cached_property
     def source(self) -> Projector:

@@ -66,7 +66,7 @@ class FrameOptics:
         # Stored with the light's index first, so that picking lit rows copies contiguous memory.
         self._layers = [
             [
-                (_stack(_corrected(left, rows), weights), _stack(_corrected(right, columns), weights))
+                (_stack(left, weights), _stack(right, weights))
                 for left, right in _shadow(geometry, _Plain.of(rows), _Plain.of(columns), depth, _lines(spectrum))
             ]
             for depth in depths
@@ -326,19 +326,6 @@ def _shadow(
     """The mask's shadow; the last few are kept, for a plan asks for the same ones many times."""
     spectrum = None if lines is None else Spectrum(np.frombuffer(lines[0]), np.frombuffer(lines[1]))
     return geometry.shadow_terms(rows.directions, columns.directions, depth, spectrum)
-
-
-def _corrected(factor: FloatArray, directions: Directions) -> FloatArray:
-    """The shadow (pixels, corners) for light that is split between cell corners; unchanged for light in cells.
-
-    Linear interpolation between corners overshoots a curved function f by D^2 f''/12 on average over a cell of size D;
-    taking a twelfth of the second difference off the values at the corners cancels that.
-    """
-    if directions.width > 0 or factor.shape[1] < 3:
-        return factor
-    corrected = factor.copy()
-    corrected[:, 1:-1] -= (factor[:, :-2] - 2 * factor[:, 1:-1] + factor[:, 2:]) / 12
-    return corrected
 
 
 def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:

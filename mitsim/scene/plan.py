@@ -61,26 +61,25 @@ class Settings:
         points a side of the sensor from which radiance is evaluated.
     layers
         depths [mm], far to near, between which light is split; one for a flat scene.
-    subdivision, linear
-        cells a side of a projector pixel, and whether light is split between their corners.
+    subdivision
+        cells a side of a projector pixel.
     effects
         those of :data:`PHYSICAL` that are simulated.
     direct_samples, other_samples
         samples a projector pixel of direct light, and a cell of all other light, that each group is predicted to need.
     coarse_cells, coarse_layers
-        cells for what anchors see beyond their mean, and for indirect light: like ``subdivision`` and ``linear``, and
-        whether they have all layers or one.
+        cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
+        they have all layers or one.
     """
 
     depth: float
     anchors: int = 1
     layers: tuple[float, ...] = ()
     subdivision: int = 1
-    linear: bool = False
     effects: frozenset[str] = frozenset()
     direct_samples: float = 1.0
     other_samples: float = 1.0
-    coarse_cells: tuple[int, bool] = (1, False)
+    coarse_cells: int = 1
     coarse_layers: bool = False
 
     @property
@@ -130,7 +129,7 @@ class Evidence:
     anchor_error, layer_error
         error of the frames by anchors a side, and by number of layers.
     cell_error
-        by (cells a side of a projector pixel, linear).
+        by cells a side of a projector pixel.
     effect_error
         error of leaving out each effect of :data:`PHYSICAL` that the scene or its devices have.
     noise
@@ -149,7 +148,7 @@ class Evidence:
     layers: Mapping[int, tuple[float, ...]]
     anchor_error: Mapping[int, float]
     layer_error: Mapping[int, float]
-    cell_error: Mapping[tuple[int, bool], float]
+    cell_error: Mapping[int, float]
     effect_error: Mapping[str, float]
     noise: tuple[Noise, Noise]
     pixels: int
@@ -214,8 +213,7 @@ def decide(
         depth=evidence.depth,
         anchors=anchors,
         layers=evidence.layers[layers] if layers > 1 else (),
-        subdivision=cells[0],
-        linear=cells[1],
+        subdivision=cells,
         effects=on,
     )
     coarse = _coarse(evidence, settings, accuracy)
@@ -253,7 +251,7 @@ def decide(
 class _Coarse:
     """Cells and layers of the light that is small or smooth, and the error that they and one anchor for it leave."""
 
-    cells: tuple[int, bool]
+    cells: int
     layers: bool
     error: float
 
@@ -308,7 +306,7 @@ class _Cost:
     def forming(self, anchors: int, layers: int, waves: bool) -> float:
         terms = self.evidence.terms if waves else 1.0
         fine = layers * self.settings.subdivision**2
-        coarse = (layers if self.settings.coarse_layers else 1) * self.settings.coarse_cells[0] ** 2
+        coarse = (layers if self.settings.coarse_layers else 1) * self.settings.coarse_cells**2
         parts = (anchors**2 if anchors > 1 else 0) + ("interreflection" in self.settings.effects)
         return self.captures * terms * self.evidence.seconds_per_frame * (fine + parts * coarse)
 
@@ -346,9 +344,8 @@ def _layers(layers: int, evidence: Evidence, accuracy: float, cost: _Cost) -> Ef
     return Effect("layers", "approximate", reason, errors[1], seconds * (1 - 1 / layers))
 
 
-def _cells(cells: tuple[int, bool], evidence: Evidence) -> Effect:
-    kind = "light split between cell corners" if cells[1] else "even light in a cell"
-    reason = f"{cells[0]}x{cells[0]} cells a projector pixel, {kind}: leave {evidence.cell_error[cells]:.1e}"
+def _cells(cells: int, evidence: Evidence) -> Effect:
+    reason = f"{cells}x{cells} cells of even light a projector pixel leave {evidence.cell_error[cells]:.1e}"
     return Effect("cells", "approximate", reason, max(evidence.cell_error.values()), 0.0)
 
 
@@ -406,7 +403,7 @@ def _warnings(
     left_out: Mapping[str, float],
     anchors: int,
     layers: int,
-    cells: tuple[int, bool],
+    cells: int,
 ) -> tuple[str, ...]:
     if left <= _FLAGGED * accuracy:
         return ()

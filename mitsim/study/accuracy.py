@@ -212,14 +212,14 @@ class _Study:
         evidence, now = self.evidence, plan.settings
         anchors = next((count for count in evidence.anchor_error if count > now.anchors), now.anchors)
         layers = next((count for count in evidence.layer_error if count > len(now.depths)), len(now.depths))
+        cells = next((count for count in evidence.cell_error if count > now.subdivision), now.subdivision)
         settings = replace(
             now,
             anchors=anchors,
             layers=evidence.layers[layers] if layers > 1 else (),
-            subdivision=4,
-            linear=True,
+            subdivision=cells,
             effects=frozenset(pilot.applicable(self.bench)),
-            coarse_cells=(2, True),
+            coarse_cells=cells,
             coarse_layers=True,
         )
         return replace(plan, settings=settings, sampling_target=plan.accuracy / _JUDGE_MARGIN)
@@ -230,7 +230,7 @@ class _Study:
         parts = (
             evidence.anchor_error[settings.anchors],
             evidence.layer_error[len(settings.depths)],
-            evidence.cell_error[settings.subdivision, settings.linear],
+            evidence.cell_error[settings.subdivision],
         )
         return float(np.linalg.norm(parts))
 

@@ -10,7 +10,7 @@ from mitsim.capture.light import GROUPS, Evidence, Plan, Settings
 from mitsim.optics.frames import ExpectedFrames
 
 Target = Callable[[ExpectedFrames], float]
-CELLS = ((1, False), (1, True), (2, True), (4, True))
+CELLS = (1, 2, 4)
 ANCHORS = (1, 2, 3, 5)
 LAYERS = (1, 2, 4, 8)
 LINE_WIDTH_NM = 2.0
@@ -53,9 +53,8 @@ def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> I
         fixed = sampled(now, samples)
         if _seconds(fixed, evidence) <= patience:
             yield Variant("samples", f"{GROUPS * samples} samples", bench, replace(plan, settings=fixed), at_once)
-    for subdivision, linear in CELLS:
-        name = f"{subdivision}x{subdivision} a pixel, {'split' if linear else 'even'}"
-        yield changed("cells", name, replace(now, subdivision=subdivision, linear=linear))
+    for cells in CELLS:
+        yield changed("cells", f"{cells}x{cells} a pixel", replace(now, subdivision=cells))
     for anchors in ANCHORS:
         settings = replace(now, anchors=anchors)
         if _seconds(settings, evidence) <= patience:

@@ -24,18 +24,22 @@ class CellAxis:
         """(count + 1,) tan-angles of the cell edges."""
         return np.asarray(self.start + self.size * np.arange(self.count + 1), dtype=np.float64)
 
-    def centre(self, index: npt.NDArray[np.int64]) -> FloatArray:
-        """Tan-angle of the centre of each cell."""
-        return np.asarray(self.start + self.size * (index + 0.5), dtype=np.float64)
+    def holds(self, tau: FloatArray) -> npt.NDArray[np.bool_]:
+        """Which tan-angles lie in one of the cells."""
+        return np.asarray((tau >= self.start) & (tau < self.start + self.count * self.size))
+
+    def cell(self, tau: FloatArray) -> npt.NDArray[np.int64]:
+        """The cell of each tan-angle; outside of all, the nearest."""
+        found = np.floor((tau - self.start) / self.size).astype(np.int64)
+        return np.clip(found, 0, self.count - 1)
 
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Rows and columns of cells; each projector pixel on the aligned plane holds ``subdivision`` cells a side."""
+    """Rows and columns of cells."""
 
     rows: CellAxis
     columns: CellAxis
-    subdivision: int
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -49,18 +53,17 @@ def aligned_grid(
     n: int,
     subdivision: int,
     tan_half_fov: float,
-    multiple: int = 1,
 ) -> CellGrid:
-    """Cells whose edges fall on the edges of the n x n projector pixels, grown to cover the field stop.
+    """``subdivision`` cells a side of each of n x n projector pixels, and more of them to cover the field stop.
 
     Light that a plane at the rig's distance reflects then never shares a cell with a neighbouring projector pixel.
-    The margin on each side is a multiple of ``multiple`` cells, so that grids of different subdivisions nest.
+    The margin on each side is a multiple of ``subdivision`` cells, so that grids of different subdivisions nest.
     """
 
     def axis(window: tuple[float, float]) -> CellAxis:
         size = (window[1] - window[0]) / (n * subdivision)
-        before = multiple * max(0, math.ceil((window[0] + tan_half_fov) / size / multiple - 1e-9))
-        after = multiple * max(0, math.ceil((tan_half_fov - window[1]) / size / multiple - 1e-9))
+        before = subdivision * max(0, math.ceil((window[0] + tan_half_fov) / size / subdivision - 1e-9))
+        after = subdivision * max(0, math.ceil((tan_half_fov - window[1]) / size / subdivision - 1e-9))
         return CellAxis(window[0] - before * size, size, n * subdivision + before + after)
 
-    return CellGrid(axis(row_window), axis(column_window), subdivision)
+    return CellGrid(axis(row_window), axis(column_window))

@@ -1,9 +1,8 @@
 """From paths to light per cell: deposits in, a sparse matrix out, light[row, layer x (anchor, cell) x (anchor, cell)].
 
 A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the
-last row. A path's light is split between the two layers (in 1/z) that enclose its depth, and filed either in the cell
-that holds its direction (``linear`` off: right when cells and projector pixels coincide) or between the four nearest
-cell corners, so that its direction is kept to first order (``linear`` on).
+last row. A path's light is filed in the cell that holds its direction, over which it is then taken as even, and split
+between the two layers (in 1/z) that enclose its depth.
 """
 
 from __future__ import annotations
@@ -16,13 +15,12 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.optics.shadow import Directions
-from mitsim.transport.cells import CellAxis, CellGrid
+from mitsim.transport.cells import CellGrid
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
 """Kinds of light, the ``order`` of a deposit."""
-Bins = list[tuple[IntArray, FloatArray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,28 +76,26 @@ class Deposits:
 
 @dataclass(frozen=True)
 class Bundle:
-    """How light is filed: cells, anchors a side, layers as depths [mm] (far to near), between cell corners or not."""
+    """How light is filed: cells, anchors a side, layers as depths [mm] (far to near)."""
 
     grid: CellGrid
     anchors: int
     depths: tuple[float, ...]
-    linear: bool
 
     @property
     def rows(self) -> Directions:
         """Directions of the cells' rows, for the mask's shadow."""
-        return _directions(self.grid.rows, self.linear)
+        return Directions.cells(self.grid.rows.edges)
 
     @property
     def columns(self) -> Directions:
         """Directions of the cells' columns."""
-        return _directions(self.grid.columns, self.linear)
+        return Directions.cells(self.grid.columns.edges)
 
     @property
     def cells(self) -> tuple[int, int]:
-        """Rows and columns of cells, or of cell corners."""
-        extra = int(self.linear)
-        return self.grid.rows.count + extra, self.grid.columns.count + extra
+        """Rows and columns of cells."""
+        return self.grid.shape
 
     @property
     def size(self) -> int:
@@ -108,37 +104,25 @@ class Bundle:
 
     def file(self, found: Deposits, labels: IntArray, samples: int = 1) -> sparse.csr_array:
         """(C + 1, size) light a row, divided by ``samples``; ``labels`` (n^2,) gives the row 0..C-1 of each pixel."""
-        inside = self._inside(self.grid.rows, found.row) & self._inside(self.grid.columns, found.column)
+        inside = self.grid.rows.holds(found.row) & self.grid.columns.holds(found.column)
         if not inside.all():
             found = found.where(inside)
         width = self.anchors * self.cells[1]
         plane = self.anchors * self.cells[0] * width
         count = int(labels.max()) + 1
         row = np.append(labels, count)[found.source]
-        places, values, lines = [], [], []
-        shares = self.shares(found.row, found.column)
-        for layer, in_layer in self._layers(found.inverse_depth):
-            for y, x, in_cell in shares:
-                line = found.anchor_row * self.cells[0] + y
-                places.append(layer * plane + line * width + found.anchor_column * self.cells[1] + x)
-                values.append(found.value * (in_layer * in_cell / samples))
-                lines.append(row)
+        line = found.anchor_row * self.cells[0] + self.grid.rows.cell(found.row)
+        place = line * width + found.anchor_column * self.cells[1] + self.grid.columns.cell(found.column)
+        layers = self._layers(found.inverse_depth)
+        values = np.concatenate([found.value * (share / samples) for _, share in layers])
+        flat = np.concatenate([layer * plane + place for layer, _ in layers])
         shape = (count + 1, self.size)
-        flat = np.concatenate(places)
         # 32-bit indices sort twice as fast.
         index = np.int32 if max(shape) < 2**31 else np.int64
-        entries = np.concatenate(values), (np.concatenate(lines).astype(index), flat.astype(index))
+        entries = values, (np.tile(row, len(layers)).astype(index), flat.astype(index))
         light = sparse.coo_array(entries, shape=shape).tocsr()
         light.eliminate_zeros()
         return light
-
-    def shares(self, row: FloatArray, column: FloatArray) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """Cells or corners (row, column) that light at these tan-angles goes to, and the part that each gets."""
-        return [
-            (y, x, in_row * in_column)
-            for y, in_row in self._bins(self.grid.rows, row)
-            for x, in_column in self._bins(self.grid.columns, column)
-        ]
 
     def repeated(self, light: sparse.csr_array) -> sparse.csr_array:
         """Light that was filed with one anchor, (rows, size / anchors^2), as if every anchor saw it."""
@@ -154,22 +138,8 @@ class Bundle:
         entries = np.tile(found.data, copies), (np.tile(found.row, copies), np.concatenate(places))
         return sparse.coo_array(entries, shape=(light.shape[0], self.size)).tocsr()
 
-    @staticmethod
-    def _inside(axis: CellAxis, tau: FloatArray) -> npt.NDArray[np.bool_]:
-        last = axis.start + axis.count * axis.size
-        return np.asarray((tau >= axis.start) & (tau < last))
-
-    def _bins(self, axis: CellAxis, tau: FloatArray) -> Bins:
-        """Cells, or pairs of corners, that share the light at ``tau``, each with its part."""
-        position = (tau - axis.start) / axis.size
-        cell = np.clip(np.floor(position).astype(np.int64), 0, axis.count - 1)
-        if not self.linear:
-            return [(cell, np.ones(1))]
-        upper = position - cell
-        return [(cell, 1 - upper), (cell + 1, upper)]
-
-    def _layers(self, inverse_depth: FloatArray) -> Bins:
-        """The same for layers; light beyond the first or the last layer goes to it."""
+    def _layers(self, inverse_depth: FloatArray) -> list[tuple[IntArray, FloatArray]]:
+        """Pairs of layers that share the light, each with its part; beyond the first or the last all goes to it."""
         if len(self.depths) == 1:
             return [(np.zeros(1, dtype=np.int64), np.ones(1))]
         nodes = 1 / np.asarray(self.depths)
@@ -177,7 +147,3 @@ class Bundle:
         layer = np.minimum(position.astype(np.int64), len(nodes) - 2)
         nearer = position - layer
         return [(layer, 1 - nearer), (layer + 1, nearer)]
-
-
-def _directions(axis: CellAxis, linear: bool) -> Directions:
-    return Directions(axis.edges, 0.0) if linear else Directions.cells(axis.edges)

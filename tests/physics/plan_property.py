@@ -92,7 +92,7 @@ class _Look:
         self.bench, self.labels, self.weights, self.effort, self.seed = bench, labels, weights, effort, seed
         # Light that no capture shows is dropped before it is filed, which takes most of the time.
         self.shown = np.append(weights.any(axis=0)[labels], True)
-        self.full = replace(base, subdivision=2, linear=True, coarse_cells=(2, True), coarse_layers=True)
+        self.full = replace(base, subdivision=2, coarse_cells=2, coarse_layers=True)
         self.full = replace(self.full, layers=self._layers())
 
     def _layers(self) -> tuple[float, ...]:

@@ -17,9 +17,7 @@ import pytest
 
 from mitsim.core.frames import read_frame
 
-# Known defect: hadamard:4 gave above 55 dB before the transport was rewritten and gives 48 now, at any accuracy.
-# Cause unknown (suspect: the pilot judges cells badly at small n). The gate was lowered: restore it with the cure.
-FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 45.0), "hadamard:4": (32, 45.0), "random:4": (16, 37.0)}
+FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 62.0), "hadamard:4": (32, 55.0), "random:4": (16, 50.0)}
 """Frames, and the least PSNR [dB] of an image with automatic lambda."""
 
 
@@ -56,13 +54,21 @@ def test_every_family_is_captured_and_recovered(
     frames, least = FAMILIES[patterns]
     run, captured = runs(patterns)
     assert captured["frames"] == frames == len(list(run.glob("frame_*.exr")))
-    assert captured["mc_error"] <= 0.02, "the accuracy that was asked for"
+    assert captured["mc_error"] <= 0.005, "the accuracy that was asked for"
     found = recover(patterns)
     assert least < found["psnr"] < least + 20 and found["rank"] == 256
     image = read_frame(Path(found["output"]) / "image.exr")[0]["reflectance"]
     truth = read_frame(run / "truth.exr")[0]["reflectance"]
     # PSNR is peak 1 with no gain or offset fit (DESIGN section 5), so that anyone can compute it from the files.
     assert found["psnr"] == pytest.approx(-10 * np.log10(np.mean((image - truth.astype(float)) ** 2)), abs=1e-3)
+
+
+def test_detail_finer_than_a_projector_pixel_costs(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """Three squares a pixel: uneven light in a pixel casts another shadow than the board's, and 66 dB become 49."""
+    rig = lab.write_scene("detail", reflectance=lab.photograph(48)), *lab.electronics
+    assert call("capture", *rig, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
+    found = call("reconstruct", tmp_path / "run", "--calibration", lab.calibration, "--json").payload
+    assert 46 < found["psnr"] < 56
 
 
 def test_the_image_stands_upright(lab: Any, recover: Callable[..., Any]) -> None:
@@ -73,7 +79,7 @@ def test_the_image_stands_upright(lab: Any, recover: Callable[..., Any]) -> None
     from skimage.io import imread
 
     sheet = imread(lab.scene.parent / "laboratory_reflectance.png").astype(float) / 255
-    fine = np.kron(sheet, np.ones((8, 8)))[16:-16, 16:-16].reshape(16, 30, 16, 30).mean(axis=(1, 3))
+    fine = sheet[8:-8, 8:-8].reshape(16, 15, 16, 15).mean(axis=(1, 3))
     truth = read_frame(lab.run / "truth.exr")[0]["reflectance"]
     # The board has reflectance 0.99; what a pixel at an edge of the disc weighs differs a little with its place.
     assert np.sqrt(np.mean((truth - fine / 0.99) ** 2)) < 0.01
@@ -121,9 +127,9 @@ def test_lambda_by_value(recover: Callable[..., Any]) -> None:
 
 
 def test_total_variation(recover: Callable[..., Any]) -> None:
-    # Few data and a print of smooth parts: 2.8 dB over Tikhonov now, 5.7 before; cause unknown, gate lowered from 3.
+    # Few data and a print of smooth parts.
     found = recover("uniform", "--method", "tv")
-    assert found["psnr"] > recover("uniform")["psnr"] + 2
+    assert found["psnr"] > recover("uniform")["psnr"] + 4
     assert "total variation" in found["status"]
 
 

@@ -77,7 +77,7 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert set(evidence.effect_error) <= set(PHYSICAL)
     assert {1, 2, 3, 5} <= set(evidence.anchor_error) <= set(pilot.ANCHOR_LADDER)
     assert {1, 2, 3, 4} <= set(evidence.layer_error) <= set(pilot.LAYER_LADDER)
-    assert set(evidence.cell_error) == set(pilot.CELL_CHOICES)
+    assert {1, 2, 4} <= set(evidence.cell_error) <= set(pilot.CELL_LADDER)
     for errors in (evidence.anchor_error, evidence.layer_error):
         assert all(value >= 0 for value in errors.values()) and errors[1] > errors[max(errors)]
     for pace in (evidence.seconds_per_connection, evidence.seconds_per_path, evidence.seconds_per_frame):
@@ -96,26 +96,41 @@ def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
             assert np.diff(1 / np.array(depths), 2) == pytest.approx(np.zeros(count - 2), abs=1e-9)
 
 
-@pytest.mark.parametrize("effect", ["interreflection", "ambient"])
+@pytest.mark.parametrize("effect", ["interreflection", "ambient", "diffraction"])
 def test_effects_come_true(bench: Bench, evidence: Evidence, effect: str) -> None:
     names = frozenset(pilot.applicable(bench)) - {"speckle"}
-    full = Settings(depth=evidence.depth, linear=True, effects=names)
+    full = Settings(depth=evidence.depth, subdivision=2, effects=names)
     judge = frames(bench, full)
     actual = change(frames(bench, replace(full, effects=names - {effect})), judge)
-    assert actual > 5e-3, "the scene has to call for it"
+    assert actual > 1e-3, "the scene has to call for it"
     assert promised(evidence.effect_error[effect], actual)
 
 
 def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
-    base = Settings(depth=evidence.depth, coarse_cells=(2, True), linear=True, subdivision=2)
+    base = Settings(depth=evidence.depth, coarse_cells=2, subdivision=2)
     judge = frames(bench, replace(base, anchors=5), 256)
     actual = change(frames(bench, base, 256), judge)
     assert actual > 2e-3
     assert promised(evidence.anchor_error[1], actual)
 
 
+def test_cells_come_true(bench: Bench, evidence: Evidence) -> None:
+    """Against cells twice as fine as the finest that the pilot tries."""
+    base = Settings(depth=evidence.depth, effects=frozenset({"diffraction"}))
+    judge = frames(bench, replace(base, subdivision=2 * max(pilot.CELL_LADDER)), 1024)
+    for cells in (1, 2):
+        actual = change(frames(bench, replace(base, subdivision=cells), 1024), judge)
+        assert actual > 4e-4
+        assert promised(evidence.cell_error[cells], actual)
+
+
+def test_a_print_in_the_projectors_pixels_needs_no_finer_cells(small_scene: Callable[..., Path]) -> None:
+    found = measured(open_bench(small_scene()), 0).cell_error
+    assert max(found.values()) < 6e-4, "falloff within a pixel of 7.5 mm"
+
+
 def test_layers_come_true(bench: Bench, evidence: Evidence) -> None:
-    base = Settings(depth=evidence.depth, linear=True, subdivision=2, effects=frozenset({"diffraction"}))
+    base = Settings(depth=evidence.depth, subdivision=2, effects=frozenset({"diffraction"}))
     judge = frames(bench, replace(base, layers=evidence.layers[4]), 256)
     actual = change(frames(bench, base, 256), judge)
     assert actual > 2e-3
@@ -126,9 +141,9 @@ def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
     """Spread of six estimates of direct light with sixteen samples; and of other light with two."""
     effects = {0: frozenset({"diffraction"}), 1: frozenset(pilot.applicable(bench)) - {"speckle"}}
     labels, weights = parse_patterns("dots:4", N).classes()
-    everything = frames(bench, Settings(depth=evidence.depth, linear=True, effects=effects[1]))
+    everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=effects[1]))
     for kind in (0, 1):
-        made = Simulation(bench, Settings(depth=evidence.depth, linear=True, effects=effects[kind]))
+        made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=effects[kind]))
         tracer, file = (made.direct, made.file) if kind == 0 else (made.other, made.file_other)
         samples = int(evidence.noise[kind].samples)
         groups = [file(tracer.trace(integer(9, kind, index), 0, samples), labels, samples) for index in range(6)]

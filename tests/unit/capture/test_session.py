@@ -5,7 +5,6 @@ Few electrons (1 % of full well) make the sensor's noise the only error that cou
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +26,8 @@ Done = tuple[Bench, CalibrationResult, Calibration]
 
 
 def geometric_plan(*arguments: object) -> Plan:
-    """Direct light through a geometric mask, in cells that are the projector's pixels: exact on the board."""
-    plan = make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
-    return replace(plan, settings=replace(plan.settings, subdivision=1, linear=False))
+    """Direct light through a geometric mask."""
+    return make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
 
 
 def recipe(mode: str, fraction: float = 0.01) -> object:

@@ -131,7 +131,7 @@ def test_ambient_light_is_in_a_dark_capture(bench: Bench) -> None:
 
 
 def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
-    made = simulation(bench, "interreflection", "ambient", subdivision=2, coarse_cells=(1, False))
+    made = simulation(bench, "interreflection", "ambient", subdivision=2, coarse_cells=1)
     assert made.bundle.cells == (2 * made.smooth.cells[0], 2 * made.smooth.cells[1])
     labels = np.zeros(N * N, dtype=np.int64)
     found = made.other.trace(1, 0, 8)
@@ -143,7 +143,7 @@ def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
 
 def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
     """Weighed by the mean anchor weights, what is filed for single anchors adds up to nothing."""
-    made = simulation(bench, anchors=2, linear=True)
+    made = simulation(bench, anchors=2)
     light = made.file_anchored(made.anchored.trace(2, 0, 4), np.zeros(N * N, dtype=np.int64), 4).coarse
     rows, columns = made.coarse.cells
     found = light[[0]].toarray().reshape(2, rows, 2, columns)

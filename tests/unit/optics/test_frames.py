@@ -17,7 +17,6 @@ from mitsim.optics.frames import (
     ExpectedFrames,
     Filed,
     FrameOptics,
-    _corrected,
     relative_error,
 )
 from mitsim.optics.mask import Mask
@@ -198,67 +197,6 @@ def test_probes_see_the_frames_of_all_layers() -> None:
     found = optics.probe(flat, lights, vectors)
     expected = np.concatenate([optics.frame(flat, light) @ vectors for light in lights], axis=1)
     assert np.allclose(found, expected, rtol=1e-10)
-
-
-def integral_by_corners(cells: int, correct: bool) -> float:
-    """Integral of f times a smooth light g, with g split between corners (exactly) and f known at them."""
-    edges = np.linspace(-1, 1, cells + 1)
-    factor = np.exp(2 * edges)[None, :]
-    if correct:
-        factor = _corrected(factor, Directions(edges, 0.0))
-    tau, weight = nodes(edges, 8)
-    light = weight * np.square(np.cos(np.pi * tau / 2)) ** 2
-    cell = np.repeat(np.arange(cells), 8)
-    upper = (tau - edges[cell]) / (2 / cells)
-    corners = np.bincount(cell, light * (1 - upper), cells + 1) + np.bincount(cell + 1, light * upper, cells + 1)
-    return float(factor[0] @ corners)
-
-
-def test_corners_reproduce_a_smooth_shadow_to_fourth_order() -> None:
-    """Halving the cells leaves a sixteenth; without the correction a quarter (linear interpolation)."""
-    tau, weight = nodes(np.linspace(-1, 1, 50), 8)
-    truth = float(weight @ (np.exp(2 * tau) * np.square(np.cos(np.pi * tau / 2)) ** 2))
-    errors = {
-        correct: [abs(integral_by_corners(cells, correct) / truth - 1) for cells in (8, 16, 32)]
-        for correct in (False, True)
-    }
-    for coarse, fine in pairwise(errors[False]):
-        assert coarse / fine == pytest.approx(4, rel=0.1)
-    for coarse, fine in pairwise(errors[True]):
-        assert coarse / fine == pytest.approx(16, rel=0.25)
-    assert errors[True][0] < 0.1 * errors[False][0]
-
-
-def test_the_correction_leaves_straight_lines_and_cells_alone() -> None:
-    edges = np.linspace(-0.2, 0.3, 12)
-    line = np.stack([2 - 3 * edges, np.full(12, 0.7)])
-    assert np.allclose(_corrected(line, Directions(edges, 0.0)), line, rtol=1e-12)
-    curve = np.stack([edges**2, np.sin(9 * edges)])
-    assert np.array_equal(_corrected(curve, Directions(edges, 0.05)), curve)
-    assert np.array_equal(_corrected(curve[:, :2], Directions(edges[:2], 0.0)), curve[:, :2])
-
-
-def test_a_board_filed_between_corners_is_the_board() -> None:
-    """The same quadrature as for even cells; light that is even over the window, split exactly."""
-
-    def found(cells: int) -> float:
-        edges = np.linspace(*WINDOW, cells + 1)
-        tau, weight = nodes(edges, 5)
-        cell = np.repeat(np.arange(cells), 5)
-        upper = (tau - edges[cell]) / (edges[1] - edges[0])
-        split = np.zeros((cells + 1, tau.size))
-        split[cell, np.arange(tau.size)] = (1 - upper) * weight
-        split[cell + 1, np.arange(tau.size)] += upper * weight
-        squared = np.square(tau)[:, None] + np.square(tau)[None, :]
-        light = split @ (1 + squared) ** -2 @ split.T
-        corners = Directions(edges, 0.0)
-        frame = FrameOptics(CAMERA, corners, corners, (Z,), 1).frame(np.arange(light.size), light.ravel())
-        even = factored("separable", 192, 1)
-        return float(np.linalg.norm(frame[np.ix_(ROWS, COLUMNS)] - even) / np.linalg.norm(even))
-
-    errors = [found(cells) for cells in (24, 48, 96)]
-    # The shadow's kinks (features' edges) hold the order between two and four.
-    assert errors[0] > 3.5 * errors[1] and errors[1] > 3.5 * errors[2] and errors[2] < 2e-4
 
 
 # ---- families of frames

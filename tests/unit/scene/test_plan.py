@@ -26,7 +26,7 @@ EVIDENCE = Evidence(
     layers={1: (380.0,), 2: (400.0, 300.0), 3: (400.0, 343.0, 300.0), 4: (400.0, 369.0, 327.0, 300.0)},
     anchor_error={1: 2e-3, 2: 3e-4, 3: 4e-5, 5: 1e-5},
     layer_error={1: 4e-3, 2: 6e-4, 3: 2e-4, 4: 5e-5},
-    cell_error={(1, False): 6e-3, (2, False): 2e-3, (2, True): 1e-4, (3, True): 3e-5, (4, True): 1e-5},
+    cell_error={1: 6e-3, 2: 2e-3, 4: 1e-4, 6: 3e-5, 8: 1e-5},
     effect_error={"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4, "blur": 1e-3, "speckle": 8e-3},
     noise=(Noise(2e-3, 16, 0.8), Noise(1e-2, 2, 0.5)),
     pixels=16_384,
@@ -117,17 +117,17 @@ def test_a_plan_is_json_with_the_promised_keys() -> None:
 @pytest.mark.parametrize(
     ("accuracy", "anchors", "layers", "cells"),
     [
-        (1e-1, 1, 1, (1, False)),
-        (5e-3, 1, 1, (2, False)),  # 4e-3 of one layer is within the accuracy
-        (3e-3, 1, 2, (2, True)),
-        (1e-3, 2, 3, (2, True)),  # 3e-4 and 2e-4 are below half of it, 6e-4 is not
-        (2e-4, 3, 4, (2, True)),  # exactly half
-        (1e-4, 3, 4, (3, True)),
+        (1e-1, 1, 1, 1),
+        (5e-3, 1, 1, 2),  # 4e-3 of one layer is within the accuracy
+        (3e-3, 1, 2, 4),
+        (1e-3, 2, 3, 4),  # 3e-4 and 2e-4 are below half of it, 6e-4 is not
+        (2e-4, 3, 4, 4),  # exactly half
+        (1e-4, 3, 4, 6),
     ],
 )
-def test_the_smallest_numbers_that_fit(accuracy: float, anchors: int, layers: int, cells: tuple[int, bool]) -> None:
+def test_the_smallest_numbers_that_fit(accuracy: float, anchors: int, layers: int, cells: int) -> None:
     found = plan(accuracy).settings
-    assert (found.anchors, len(found.depths), (found.subdivision, found.linear)) == (anchors, layers, cells)
+    assert (found.anchors, len(found.depths), found.subdivision) == (anchors, layers, cells)
     assert found.depths == EVIDENCE.layers[layers] and found.depth == EVIDENCE.depth
 
 
@@ -139,7 +139,7 @@ def test_rows_of_numbers_are_off_at_one_and_approximate_beyond() -> None:
 
 def test_the_best_there_is_when_nothing_fits() -> None:
     found = plan(1e-6).settings
-    assert (found.anchors, len(found.depths), found.subdivision) == (5, 4, 4)
+    assert (found.anchors, len(found.depths), found.subdivision) == (5, 4, 8)
 
 
 def test_a_flat_scene_has_one_layer_whatever_is_asked_for() -> None:

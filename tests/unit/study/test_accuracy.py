@@ -106,7 +106,7 @@ def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
     samples = {"direct_samples", "other_samples"}
     turned = {
         "samples": samples,
-        "cells": {"subdivision", "linear"},
+        "cells": {"subdivision"},
         "anchors": {"anchors"},
         "bounces": {"effects"},
         "layers": {"layers"},

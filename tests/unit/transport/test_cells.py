@@ -26,15 +26,16 @@ def test_edges_fall_on_pixels_and_cover_window_and_stop(
     place = (np.linspace(low, low + width, n + 1)[:, None] - edges[None, :]) / step
     assert np.abs(place).min(axis=1).max() < 1e-6, "a projector pixel's edge inside a cell"
     assert edges[0] <= min(low, -stop) + 1e-6 * step and edges[-1] >= max(low + width, stop) - 1e-6 * step
-    # Not more than one cell of margin beyond what is needed.
-    assert edges[0] > min(low, -stop) - step * 1.001 and edges[-1] < max(low + width, stop) + step * 1.001
+    # Not more than one projector pixel of margin beyond what is needed.
+    pixel = step * subdivision * 1.001
+    assert edges[0] > min(low, -stop) - pixel and edges[-1] < max(low + width, stop) + pixel
 
 
 @settings(max_examples=30, deadline=None)
 @given(n=st.integers(1, 40), shift=st.floats(-0.1, 0.1))
-def test_grids_of_one_multiple_nest(n: int, shift: float) -> None:
+def test_grids_nest(n: int, shift: float) -> None:
     window = (-0.15 + shift, 0.15 + shift)
-    fine = aligned_grid(window, window, n, 4, 0.17, multiple=4)
+    fine = aligned_grid(window, window, n, 4, 0.17)
     coarse = aligned_grid(window, window, n, 1, 0.17)
     assert np.allclose(fine.rows.edges[::4], coarse.rows.edges)
     assert fine.shape[0] == 4 * coarse.shape[0]
@@ -43,4 +44,4 @@ def test_grids_of_one_multiple_nest(n: int, shift: float) -> None:
 def test_rows_and_columns_are_kept_apart() -> None:
     grid = aligned_grid((-0.1, 0.1), (-0.3, 0.3), 10, 2, 0.05)
     assert (grid.rows.size, grid.columns.size) == (0.01, 0.03)
-    assert grid.shape == (20, 20) and grid.subdivision == 2
+    assert grid.shape == (20, 20)

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from mitsim.optics.shadow import Directions
 from mitsim.transport.cells import CellAxis, CellGrid
 from mitsim.transport.histogram import AMBIENT, DIRECT, Bundle, Deposits
 
 PIXELS = 9  # a projector of 3 x 3
-GRID = CellGrid(CellAxis(-0.2, 0.05, 8), CellAxis(-0.1, 0.02, 15), 1)
+GRID = CellGrid(CellAxis(-0.2, 0.05, 8), CellAxis(-0.1, 0.02, 15))
 DEPTHS = (500.0, 300.0, 250.0)
 
 
@@ -40,8 +39,8 @@ def one(row: float, column: float, **changes: object) -> Deposits:
     return Deposits(**{name: np.array([value], dtype=kinds.get(name, np.int64)) for name, value in values.items()})
 
 
-def bundle(depths: tuple[float, ...] = (400.0,), linear: bool = True, anchors: int = 2) -> Bundle:
-    return Bundle(GRID, anchors, depths, linear)
+def bundle(depths: tuple[float, ...] = (400.0,), anchors: int = 2) -> Bundle:
+    return Bundle(GRID, anchors, depths)
 
 
 def unpacked(made: Bundle, light: np.ndarray) -> np.ndarray:
@@ -51,21 +50,21 @@ def unpacked(made: Bundle, light: np.ndarray) -> np.ndarray:
 
 
 LABELS = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])
-WAYS = [(depths, linear) for depths in ((400.0,), DEPTHS) for linear in (False, True)]
+WAYS = ((400.0,), DEPTHS)
 
 
-@pytest.mark.parametrize(("depths", "linear"), WAYS)
-def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...], linear: bool) -> None:
-    made, found = bundle(depths, linear), deposits()
+@pytest.mark.parametrize("depths", WAYS)
+def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...]) -> None:
+    made, found = bundle(depths), deposits()
     light = made.file(found, LABELS, samples=4)
     assert light.shape == (4, made.size)
     lines = np.append(LABELS, 3)[found.source]
     assert np.asarray(light.sum(axis=1)).ravel() == pytest.approx(np.bincount(lines, found.value) / 4, rel=1e-12)
 
 
-@pytest.mark.parametrize(("depths", "linear"), WAYS)
-def test_anchors_are_kept_apart(depths: tuple[float, ...], linear: bool) -> None:
-    made, found = bundle(depths, linear), deposits()
+@pytest.mark.parametrize("depths", WAYS)
+def test_anchors_are_kept_apart(depths: tuple[float, ...]) -> None:
+    made, found = bundle(depths), deposits()
     light = unpacked(made, made.file(found, LABELS).toarray()).sum(axis=(0, 1, 3, 5))
     for a, b in np.ndindex(2, 2):
         mine = (found.anchor_row == a) & (found.anchor_column == b)
@@ -73,29 +72,10 @@ def test_anchors_are_kept_apart(depths: tuple[float, ...], linear: bool) -> None
 
 
 def test_an_even_cell_holds_the_light_that_falls_in_it() -> None:
-    made = bundle(linear=False, anchors=1)
+    made = bundle(anchors=1)
     light = unpacked(made, made.file(one(-0.2 + 2.99 * 0.05, -0.1 + 7.01 * 0.02), LABELS).toarray())[0, 0, 0, :, 0]
     assert light[2, 7] == 1 and light.sum() == 1
     assert made.cells == GRID.shape
-
-
-def test_light_between_corners_keeps_its_mean_direction() -> None:
-    """First moments of the corners are those of the paths, row by row; a cell's centre would miss by half a cell."""
-    made, found = bundle(anchors=1), deposits()
-    found = Deposits(**{**vars(found), "anchor_row": 0 * found.anchor_row, "anchor_column": 0 * found.anchor_column})
-    light = unpacked(made, made.file(found, LABELS).toarray())[:, 0, 0, :, 0, :]
-    assert made.cells == (9, 16)
-    for line in range(4):
-        mine = np.append(LABELS, 3)[found.source] == line
-        assert light[line].sum(axis=1) @ GRID.rows.edges == pytest.approx(found.value[mine] @ found.row[mine])
-        assert light[line].sum(axis=0) @ GRID.columns.edges == pytest.approx(found.value[mine] @ found.column[mine])
-
-
-def test_a_path_lights_only_the_corners_of_its_cell() -> None:
-    made = bundle(anchors=1)
-    light = unpacked(made, made.file(one(-0.2 + 2.25 * 0.05, -0.1 + 7.5 * 0.02), LABELS).toarray())[0, 0, 0, :, 0]
-    assert light[2:4, 7:9] == pytest.approx(np.outer([0.75, 0.25], [0.5, 0.5]))
-    assert light.sum() == pytest.approx(1)
 
 
 @pytest.mark.parametrize("depth", [480.0, 300.0, 260.0])
@@ -119,9 +99,8 @@ def test_light_beyond_the_layers_goes_to_the_nearest(depth: float, layer: int) -
     assert light == pytest.approx(np.eye(3)[layer])
 
 
-@pytest.mark.parametrize("linear", [False, True])
-def test_light_from_outside_the_grid_is_dropped(linear: bool) -> None:
-    made, found = bundle(linear=linear), deposits(inside=False)
+def test_light_from_outside_the_grid_is_dropped() -> None:
+    made, found = bundle(), deposits(inside=False)
     inside = (found.row >= -0.2) & (found.row < 0.2) & (found.column >= -0.1) & (found.column < 0.2)
     assert 0.1 < inside.mean() < 0.9
     light, kept = made.file(found, LABELS), made.file(found.where(inside), LABELS)
@@ -152,11 +131,10 @@ def test_parts_join_in_order() -> None:
 
 
 def test_directions_for_the_shadow() -> None:
-    """Cells are boxes; corners are points."""
-    even, split = bundle(linear=False), bundle(linear=True)
-    assert np.allclose(even.rows.centres, GRID.rows.edges[:-1] + 0.025) and even.rows.width == pytest.approx(0.05)
-    assert np.allclose(split.columns.centres, GRID.columns.edges) and split.columns.width == 0
-    assert isinstance(split.rows, Directions) and np.allclose(split.rows.centres, GRID.rows.edges)
+    """Cells are boxes."""
+    made = bundle()
+    assert np.allclose(made.rows.centres, GRID.rows.edges[:-1] + 0.025) and made.rows.width == pytest.approx(0.05)
+    assert np.allclose(made.columns.centres, GRID.columns.edges[:-1] + 0.01)
 
 
 def test_light_averaged_over_the_anchors() -> None:
@@ -167,9 +145,9 @@ def test_light_averaged_over_the_anchors() -> None:
     assert np.allclose(mean[:, :, 0, :, 0], np.einsum("a,b,claybx->clyx", weights, weights, light), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("depths", "linear"), WAYS)
-def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...], linear: bool) -> None:
-    made, single = bundle(depths, linear), bundle(depths, linear, anchors=1)
+@pytest.mark.parametrize("depths", WAYS)
+def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None:
+    made, single = bundle(depths), bundle(depths, anchors=1)
     light = single.file(deposits().averaged(np.array([0.5, 0.5])), LABELS)
     shown, one = unpacked(made, made.repeated(light).toarray()), unpacked(single, light.toarray())
     for a, b in np.ndindex(2, 2):
