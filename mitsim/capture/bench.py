@@ -197,7 +197,7 @@ class Bench:
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
-        return replace(self, loaded=replace(self.loaded, scene=scene, lamps=(), mirrors=False))
+        return replace(self, loaded=replace(self.loaded, scene=scene, lamps=(), mirrors=False, glossy=False))
 
 
 def open_bench(

@@ -191,8 +191,8 @@ def collect(
         if error <= goal or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=error <= goal)
         # Indirect light's error falls with the square root of the samples; direct light's falls faster.
-        growth = min(1.1 * (error / goal) ** (2 if simulation.other else 1.2), _LARGEST_GROWTH)
-        rounds *= max(growth, 1.2)
+        rate = 1.6 if simulation.indirect or simulation.other else 1.2
+        rounds *= min(max(1.05 * (error / goal) ** rate, 1.1), _LARGEST_GROWTH)
 
 
 class _Group:

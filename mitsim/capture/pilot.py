@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.scene.plan import GROUPS, PHYSICAL, Evidence, Noise, Settings
+from mitsim.scene.plan import GROUPS, PHYSICAL, Effort, Evidence, Noise, Settings
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import AMBIENT, INDIRECT, Deposits
 
@@ -30,7 +31,7 @@ Halves = tuple[FloatArray, FloatArray]
 ANCHOR_LADDER = (1, 2, 3, 5, 8)
 LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)
 CELL_LADDER = (1, 2, 4, 8)
-_FIRST_JUDGE = 5
+_FIRST_JUDGE, _FEW_ANCHORS = 5, 3
 _CAPTURES = 4
 _PIXELS = 64**2
 """Few projector pixels are sampled more often, until they are as many samples as these pixels take."""
@@ -59,7 +60,7 @@ class _Family:
 
     @property
     def other(self) -> int:
-        """Samples a cell of light that is followed from the camera."""
+        """Samples a projector pixel of indirect light, and a cell of light that is followed from the camera."""
         return 2 * self._more
 
 
@@ -92,13 +93,13 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
     MitsimError
         when no light of the projector reaches the camera.
     """
-    started = time.perf_counter()
     family = _Family(labels, _some(weights, _CAPTURES))
     names = applicable(bench)
     direct = frozenset(names) & {"mirrors", "aperture", "blur", "diffraction"}
     depth = _depth(bench, direct, seed)
     base = Settings(depth=depth, effects=direct)
     fine = _Fine(bench, base, family, accuracy, seed)
+    anchors = _Anchors(bench, base, family, accuracy, seed)
     layer_error = fine.layer_errors()
     cell_error = fine.cell_errors()
     effects = _Effects(bench, replace(base, effects=frozenset(names), subdivision=2), family, seed)
@@ -108,18 +109,16 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
     return Evidence(
         depth=depth,
         layers=fine.layers,
-        anchor_error=_anchor_errors(bench, base, family, accuracy, seed),
+        anchor_error=anchors.errors,
         layer_error=layer_error,
         cell_error=cell_error,
         effect_error=effect_error,
-        noise=(fine.noise(), effects.noise()),
-        pixels=bench.n**2,
-        cells=effects.cells,
-        seconds_per_connection=fine.seconds_per_connection,
-        seconds_per_path=effects.seconds_per_path,
+        direct=fine.effort(),
+        anchored=anchors.effort(fine.pace),
+        indirect=effects.effort("indirect"),
+        other=effects.effort("other"),
         seconds_per_frame=fine.seconds_per_frame,
         terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
-        seconds=time.perf_counter() - started,
     )
 
 
@@ -149,7 +148,7 @@ class _Fine:
         first = tracer.trace(seeds[0], 0, family.fine)
         started = time.perf_counter()
         second = tracer.trace(seeds[1], 0, family.fine)
-        self.seconds_per_connection = (time.perf_counter() - started) / (tracer.lanes * family.fine)
+        self.pace = (time.perf_counter() - started) / (tracer.lanes * family.fine)
         few = [tracer.trace(one, 0, family.fine // 4) for one in seeds]
         first, second, *few = (_shown(found, family) for found in (first, second, *few))
         self.deposits, self.few = (first, second), (few[0], few[1])
@@ -183,12 +182,13 @@ class _Fine:
         whole = {count: error / (1 - (count / judge) ** 2) for count, error in errors.items() if count < judge}
         return {**whole, judge: whole[before] * (before / judge) ** 2}
 
-    def noise(self) -> Noise:
-        """Monte Carlo error of one estimate, and how fast it falls."""
+    def effort(self) -> Effort:
+        """Monte Carlo error of one estimate, how fast it falls, and what it takes."""
         many = _noise(self._frames((), 1))
         few = _noise(self._frames((), 1, self.few, self.family.fine // 4))
         rate = math.log(few / many) / math.log(4) if many > 0 and few > 0 else 1.0
-        return Noise(many, self.family.fine, min(max(rate, 0.5), 1.0))
+        noise = Noise(many, self.family.fine, min(max(rate, 0.5), 1.0))
+        return Effort(noise, self.simulation.direct.lanes, self.pace)
 
     def _frames(
         self,
@@ -214,23 +214,26 @@ class _Effects:
         self.seeds = tuple(integer(seed, "pilot", "effects", half) for half in range(2))
         self.simulation = Simulation(bench, everything)
         self.direct, self.other = self._direct(self.simulation), self._other(self.simulation)
-        started = time.perf_counter()
-        self._other(self.simulation)
-        self.cells = self.simulation.other.lanes if self.simulation.other else 1
-        self.seconds_per_path = (time.perf_counter() - started) / (2 * self.cells * family.other)
         self.frames = self._form(self.simulation, self.direct, self.other)
 
     def errors(self, names: tuple[str, ...]) -> dict[str, float]:
         """Change of the frames when each effect is left out."""
         return {name: _difference(self._without(name), self.frames) for name in names if name != "speckle"}
 
-    def noise(self) -> Noise:
-        """Monte Carlo error of one estimate of all that is not direct light, relative to all light."""
+    def effort(self, name: str) -> Effort:
+        """Monte Carlo error of one estimate of indirect or other light, relative to all light, and what it takes."""
+        stage = self.simulation.tracers().get(name)
+        if stage is None:
+            return Effort.none()
         none = tuple(Deposits.none() for _ in self.seeds)
-        first, second = self._form(self.simulation, none, self.other)
+        started = time.perf_counter()
+        found = tuple(stage.tracer.trace(seed, 0, self.family.other) for seed in self.seeds)
+        pace = (time.perf_counter() - started) / (2 * stage.tracer.lanes * self.family.other)
+        first, second = self._form(self.simulation, none, found)
         energy = float(np.vdot(*self.frames))
         spread = float(np.square(first - second).sum()) / 2
-        return Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.other, 0.5)
+        noise = Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.other, 0.5)
+        return Effort(noise, stage.tracer.lanes, pace)
 
     def _without(self, name: str) -> Halves:
         simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {name}))
@@ -251,9 +254,7 @@ class _Effects:
         return tuple(simulation.direct.trace(seed, 0, self.family.direct) for seed in self.seeds)
 
     def _other(self, simulation: Simulation) -> tuple[Deposits, ...]:
-        if simulation.other is None:
-            return tuple(Deposits.none() for _ in self.seeds)
-        return tuple(simulation.other.trace(seed, 0, self.family.other) for seed in self.seeds)
+        return tuple(simulation.followed(seed, self.family.other) for seed in self.seeds)
 
     def _form(self, simulation: Simulation, direct: tuple[Deposits, ...], other: tuple[Deposits, ...]) -> Halves:
         first, second = (
@@ -262,29 +263,56 @@ class _Effects:
         return first, second
 
 
-def _anchor_errors(bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int) -> dict[int, float]:
-    """Error of the frames with fewer anchors; every anchor is connected to the same points, so little noise is left.
+class _Anchors:
+    """The frames with fewer anchors; every anchor is connected to the same points, so little noise is left.
 
     Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame.
     """
 
-    def frames(anchors: int) -> Halves:
-        simulation = Simulation(bench, replace(base, anchors=anchors))
-        loaded = bench.loaded
-        tracer = DirectTracer(loaded.scene, loaded.camera, simulation.source, anchors, simulation.geometry)
-        halves = (tracer.trace(integer(seed, "pilot", "anchors", half), 0, family.direct) for half in range(2))
-        first, second = (_anchored(simulation, _shown(found, family), family) for found in halves)
+    def __init__(self, bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int) -> None:
+        self.bench, self.base, self.family = bench, base, family
+        self.seeds = [integer(seed, "pilot", "anchors", half) for half in range(2)]
+        self.errors = _ladder(ANCHOR_LADDER, self._frames, ANCHOR_LADDER.index(_FIRST_JUDGE), accuracy)
+
+    def effort(self, pace: float) -> Effort:
+        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all light."""
+        simulation = self._simulation(_FEW_ANCHORS)
+        halves = []
+        for found in self._traced(simulation):
+            mean = simulation.smooth.file(
+                found.averaged(simulation.mean_weights), self.family.labels, self.family.direct
+            )
+            everything = self._formed(simulation, self._filed(simulation, found))
+            halves.append((everything, everything - self._formed(simulation, simulation.coarse.repeated(mean))))
+        (first, only_first), (second, only_second) = halves
+        spread, energy = float(np.square(only_first - only_second).sum()) / 2, float(np.vdot(first, second))
+        noise = Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.direct, 0.5)
+        return Effort(noise, self.bench.n**2, pace)
+
+    def _frames(self, anchors: int) -> Halves:
+        simulation = self._simulation(anchors)
+        traced = self._traced(simulation)
+        first, second = (self._formed(simulation, self._filed(simulation, found)) for found in traced)
         return first, second
 
-    return _ladder(ANCHOR_LADDER, frames, ANCHOR_LADDER.index(_FIRST_JUDGE), accuracy)
+    def _simulation(self, anchors: int) -> Simulation:
+        return Simulation(self.bench, replace(self.base, anchors=anchors))
 
+    def _traced(self, simulation: Simulation) -> Iterator[Deposits]:
+        """Light to every anchor, in two halves."""
+        loaded, anchors = self.bench.loaded, simulation.settings.anchors
+        tracer = DirectTracer(loaded.scene, loaded.camera, simulation.source, anchors, simulation.geometry)
+        return (_shown(tracer.trace(seed, 0, self.family.direct), self.family) for seed in self.seeds)
 
-def _anchored(simulation: Simulation, found: Deposits, family: _Family) -> FloatArray:
-    """(captures, pixels, pixels) frames of light that was connected to every anchor."""
-    light = simulation.coarse.file(found, family.labels, family.direct)
-    rows = np.arange(family.weights.shape[1])
-    frames = ExpectedFrames(simulation.coarse_optics, [light[: len(rows)]], rows, family.weights, 0)
-    return np.stack([frame.irradiance for frame in frames])
+    def _filed(self, simulation: Simulation, found: Deposits) -> sparse.csr_array:
+        return simulation.coarse.file(found, self.family.labels, self.family.direct)
+
+    def _formed(self, simulation: Simulation, light: sparse.csr_array) -> FloatArray:
+        """(captures, pixels, pixels) frames of light to every anchor."""
+        rows = np.arange(self.family.weights.shape[1])
+        groups = [light[: len(rows)]]
+        frames = ExpectedFrames(simulation.coarse_optics, groups, rows, self.family.weights, 0)
+        return np.stack([frame.irradiance for frame in frames])
 
 
 def _shown(found: Deposits, family: _Family) -> Deposits:

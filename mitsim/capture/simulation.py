@@ -20,16 +20,15 @@ from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weight
 from mitsim.optics.diffraction import Spectrum
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
 from mitsim.scene.plan import Settings
+from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.factored import Paths, Tracer
 from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
+from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.source import Projector
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
-_ANCHORED = 8
-"""Samples to all of the sensor for each one to every anchor: differences between anchors are small."""
 AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over this range, in so many bands."""
 
@@ -57,7 +56,7 @@ class Light:
 class Stage:
     """A tracer, the samples of it that the plan predicted, and how its light is filed (deposits, labels, samples)."""
 
-    tracer: DirectTracer | Tracer
+    tracer: DirectTracer | IndirectTracer | CameraTracer
     predicted: float
     file: Callable[[Deposits, Labels, int], Light]
 
@@ -112,18 +111,29 @@ class Simulation:
         return DirectTracer(loaded.scene, loaded.camera, self.source, anchors, self.geometry) if anchors > 1 else None
 
     @cached_property
-    def other(self) -> Tracer | None:
+    def indirect(self) -> IndirectTracer | None:
+        """Follows light over several surfaces from the projector to the sensor's centre; none where there is none."""
+        loaded, more = self.bench.loaded, (self._over_mirrors, "interreflection" in self.settings.effects)
+        return IndirectTracer(loaded.scene, loaded.camera, self.source, *more, self.geometry) if any(more) else None
+
+    @cached_property
+    def other(self) -> CameraTracer | None:
         """Follows all other light from the sensor's centre; none where there is none."""
-        on, loaded = self.settings.effects, self.bench.loaded
-        paths = Paths(
-            mirrors="mirrors" in on and loaded.mirrors,
-            interreflection="interreflection" in on,
-            emitters=loaded.lamps if self.lit_by_lamps else (),
-        )
-        if paths == Paths():
+        loaded, bounces = self.bench.loaded, "interreflection" in self.settings.effects
+        emitters = loaded.lamps if self.lit_by_lamps else ()
+        if not (emitters or self._over_mirrors or (bounces and loaded.glossy)):
             return None
-        depth = self.settings.depth
-        return Tracer(loaded.scene, loaded.camera, self.source, self.aim, 1, depth, paths, geometry=self.geometry)
+        paths = Paths(self._over_mirrors, bounces, emitters)
+        return CameraTracer(loaded.scene, loaded.camera, self.source, self.aim, paths, self.geometry)
+
+    def followed(self, seed: int, samples: int) -> Deposits:
+        """Light of :attr:`indirect` and :attr:`other` in as many samples of each, for :meth:`file_other`."""
+        tracers = [tracer for tracer in (self.indirect, self.other) if tracer is not None]
+        return Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers])
+
+    @property
+    def _over_mirrors(self) -> bool:
+        return "mirrors" in self.settings.effects and self.bench.loaded.mirrors
 
     @cached_property
     def optics(self) -> FrameOptics:
@@ -166,7 +176,7 @@ class Simulation:
         return self._light(coarse=self.coarse.file(found, labels, samples) - self.coarse.repeated(mean))
 
     def file_other(self, found: Deposits, labels: Labels, samples: int) -> Light:
-        """Light of :attr:`other`, per sample."""
+        """Light of :attr:`indirect` or :attr:`other`, per sample."""
         indirect = found.order == INDIRECT
         fine = self.bundle.file(found.where(~indirect), labels, samples)
         return self._light(fine=fine, smooth=self.smooth.file(found.where(indirect), labels, samples))
@@ -181,7 +191,9 @@ class Simulation:
         settings = self.settings
         stages = {"direct": Stage(self.direct, settings.direct_samples, self.file)}
         if self.anchored is not None:
-            stages["anchored"] = Stage(self.anchored, settings.direct_samples / _ANCHORED, self.file_anchored)
+            stages["anchored"] = Stage(self.anchored, settings.anchored_samples, self.file_anchored)
+        if self.indirect is not None:
+            stages["indirect"] = Stage(self.indirect, settings.indirect_samples, self.file_other)
         if self.other is not None:
             stages["other"] = Stage(self.other, settings.other_samples, self.file_other)
         return stages
@@ -196,7 +208,7 @@ class Simulation:
 
         It is a pinhole's light, whatever the projector's lens.
         """
-        if "mirrors" not in self.settings.effects or not self.bench.loaded.mirrors:
+        if not self._over_mirrors:
             return None
         return self.bench.mirror_light.frames(labels, self.geometry, self.bench.spectrum if self.waves else None)
 

@@ -24,7 +24,8 @@ class LoadedScene:
 
     ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
     pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
-    other emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions.
+    other emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions, ``glossy``
+    whether one does in lobes.
     """
 
     path: Path
@@ -34,6 +35,7 @@ class LoadedScene:
     grid: ProjectorGrid | None
     lamps: tuple[Any, ...]
     mirrors: bool
+    glossy: bool
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -70,19 +72,21 @@ def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_proje
         if scale < 0:
             raise MitsimError(f"{path}: the projector's scale: got {scale:g}; light is at least 0")
     if not needs_projector:
-        return LoadedScene(path, scene, cameras[0], None, None, tuple(emitters), _has_mirrors(scene))
+        return LoadedScene(path, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
     if len(projectors) != 1:
         raise MitsimError(
             f'{path}: {len(projectors)} emitters of type "projector"; coded illumination needs exactly one'
         )
     grid = locate_projector(str(path), projectors[0], cameras[0])
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
-    return LoadedScene(path, scene, cameras[0], projectors[0], grid, lamps, _has_mirrors(scene))
+    return LoadedScene(path, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
 
 
-def _has_mirrors(scene: Any) -> bool:
-    """Whether a surface of the scene has a delta component."""
-    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta) for shape in scene.shapes() if shape.bsdf())
+def _polished(scene: Any) -> tuple[bool, bool]:
+    """Whether a surface of the scene has a delta component, and whether one has a glossy component."""
+    flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
+    delta, glossy = mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy
+    return any(mi.has_flag(one, delta) for one in flags), any(mi.has_flag(one, glossy) for one in flags)
 
 
 def _one_line(error: BaseException) -> str:

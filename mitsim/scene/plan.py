@@ -32,8 +32,8 @@ _FEWEST_SAMPLES = 1e-3
 _FEWEST_DIRECT = 8.0
 """Samples a projector pixel: few are cheap, and a spectrum or a texture wants more than the frames' error tells."""
 _COARSE = 0.4
-_OF_OTHER = frozenset({"interreflection", "ambient", "mirrors"})
-"""Effects whose light is followed from the camera."""
+_FOLLOWED = frozenset({"interreflection", "ambient", "mirrors"})
+"""Effects whose light is followed over more than one surface, or from the camera."""
 GROUPS = 8
 """Independent estimates of the light, whose spread tells the Monte Carlo error."""
 
@@ -65,8 +65,9 @@ class Settings:
         cells a side of a projector pixel.
     effects
         those of :data:`PHYSICAL` that are simulated.
-    direct_samples, other_samples
-        samples a projector pixel of direct light, and a cell of all other light, that each group is predicted to need.
+    direct_samples, anchored_samples, indirect_samples, other_samples
+        samples that each group is predicted to need: a projector pixel of direct light, of its differences between
+        anchors, and of indirect light; a cell of what is followed from the camera.
     coarse_cells, coarse_layers
         cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
         they have all layers or one.
@@ -78,6 +79,8 @@ class Settings:
     subdivision: int = 1
     effects: frozenset[str] = frozenset()
     direct_samples: float = 1.0
+    anchored_samples: float = 1.0
+    indirect_samples: float = 1.0
     other_samples: float = 1.0
     coarse_cells: int = 1
     coarse_layers: bool = False
@@ -119,6 +122,30 @@ class Noise:
 
 
 @dataclass(frozen=True)
+class Effort:
+    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds a path."""
+
+    noise: Noise
+    paths: int
+    seconds: float
+
+    @classmethod
+    def none(cls) -> Effort:
+        """Of light that there is none of."""
+        return cls(Noise(0.0, 1, 0.5), 0, 0.0)
+
+    @property
+    def cost(self) -> float:
+        """Seconds a sample."""
+        return self.paths * self.seconds
+
+    @property
+    def variance(self) -> float:
+        """Relative variance of one sample, where the error falls with the square root of their number."""
+        return self.noise.samples * self.noise.error**2
+
+
+@dataclass(frozen=True)
 class Evidence:
     """What a short look at the scene measured (:mod:`mitsim.capture.pilot`); all errors are relative.
 
@@ -132,12 +159,9 @@ class Evidence:
         by cells a side of a projector pixel.
     effect_error
         error of leaving out each effect of :data:`PHYSICAL` that the scene or its devices have.
-    noise
-        of one estimate, relative to all light: of direct light, and of all other light.
-    pixels, cells
-        connections of one sample of direct light with one anchor, and paths of one sample of other light.
-    seconds_per_connection, seconds_per_path
-        pace of the two.
+    direct, anchored, indirect, other
+        what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
+        and what is followed from the camera.
     seconds_per_frame
         of forming a frame with one anchor, one layer, a geometric shadow and a cell a projector pixel.
     terms
@@ -150,14 +174,23 @@ class Evidence:
     layer_error: Mapping[int, float]
     cell_error: Mapping[int, float]
     effect_error: Mapping[str, float]
-    noise: tuple[Noise, Noise]
-    pixels: int
-    cells: int
-    seconds_per_connection: float
-    seconds_per_path: float
+    direct: Effort
+    anchored: Effort
+    indirect: Effort
+    other: Effort
     seconds_per_frame: float
     terms: float
-    seconds: float
+
+    def connecting(self, settings: Settings, anchors: int) -> float:
+        """Seconds of direct light, and of its differences between anchors, in the samples that are predicted."""
+        differences = settings.anchored_samples * anchors**2 * self.anchored.cost if anchors > 1 else 0.0
+        return GROUPS * (settings.direct_samples * self.direct.cost + differences)
+
+    def following(self, settings: Settings) -> float:
+        """Seconds of all other light; none when no effect calls for it."""
+        if not settings.effects & _FOLLOWED:
+            return 0.0
+        return GROUPS * (settings.indirect_samples * self.indirect.cost + settings.other_samples * self.other.cost)
 
 
 @dataclass(frozen=True)
@@ -228,7 +261,7 @@ def decide(
     )
     target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - left**2, (_FLOOR * accuracy) ** 2))
     cost = _Cost(evidence, settings, captures, target)
-    settings = replace(settings, direct_samples=cost.direct_samples, other_samples=cost.other_samples)
+    settings = cost.settings
     effects = (
         _anchors(anchors, evidence, accuracy, cost),
         _layers(layers, evidence, accuracy, cost),
@@ -259,7 +292,7 @@ class _Coarse:
 def _coarse(evidence: Evidence, settings: Settings, accuracy: float) -> _Coarse:
     """The coarsest choice that fits: its error counts only for the part of the light that is filed in it."""
     part = evidence.anchor_error[1] if settings.anchors > 1 else 0.0
-    # What is followed from the camera is seen from the sensor's centre alone.
+    # Indirect and ambient light is seen from the sensor's centre alone.
     seen = sum(evidence.effect_error.get(name, 0.0) for name in settings.effects & {"interreflection", "ambient"})
     centre = min(seen, 1.0) * evidence.anchor_error[1]
     if "interreflection" in settings.effects:
@@ -279,29 +312,34 @@ class _Cost:
     """Seconds of a capture with some settings, by the paces that the pilot measured."""
 
     def __init__(self, evidence: Evidence, settings: Settings, captures: int, target: float) -> None:
-        self.evidence, self.settings, self.captures = evidence, settings, captures
-        single = target * math.sqrt(GROUPS)
-        self.other = bool(settings.effects & _OF_OTHER)
-        direct, other = (0.5, 0.85) if self.other else (1.0, 0.0)
-        self.direct_samples = max(_FEWEST_DIRECT, evidence.noise[0].samples_for(single * direct))
-        self.other_samples = max(1.0, evidence.noise[1].samples_for(single * other)) if self.other else 0.0
+        self.evidence, self.captures = evidence, captures
+        many = settings.anchors > 1
+        efforts = {
+            "direct": evidence.direct,
+            "anchored": replace(evidence.anchored, paths=evidence.anchored.paths * settings.anchors**2 * many),
+        }
+        if settings.effects & _FOLLOWED:
+            efforts |= {"indirect": evidence.indirect, "other": evidence.other}
+        # The fewest paths for a sum of variances; not the least time, for settings must not depend on the pace.
+        parts = {name: math.sqrt(effort.variance * effort.paths) for name, effort in efforts.items()}
+        single, whole = target * math.sqrt(GROUPS), sum(parts.values())
+        samples = {
+            f"{name}_samples": max(
+                _FEWEST_DIRECT if name == "direct" else 1.0,
+                effort.noise.samples_for(single * math.sqrt(parts[name] / whole)) if parts[name] else 0.0,
+            )
+            for name, effort in efforts.items()
+        }
+        self.settings: Settings = replace(settings, **samples)  # type: ignore[arg-type]
 
     @property
     def total(self) -> float:
         waves = "diffraction" in self.settings.effects
         return (
-            self.direct(self.settings.anchors)
-            + self.followed
+            self.evidence.connecting(self.settings, self.settings.anchors)
+            + self.evidence.following(self.settings)
             + self.forming(self.settings.anchors, len(self.settings.depths), waves)
         )
-
-    @property
-    def followed(self) -> float:
-        return GROUPS * self.other_samples * self.evidence.cells * self.evidence.seconds_per_path
-
-    def direct(self, anchors: int) -> float:
-        connections = 1 + (anchors**2 / 8 if anchors > 1 else 0)
-        return GROUPS * self.direct_samples * connections * self.evidence.pixels * self.evidence.seconds_per_connection
 
     def forming(self, anchors: int, layers: int, waves: bool) -> float:
         terms = self.evidence.terms if waves else 1.0
@@ -326,7 +364,7 @@ def _anchors(anchors: int, evidence: Evidence, accuracy: float, cost: _Cost) -> 
         return Effect("anchors", "off", f"{reason} of {accuracy:g} allowed", errors[1], 0.0)
     reason = f"falloff, gloss and parallax: {anchors}x{anchors} anchors leave {errors[anchors]:.1e}"
     waves, layers = "diffraction" in cost.settings.effects, len(cost.settings.depths)
-    seconds = cost.direct(anchors) - cost.direct(1)
+    seconds = evidence.connecting(cost.settings, anchors) - evidence.connecting(cost.settings, 1)
     seconds += cost.forming(anchors, layers, waves) - cost.forming(1, layers, waves)
     return Effect("anchors", "approximate", reason, errors[1], seconds)
 
@@ -374,8 +412,8 @@ def _physical(
 
 def _seconds(name: str, cost: _Cost) -> float:
     anchors, layers = cost.settings.anchors, len(cost.settings.depths)
-    if name in _OF_OTHER:
-        return cost.followed
+    if name in _FOLLOWED:
+        return cost.evidence.following(cost.settings)
     if name == "diffraction":
         return cost.forming(anchors, layers, True) - cost.forming(anchors, layers, False)
     return 0.0

@@ -39,7 +39,8 @@ def at_once(_: ExpectedFrames) -> float:
 
 def sampled(settings: Settings, samples: int) -> Settings:
     """Settings under which the first round takes so many samples of a projector pixel and of a cell in each group."""
-    return replace(settings, direct_samples=2.0 * samples, other_samples=2.0 * samples)
+    each = 2.0 * samples
+    return replace(settings, direct_samples=each, anchored_samples=each / 8, indirect_samples=each, other_samples=each)
 
 
 def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Iterator[Variant]:
@@ -51,13 +52,13 @@ def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> I
 
     for samples in SAMPLES:
         fixed = sampled(now, samples)
-        if _seconds(fixed, evidence) <= patience:
+        if _tracing(fixed, evidence) <= patience:
             yield Variant("samples", f"{GROUPS * samples} samples", bench, replace(plan, settings=fixed), at_once)
     for cells in CELLS:
         yield changed("cells", f"{cells}x{cells} a pixel", replace(now, subdivision=cells))
     for anchors in ANCHORS:
         settings = replace(now, anchors=anchors)
-        if _seconds(settings, evidence) <= patience:
+        if _tracing(settings, evidence) <= patience:
             yield changed("anchors", f"{anchors}x{anchors}", settings)
     for layers in LAYERS:
         if layers in evidence.layers and (layers > 1 or len(evidence.layers) > 1):
@@ -65,7 +66,7 @@ def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> I
             yield changed("layers", str(layers), replace(now, layers=depths))
     yield changed("bounces", "one reflection", replace(now, effects=now.effects - {"interreflection"}))
     bounced = replace(now, effects=now.effects | {"interreflection"})
-    if _seconds(bounced, evidence) <= patience:
+    if _tracing(bounced, evidence) <= patience:
         yield changed("bounces", "all, roulette", bounced)
     yield from (Variant("wavelengths", name, lit, plan) for name, lit in _spectra(bench))
 
@@ -96,10 +97,6 @@ def _spectra(bench: Bench) -> Iterator[tuple[str, Bench]]:
         yield name, replace(bench, projector=model.model_copy(update=changes))
 
 
-def _seconds(settings: Settings, evidence: Evidence) -> float:
-    """Tracing the samples that the settings predict, at the pilot's pace."""
-    connections = settings.direct_samples * evidence.pixels * (1 + settings.anchors**2 / 8)
-    seconds = connections * evidence.seconds_per_connection
-    if settings.effects & {"interreflection", "ambient", "mirrors"}:
-        seconds += settings.other_samples * evidence.cells * evidence.seconds_per_path
-    return GROUPS * seconds
+def _tracing(settings: Settings, evidence: Evidence) -> float:
+    """Seconds of tracing what the settings predict, at the pilot's pace."""
+    return evidence.connecting(settings, settings.anchors) + evidence.following(settings)

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import Directions
 from mitsim.transport.cells import CellGrid
 
@@ -54,8 +57,49 @@ class Deposits:
 
     @classmethod
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
-        """All parts in one."""
+        """All parts in one; no light where there are none."""
+        parts = parts or [cls.none()]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+    @classmethod
+    def fetched(
+        cls,
+        value: Any,
+        source: Any,
+        row: Any,
+        column: Any,
+        inverse_depth: Any,
+        order: int,
+        anchor_row: Any = None,
+        anchor_column: Any = None,
+    ) -> Deposits:
+        """Lit connections of one kind from the renderer's arrays; those of the first anchor when none is named.
+
+        Raises
+        ------
+        MitsimError
+            when the light is NaN or infinite.
+        """
+        # Together: one by one, each would trace all paths again.
+        dr.eval(value, source, row, column, inverse_depth, anchor_row, anchor_column)
+        light = np.array(value)
+        if not np.isfinite(light).all():
+            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+        lit = np.flatnonzero(light)
+
+        def taken(values: Any, kind: type) -> Any:
+            return np.zeros(lit.size, kind) if values is None else np.array(values)[lit].astype(kind)
+
+        return cls(
+            source=taken(source, np.int64),
+            anchor_row=taken(anchor_row, np.int64),
+            anchor_column=taken(anchor_column, np.int64),
+            row=taken(row, np.float64),
+            column=taken(column, np.float64),
+            inverse_depth=taken(inverse_depth, np.float64),
+            value=light[lit].astype(np.float64),
+            order=np.full(lit.size, order, dtype=np.int16),
+        )
 
     @classmethod
     def none(cls) -> Deposits:
@@ -120,7 +164,8 @@ class Bundle:
         # 32-bit indices sort twice as fast.
         index = np.int32 if max(shape) < 2**31 else np.int64
         entries = values, (np.tile(row, len(layers)).astype(index), flat.astype(index))
-        light = sparse.coo_array(entries, shape=shape).tocsr()
+        # By way of columns, for two passes of counting take half the time of sorting.
+        light = sparse.coo_array(entries, shape=shape).tocsc().tocsr()
         light.eliminate_zeros()
         return light
 

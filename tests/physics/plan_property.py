@@ -41,7 +41,7 @@ _INTERPLAY = 0.05
 
 @dataclass(frozen=True)
 class Effort:
-    """Samples of one group, a projector pixel of direct light and a cell of other light; layers for depth."""
+    """Samples of one group, a projector pixel of direct light, a pixel or a cell of other light; layers for depth."""
 
     direct: int
     other: int
@@ -98,9 +98,7 @@ class _Look:
     def _layers(self) -> tuple[float, ...]:
         """Depths over the whole range that light is seen at; none for a flat scene."""
         simulation, seed = Simulation(self.bench, self.full), integer(self.seed, "range")
-        near = simulation.direct.trace(seed, 0, 8).inverse_depth
-        if simulation.other is not None:
-            near = np.append(near, simulation.other.trace(seed).inverse_depth)
+        near = np.append(simulation.direct.trace(seed, 0, 8).inverse_depth, simulation.followed(seed, 8).inverse_depth)
         low, high = max(float(near.min()), 1e-4 / self.full.depth), float(near.max())
         return () if high < low * (1 + 1e-4) else tuple(1 / np.linspace(low, high, self.effort.layers))
 
@@ -141,9 +139,7 @@ class _Look:
     def _traced(self, simulation: Simulation, seed: int) -> tuple[Deposits, Deposits]:
         """Direct and other light of pixels that the captures show, and of lamps."""
         direct = simulation.direct.trace(integer(seed, "direct"), 0, self.effort.direct)
-        other = Deposits.none()
-        if simulation.other is not None:
-            other = simulation.other.trace(integer(seed, "other"), 0, self.effort.other)
+        other = simulation.followed(integer(seed, "other"), self.effort.other)
         return direct.where(self.shown[direct.source]), other.where(self.shown[other.source])
 
     def _filed(self, simulation: Simulation, deposits: tuple[Deposits, Deposits]) -> Light:
@@ -179,8 +175,7 @@ class _Look:
         """(pixels, pixels) frame of every projector pixel lit, from two samples, whose noise all pixels average."""
         one = np.zeros_like(self.labels)
         light = simulation.file(simulation.direct.trace(integer(seed, "direct"), 0, 2), one, 2)
-        if simulation.other is not None:
-            light += simulation.file_other(simulation.other.trace(integer(seed, "other"), 0, 2), one, 2)
+        light += simulation.file_other(simulation.followed(integer(seed, "other"), 8), one, 8)
         frames = _products_of(simulation.optics, light.fine[[0]])
         return np.asarray((frames + _products_of(simulation.smooth_optics, light.smooth[[0]]))[0])
 

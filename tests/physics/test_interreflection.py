@@ -96,11 +96,11 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
         own = 1000 * seed + group
         one, more = (
             [
-                stage.file(stage.tracer.trace(own, 0, samples), labels, samples)
+                stage.file(stage.tracer.trace(own, 0, count), labels, count)
                 for name, stage in simulation.tracers().items()
-                if (name == "other") == indirect
+                if name in names
             ]
-            for indirect in (False, True)
+            for names, count in ((("direct", "anchored"), samples), (("indirect",), 64 * samples))
         )
         for light in (sum(one[1:], one[0]), more[0]):
             frames = [frame.irradiance for frame in simulation.expected([light], np.arange(K**2), weights, 0)]

@@ -52,7 +52,10 @@ def evidence(bench: Bench) -> Evidence:
 def frames(bench: Bench, settings: Settings, direct: int = 64, other: int = 24) -> np.ndarray:
     """(4, pixels, pixels) of the captures that the pilot looks at, from many samples."""
     labels, weights = parse_patterns("dots:4", N).classes()
-    made, counts = Simulation(bench, settings), {"direct": direct, "anchored": direct // 4, "other": other}
+    made, counts = (
+        Simulation(bench, settings),
+        {"direct": direct, "anchored": direct // 4, "indirect": 8 * other, "other": other},
+    )
     parts = [
         stage.file(stage.tracer.trace(integer(77, name), 0, counts[name]), labels, counts[name])
         for name, stage in made.tracers().items()
@@ -80,9 +83,11 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert {1, 2, 4} <= set(evidence.cell_error) <= set(pilot.CELL_LADDER)
     for errors in (evidence.anchor_error, evidence.layer_error):
         assert all(value >= 0 for value in errors.values()) and errors[1] > errors[max(errors)]
-    for pace in (evidence.seconds_per_connection, evidence.seconds_per_path, evidence.seconds_per_frame):
-        assert 0 < pace < evidence.seconds
-    assert evidence.pixels == N * N and evidence.terms == len(bench.spectrum.weights)
+    for pace in (evidence.direct.seconds, evidence.indirect.seconds, evidence.other.seconds):
+        assert 0 < pace < 1e-3
+    assert 0 < evidence.seconds_per_frame < 1
+    assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.other.paths
+    assert evidence.terms == len(bench.spectrum.weights)
 
 
 def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
@@ -139,28 +144,30 @@ def test_layers_come_true(bench: Bench, evidence: Evidence) -> None:
 
 def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
     """Spread of six estimates of direct light with sixteen samples; and of other light with two."""
-    effects = {0: frozenset({"diffraction"}), 1: frozenset(pilot.applicable(bench)) - {"speckle"}}
+    every = frozenset(pilot.applicable(bench)) - {"speckle"}
+    effects = {"direct": frozenset({"diffraction"}), "indirect": every, "other": every}
     labels, weights = parse_patterns("dots:4", N).classes()
-    everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=effects[1]))
-    for kind in (0, 1):
+    everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=every))
+    for kind in effects:
         made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=effects[kind]))
-        tracer, file = (made.direct, made.file) if kind == 0 else (made.other, made.file_other)
-        samples = int(evidence.noise[kind].samples)
-        groups = [file(tracer.trace(integer(9, kind, index), 0, samples), labels, samples) for index in range(6)]
+        stage, noise = made.tracers()[kind], getattr(evidence, kind).noise
+        samples = int(noise.samples)
+        traced = [stage.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
+        groups = [stage.file(found, labels, samples) for found in traced]
         found = [
             np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), weights[SHOWN], 0)])
             for light in groups
         ]
         spread = np.sqrt(np.square(np.std(found, axis=0, ddof=1)).sum())
-        norm = np.linalg.norm(np.mean(found, axis=0) if kind == 0 else everything)
+        norm = np.linalg.norm(np.mean(found, axis=0) if kind == "direct" else everything)
         # Two halves tell a spread with few degrees of freedom.
-        assert 0.4 < evidence.noise[kind].error / (spread / norm) < 2.5
-        assert 0.5 <= evidence.noise[kind].rate <= 1
+        assert 0.4 < noise.error / (spread / norm) < 2.5
+        assert 0.5 <= noise.rate <= 1
 
 
 def test_the_pilot_is_reproducible(bench: Bench, evidence: Evidence) -> None:
     again, other = measured(bench, seed=3), measured(bench, seed=4)
-    for name in ("depth", "layers", "anchor_error", "layer_error", "cell_error", "effect_error", "noise"):
+    for name in ("depth", "layers", "anchor_error", "layer_error", "cell_error", "effect_error"):
         assert getattr(again, name) == getattr(evidence, name)
     assert other.effect_error != evidence.effect_error and other.anchor_error != evidence.anchor_error
 

@@ -55,8 +55,7 @@ def uniform(made: Simulation, samples: int = 8, weight: float = 1.0) -> np.ndarr
     """The frame of one capture with every pixel alike."""
     labels = np.zeros(N * N, dtype=np.int64)
     light = made.file(made.direct.trace(3, 0, samples), labels, samples)
-    if made.other is not None:
-        light = light + made.file_other(made.other.trace(3, 0, 4), labels, 4)
+    light = light + made.file_other(made.followed(3, 4), labels, 4)
     (frame,) = made.expected([light], np.zeros(1, dtype=np.int64), np.array([[weight]]), 0)
     return frame.irradiance
 
@@ -83,7 +82,7 @@ def test_every_effect_off_is_the_geometric_model(bench: Bench) -> None:
 
 def test_neutral_parts(bench: Bench) -> None:
     off = simulation(bench)
-    assert off.source.ideal and off.black == 0 and off.other is None and off.anchored is None
+    assert off.source.ideal and off.black == 0 and off.other is off.indirect is off.anchored is None
     assert not off.lit_by_lamps and not off.waves and off.mirrored(np.zeros(N * N, dtype=np.int64)) is None
     assert set(off.tracers()) == {"direct"}
 
@@ -99,8 +98,8 @@ def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
         "black-level": on.black == pytest.approx(BLACK),
         "diffraction": on.waves,
         "ambient": on.lit_by_lamps and on.other is not None and len(on.other.paths.emitters) == 1,
-        "interreflection": on.other is not None and on.other.paths.interreflection,
-        "mirrors": on.other is not None and on.other.paths.mirrors,
+        "interreflection": on.indirect is not None and on.indirect.interreflection,
+        "mirrors": on.indirect is not None and on.indirect.mirrors and on.other.paths.mirrors,
     }
     assert [name for name, holds in changed.items() if holds] == [effect]
     if effect not in ("mask-thickness", "pixel-response"):
@@ -134,9 +133,9 @@ def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
     made = simulation(bench, "interreflection", "ambient", subdivision=2, coarse_cells=1)
     assert made.bundle.cells == (2 * made.smooth.cells[0], 2 * made.smooth.cells[1])
     labels = np.zeros(N * N, dtype=np.int64)
-    found = made.other.trace(1, 0, 8)
-    light = made.file_other(found, labels, 8)
-    kinds = {order: found.value[found.order == order].sum() / 8 for order in (0, 2)}
+    found = made.followed(1, 64)
+    light = made.file_other(found, labels, 64)
+    kinds = {order: found.value[found.order == order].sum() / 64 for order in (0, 2)}
     assert light.fine[[1]].sum() == pytest.approx(kinds[0], rel=0.02) and not light.fine[[0]].nnz
     assert light.smooth.sum() == pytest.approx(kinds[2], rel=0.02) and not light.coarse.nnz
 

@@ -11,6 +11,7 @@ from mitsim.scene.plan import (
     PHYSICAL,
     SWITCHES,
     Effect,
+    Effort,
     Evidence,
     Noise,
     Plan,
@@ -28,14 +29,12 @@ EVIDENCE = Evidence(
     layer_error={1: 4e-3, 2: 6e-4, 3: 2e-4, 4: 5e-5},
     cell_error={1: 6e-3, 2: 2e-3, 4: 1e-4, 6: 3e-5, 8: 1e-5},
     effect_error={"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4, "blur": 1e-3, "speckle": 8e-3},
-    noise=(Noise(2e-3, 16, 0.8), Noise(1e-2, 2, 0.5)),
-    pixels=16_384,
-    cells=20_000,
-    seconds_per_connection=1e-7,
-    seconds_per_path=6e-7,
+    direct=Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
+    anchored=Effort(Noise(3e-4, 4, 0.5), 16_384, 1e-7),
+    indirect=Effort(Noise(4e-3, 2, 0.5), 16_384, 2e-7),
+    other=Effort(Noise(1e-2, 2, 0.5), 20_000, 6e-7),
     seconds_per_frame=2e-3,
     terms=3.0,
-    seconds=1.5,
 )
 ACCURACIES = [0.1, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4]
 
@@ -194,7 +193,10 @@ def test_warnings_of_the_devices_come_first() -> None:
 
 def test_settings_do_not_depend_on_the_machines_pace() -> None:
     """Bit-equal repetition and --resume need it: the same seed must mean the same settings."""
-    slow = replace(EVIDENCE, seconds_per_connection=1e-5, seconds_per_path=1e-4, seconds_per_frame=1.0, seconds=60.0)
+    efforts = {
+        name: replace(getattr(EVIDENCE, name), seconds=1e-4) for name in ("direct", "anchored", "indirect", "other")
+    }
+    slow = replace(EVIDENCE, **efforts, seconds_per_frame=1.0)
     for accuracy in ACCURACIES:
         assert plan(accuracy).settings == plan(accuracy, slow).settings
         assert plan(accuracy).sampling_target == plan(accuracy, slow).sampling_target

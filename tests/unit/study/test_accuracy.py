@@ -103,7 +103,7 @@ def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
     labels, weights = bench.family(PATTERNS).classes()
     plan = make_plan(bench, labels, weights, 1e-3, SEED)
     evidence = pilot.measure(bench, labels, weights, 1e-3, SEED)
-    samples = {"direct_samples", "other_samples"}
+    samples = {"direct_samples", "anchored_samples", "indirect_samples", "other_samples"}
     turned = {
         "samples": samples,
         "cells": {"subdivision"},

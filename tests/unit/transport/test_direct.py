@@ -14,7 +14,7 @@ import pytest
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.optics.camera import CameraGeometry, anchor_positions
-from mitsim.transport import direct
+from mitsim.transport import paths
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import DIRECT, Deposits
 
@@ -178,7 +178,7 @@ def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatc
     assert not np.isin(whole.row, other.row).any()
     # A sequence in pieces, in samples or in launches, is the same sequence.
     pieces = Deposits.joined([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
-    monkeypatch.setattr(direct, "_LANES_PER_LAUNCH", 300)
+    monkeypatch.setattr(paths, "_LANES_PER_LAUNCH", 300)
     launches = trace.trace(1, 0, 4)
     for parts in (pieces, launches):
         assert np.array_equal(parts.source, whole.source) and np.allclose(parts.row, whole.row, atol=1e-6)

@@ -1,0 +1,291 @@
+"""Light followed from the camera: of lamps, in mirrors, and over sharp turns before the sensor.
+
+A path starts at the sensor's centre, goes through a cell of directions, and connects to the lights at its vertices; a
+connection to the projector names the projector pixel that it used. The mask and the sensor pixels are applied
+afterwards in closed form (:mod:`mitsim.optics`).
+
+Value collected, for tan-angle t (the integrand of the reference estimator without its mask)::
+
+    g(t) dt = L(t) (1 + |t|^2)^-2 r(t) dt          [W m^-2]        r: the pixel's angular response
+
+Most of the projector's light is followed from its own side (:mod:`mitsim.transport.direct`, `.indirect`). From here
+comes what that side cannot find: light whose last surface before the sensor is a mirror, and of indirect light the part
+over sharp turns (:func:`mitsim.transport.paths.camera_part`).
+
+A path's light is filed under the direction and depth of its first vertex that is no mirror: through plane mirrors, of
+that vertex's image, which is where the camera sees it. Paths end at random (Russian roulette) with a probability that
+keeps the estimate unbiased; there is no last bounce.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsim.optics.camera import CameraGeometry
+from mitsim.transport.cells import CellGrid
+from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
+from mitsim.transport.paths import Reservoir, camera_part, launches, survival
+from mitsim.transport.sampling import generator, panchromatic, stratified
+from mitsim.transport.source import Projector, Source
+
+_MARGIN = 1e-4
+_KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Which light is followed besides projector - surface - camera.
+
+    ``mirrors``: over delta reflections and transmissions on the camera's side; ``interreflection``: any number of
+    bounces; ``emitters``: other lights of the scene, all of them one class of ambient light.
+    """
+
+    mirrors: bool = False
+    interreflection: bool = False
+    emitters: tuple[Any, ...] = ()
+
+
+class CameraTracer:
+    """Prepared once for a scene and a cell grid; each seed is an independent estimate."""
+
+    def __init__(
+        self,
+        scene: Any,
+        camera: Any,
+        projector: Projector,
+        grid: CellGrid,
+        paths: Paths,
+        geometry: CameraGeometry | None = None,
+    ) -> None:
+        """``geometry`` stands in for the camera's own."""
+        self.geometry: CameraGeometry = geometry or camera.geometry
+        self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
+        self.source = Source(projector)
+
+    @property
+    def lanes(self) -> int:
+        """Paths in one sample: one per cell."""
+        return self.grid.shape[0] * self.grid.shape[1]
+
+    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
+        """Samples ``first`` .. ``first + samples - 1`` of the sequence ``seed``, a path each a cell.
+
+        Raises
+        ------
+        MitsimError
+            when the scene sends NaN or infinite light to the camera.
+        """
+        parts = [
+            part
+            for sample, cell in launches(self.lanes, first, samples)
+            for part in _Walk(self, seed, cell, sample).deposits()
+        ]
+        return Deposits.joined(parts)
+
+
+class _Walk:
+    """One launch: paths from the camera in one kernel, the first vertex apart and all others in a loop.
+
+    A path makes many connections, and the kernel hands out one of each kind: direct light of the projector, its
+    indirect light, and ambient light.
+    """
+
+    def __init__(self, tracer: CameraTracer, seed: int, cell: Any, sample: Any) -> None:
+        self.tracer, self.paths, self.source, self.geometry = tracer, tracer.paths, tracer.source, tracer.geometry
+        self.scene = tracer.scene
+        # A path that leaves a cell's very edge could be filed in the next cell by rounding.
+        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, generator(dr.opaque(mi.UInt32, seed), cell))
+        self.rng = generator(dr.opaque(mi.UInt32, seed) ^ (sample * 0x9E3779B9 + 1), cell)
+        self.strength, self.part = mi.Spectrum(1), mi.Float(1)
+        self.travelled, self.bounce, self.order, self.left_at = mi.Float(0), mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
+        self.by_delta, self.mirrored, self.in_mirror = mi.Bool(True), mi.Bool(True), mi.Bool(False)
+        self.came_from, self.came_pdf = dr.zeros(mi.Point3f), mi.Float(0)
+        self._aim(cell, jitter)
+        self.kept = {kind: Reservoir.empty() for kind in _KINDS}
+
+    def deposits(self) -> list[Deposits]:
+        """Follow every path to its end, and take its light to the host."""
+        self._vertex(first=True)
+        if self.paths.mirrors or self.paths.interreflection:
+            self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self._STATE))
+        dr.eval(self.kept)
+        return [
+            Deposits.fetched(kept.value, kept.source, kept.tau_row, kept.tau_column, kept.near, _KINDS[kind])
+            for kind, kept in self.kept.items()
+        ]
+
+    def _body(self, *values: Any) -> tuple[Any, ...]:
+        self._load(values)
+        self._vertex(first=False)
+        return self._values()
+
+    # ---- the camera's side ------------------------------------------------------------------------------------------
+
+    def _aim(self, cell: Any, jitter: Any) -> None:
+        """Rays from the sensor's centre through the cells, and the weight of each."""
+        tracer, grid = self.tracer, self.tracer.grid
+        columns = dr.opaque(mi.UInt32, grid.shape[1])
+        self.tau_row = _place(grid.rows, cell // columns, jitter.x)
+        self.tau_column = _place(grid.columns, cell % columns, jitter.y)
+        squared = 1 + dr.square(self.tau_row) + dr.square(self.tau_column)
+        self.slope = dr.rsqrt(squared)
+        wavelengths, spectral = tracer.camera.sample_wavelengths(
+            dr.zeros(mi.SurfaceInteraction3f), self.rng.next_float32(), True
+        )
+        to_world = tracer.camera.world_transform()
+        direction = mi.Vector3f(-self.tau_column, -self.tau_row, 1) * self.slope
+        self.ray = mi.Ray3f(to_world @ mi.Point3f(0), to_world @ direction, 0.0, wavelengths)
+        stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
+        self.active = (dr.abs(self.tau_row) <= stop) & (dr.abs(self.tau_column) <= stop)
+        # dt of a cell times (1 + t^2)^-2, and a pixel's response cos^n.
+        solid = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) / dr.square(squared)
+        if self.geometry.angular_exponent > 0:
+            solid *= dr.power(squared, -0.5 * dr.opaque(mi.Float, self.geometry.angular_exponent))
+        self.weight = spectral * solid
+        self.near = mi.Float(0)
+
+    # ---- one vertex -------------------------------------------------------------------------------------------------
+
+    def _vertex(self, first: bool) -> None:
+        """Find the next vertex of every path, connect it to the lights, and leave it."""
+        si = self.scene.ray_intersect(mi.RayDifferential3f(self.ray), mi.RayFlags.All, first, self.active)
+        if first or self.paths.mirrors:
+            # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
+            self.near = dr.select(self.mirrored, dr.rcp((self.travelled + si.t) * self.slope), self.near)
+        if first:
+            self.active &= self.near < 1 / dr.opaque(mi.Float, self.geometry.mask_distance)
+        elif self.tracer.projector.aperture > 0:
+            self._projector_hit(si)
+        if self.paths.emitters:
+            self._emitter_hit(si)
+        self.active &= si.is_valid()
+        bsdf = si.bsdf()
+        if not first:
+            self._connect(si, bsdf)
+        for emitter in self.paths.emitters:
+            self._light(si, bsdf, emitter)
+        if self.paths.mirrors or self.paths.interreflection:
+            self._leave(si, bsdf, first)
+
+    def _connect(self, si: Any, bsdf: Any) -> None:
+        """Light of the projector that this vertex sends on along its path."""
+        found = self.source.connect(si, self.rng, self.active)
+        active = found.valid & ~self.scene.ray_test(si.spawn_ray_to(found.target), found.valid)
+        toward = si.to_local(found.direction)
+        if self.tracer.projector.aperture > 0 and self.paths.interreflection:
+            value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, toward, active)
+            value *= self._share(found.pdf, pdf)
+        else:
+            value = bsdf.eval(mi.BSDFContext(), si, toward, active)
+        self._keep_of_projector(active, self._radiance(value * found.weight), found.pixel, self.order)
+
+    def _light(self, si: Any, bsdf: Any, emitter: Any) -> None:
+        """The same for another light of the scene."""
+        point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        ds, light = emitter.sample_direction(si, point, self.active)
+        active = self.active & (ds.pdf > 0)
+        active &= ~self.scene.ray_test(si.spawn_ray_to(ds.p), active)
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
+        share = dr.select(ds.delta, 1, self._share(ds.pdf, pdf)) if self.paths.interreflection else 1
+        self._keep("ambient", active, self._radiance(value * light) * share, self._lamps())
+
+    def _emitter_hit(self, si: Any) -> None:
+        """Light of a lamp that the path has run into."""
+        emitter = si.emitter(self.scene, self.active)
+        before = dr.zeros(mi.Interaction3f)
+        before.p = self.came_from
+        lamp = self.active & (emitter != None)  # noqa: E711 - a Dr.Jit comparison, lane by lane
+        ds = mi.DirectionSample3f(self.scene, si, before)
+        pdf = emitter.pdf_direction(before, ds, lamp & ~self.by_delta)
+        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, pdf))
+        self._keep("ambient", lamp, self._radiance(emitter.eval(si, lamp)) * share, self._lamps())
+
+    def _projector_hit(self, si: Any) -> None:
+        """Light of a projector's lens that the path has run into.
+
+        Over mirrors alone it is the beams' (:mod:`mitsim.transport.beams`); over one other surface, unless that is
+        seen in a mirror, it is the projector's side's.
+        """
+        active = self.active & (self.order > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
+        radiance, pdf, pixel, met = self.source.hit(self.ray, si.t, self.rng, active)
+        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, pdf))
+        self._keep_of_projector(met, self._radiance(radiance) * share, pixel, self.order - 1)
+
+    def _leave(self, si: Any, bsdf: Any, first: bool) -> None:
+        """Sample where each path goes on, and end some of them."""
+        number = self.rng.next_float32()
+        point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        sample, value = bsdf.sample(mi.BSDFContext(), si, number, point, self.active)
+        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        going = self.active & (sample.pdf > 0)
+        if not self.paths.interreflection:
+            going &= delta
+        elif not self.paths.mirrors:
+            going &= ~delta
+        if first:
+            self.in_mirror = mi.Bool(delta)
+            self.part = dr.select(delta, 1, camera_part(sample.pdf))
+            if not self.paths.emitters:
+                going &= self.part > 0
+        self.strength *= mi.unpolarized_spectrum(value)
+        self.bounce += 1
+        if not first:
+            chance = survival(self.strength, self.mirrored, self.bounce)
+            going &= self.rng.next_float32() < chance
+            self.strength *= dr.rcp(dr.maximum(chance, 1e-6))
+        self.active = going & (dr.max(self.strength) > 0)
+        self.mirrored &= delta
+        self.order = dr.select(delta, self.order, self.order + 1)
+        self.travelled += si.t
+        self.came_from, self.came_pdf, self.by_delta = mi.Point3f(si.p), mi.Float(sample.pdf), mi.Bool(delta)
+        self.ray = si.spawn_ray(si.to_world(sample.wo))
+
+    # ---- light that is kept -----------------------------------------------------------------------------------------
+
+    def _radiance(self, light: Any) -> Any:
+        """One number for the light of a connection, as irradiance at the sensor's centre."""
+        return panchromatic(mi.unpolarized_spectrum(light) * self.strength * self.weight)
+
+    def _lamps(self) -> Any:
+        return mi.UInt32(self.tracer.projector.n**2)
+
+    @staticmethod
+    def _share(own: Any, other: Any) -> Any:
+        """Balance heuristic of two ways to find the same light; a pdf of 0 means that a way cannot find it."""
+        return dr.select(own > 0, own / (own + other), 1)
+
+    def _keep_of_projector(self, active: Any, value: Any, pixel: Any, order: Any) -> None:
+        """``order``: surfaces on the light's way that are no mirrors."""
+        self._keep("direct", active & (order == 1), value * self.part, pixel)
+        if self.paths.interreflection:
+            self._keep("indirect", active & (order > 1), value * self.part, pixel)
+
+    def _keep(self, kind: str, active: Any, value: Any, source: Any) -> None:
+        light = dr.select(active, value, 0)
+        self.kept[kind] = self.kept[kind].joined_by(light, source, self.tau_row, self.tau_column, self.near, self.rng)
+
+    # ---- state of the loop ------------------------------------------------------------------------------------------
+
+    _STATE = (
+        *("active", "ray", "strength", "part", "bounce", "order", "in_mirror", "mirrored", "by_delta", "travelled"),
+        *("rng", "near", "came_from", "came_pdf", "kept"),
+    )
+
+    def _values(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, name) for name in self._STATE)
+
+    def _load(self, values: tuple[Any, ...]) -> None:
+        for name, value in zip(self._STATE, values, strict=True):
+            setattr(self, name, value)
+
+
+def _place(axis: Any, index: Any, jitter: Any) -> Any:
+    """Tan-angle of a place in a cell."""
+    start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, axis.size)
+    return start + (mi.Float(index) + jitter) * size

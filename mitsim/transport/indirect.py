@@ -1,0 +1,157 @@
+"""Indirect light from the projector's side: every pixel's rays, followed over any number of surfaces to the sensor.
+
+At each surface after the first the light that a path carries is connected to the sensor's centre
+(:mod:`mitsim.transport.receiver`), so every path that meets a second surface counts, and it counts for its own pixel.
+Of the connections of a path one is handed out, drawn in proportion to its light, and it carries the light of all.
+
+Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side
+(:mod:`mitsim.transport.camera_side`) finds the light instead. :func:`mitsim.transport.paths.camera_part` divides it.
+
+Light that only mirrors have turned before the last surface (a caustic) is direct light; the camera's side has no part
+in it. Paths end at random (Russian roulette) with a probability that keeps the estimate unbiased.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsim.optics.camera import CameraGeometry
+from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits
+from mitsim.transport.paths import Reservoir, camera_part, launches, survival
+from mitsim.transport.rays import ProjectorRays
+from mitsim.transport.receiver import Receiver
+from mitsim.transport.sampling import generator, panchromatic, stratified
+from mitsim.transport.source import Projector
+
+_KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT})
+
+
+class IndirectTracer:
+    """Prepared once for a scene and a projector; each seed is an independent estimate."""
+
+    def __init__(
+        self,
+        scene: Any,
+        camera: Any,
+        projector: Projector,
+        mirrors: bool,
+        interreflection: bool,
+        geometry: CameraGeometry | None = None,
+    ) -> None:
+        """``mirrors``: paths over delta reflections and transmissions; ``interreflection``: over other surfaces.
+
+        ``geometry`` stands in for the camera's own.
+        """
+        self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
+        self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
+
+    @property
+    def lanes(self) -> int:
+        """Paths of one sample: one per projector pixel."""
+        return self.projector.n**2
+
+    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
+        """Samples ``first`` .. ``first + samples - 1`` of every pixel, as if ``samples`` of them were all.
+
+        Raises
+        ------
+        MitsimError
+            when the scene sends NaN or infinite light to the camera.
+        """
+        parts = [
+            part
+            for sample, pixel in launches(self.lanes, first, samples)
+            for part in _Walk(self, seed, pixel, sample).deposits()
+        ]
+        return Deposits.joined(parts)
+
+
+class _Walk:
+    """One launch: the first surface apart, and all others in a loop of one kernel."""
+
+    def __init__(self, tracer: IndirectTracer, seed: int, pixel: Any, sample: Any) -> None:
+        self.tracer, self.scene, self.pixel = tracer, tracer.scene, pixel
+        # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
+        self.first_turn = stratified(sample, generator(dr.opaque(mi.UInt32, seed), pixel))
+        self.rng = generator(dr.opaque(mi.UInt32, seed) ^ (sample * 0x9E3779B9 + 1), pixel)
+        wavelengths, spectral = tracer.receiver.wavelengths(self.rng)
+        jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        self.ray = tracer.rays.sample(pixel, jitter, self.rng, wavelengths)
+        self.flux = tracer.rays.flux(pixel, wavelengths) * spectral
+        self.strength, self.active = mi.Spectrum(1), mi.Bool(True)
+        self.bounce, self.scattered = mi.UInt32(0), mi.UInt32(0)
+        self.kept = {kind: Reservoir.empty() for kind in _KINDS}
+
+    def deposits(self) -> list[Deposits]:
+        """Follow every path to its end, and take its light to the host."""
+        self._vertex(first=True)
+        self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self._STATE))
+        dr.eval(self.kept, self.pixel)
+        return [
+            Deposits.fetched(kept.value, self.pixel, kept.tau_row, kept.tau_column, kept.near, _KINDS[kind])
+            for kind, kept in self.kept.items()
+        ]
+
+    def _body(self, *values: Any) -> tuple[Any, ...]:
+        self._load(values)
+        self._vertex(first=False)
+        return self._values()
+
+    def _vertex(self, first: bool) -> None:
+        si = self.scene.ray_intersect(self.ray, self.active)
+        self.active &= si.is_valid()
+        if not first:
+            self._connect(si)
+        self._leave(si, first)
+
+    def _connect(self, si: Any) -> None:
+        """Light that this surface sends to the sensor's centre."""
+        found = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active)
+        value = panchromatic(found.irradiance * self.flux * self.strength)
+        caustic = self.scattered == 0
+        value *= dr.select(caustic, 1, 1 - camera_part(found.pdf))
+        for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
+            self.kept[kind] = self.kept[kind].joined_by(
+                dr.select(chosen, value, 0), self.pixel, found.tau_row, found.tau_column, found.near, self.rng
+            )
+
+    def _leave(self, si: Any, first: bool) -> None:
+        """Sample where each path goes on, and end some of them."""
+        toward = -self.ray.d
+        si.wi = si.to_local(toward)
+        number, point = self.rng.next_float32(), mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        point = self.first_turn if first else point
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        sample, value = si.bsdf().sample(context, si, number, point, self.active)
+        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        going = self.active & (sample.pdf > 0)
+        if not self.tracer.interreflection:
+            going &= delta
+        elif not self.tracer.mirrors:
+            going &= ~delta
+        onward = si.to_world(sample.wo)
+        # Light that is followed forward sees shading normals the other way round (Veach 1997, 5.3).
+        turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
+        turned /= mi.Frame3f.cos_theta(sample.wo) * dr.dot(si.n, toward)
+        self.strength *= mi.unpolarized_spectrum(value) * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
+        self.bounce += 1
+        if not first:
+            chance = survival(self.strength, (self.scattered == 0) & delta, self.bounce)
+            going &= self.rng.next_float32() < chance
+            self.strength *= dr.rcp(dr.maximum(chance, 1e-6))
+        self.active = going & (dr.max(self.strength) > 0)
+        self.scattered += dr.select(delta, mi.UInt32(0), mi.UInt32(1))
+        self.ray = si.spawn_ray(onward)
+
+    _STATE = ("active", "ray", "strength", "bounce", "scattered", "rng", "kept")
+
+    def _values(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, name) for name in self._STATE)
+
+    def _load(self, values: tuple[Any, ...]) -> None:
+        for name, value in zip(self._STATE, values, strict=True):
+            setattr(self, name, value)

@@ -1,0 +1,67 @@
+"""What paths from the projector and paths from the camera share: launches, who finds which light, how they end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+_LANES_PER_LAUNCH = 2**22
+_SHARP = 1.0
+"""Density [1/sr] of sampling a turn above which its light is looked for from the camera; 0.32 is a matt surface's."""
+_MIRRORS = 16
+
+
+def launches(lanes: int, first: int, samples: int) -> Iterator[tuple[Any, Any]]:
+    """(sample, lane) of samples ``first`` .. ``first + samples - 1`` of ``lanes`` lanes each, one kernel at a time."""
+    total, start = lanes * samples, lanes * first
+    for done in range(0, total, _LANES_PER_LAUNCH):
+        index = dr.arange(mi.UInt64, min(_LANES_PER_LAUNCH, total - done)) + dr.opaque(mi.UInt64, start + done)
+        # An opaque number keeps the compiled kernel the same for every count.
+        per_sample = dr.opaque(mi.UInt64, lanes)
+        yield mi.UInt32(index // per_sample), mi.UInt32(index % per_sample)
+
+
+def camera_part(pdf: Any) -> Any:
+    """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
+
+    ``pdf`` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to
+    one. A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light: it is bounded however sharp
+    the lobe. What is matt is never followed from the camera.
+    """
+    return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)
+
+
+def survival(strength: Any, mirrored: Any, bounce: Any) -> Any:
+    """Chance that a path goes on: what it still carries; chains of mirrors are short and full of light."""
+    return dr.select(mirrored & (bounce < _MIRRORS), 1, dr.minimum(dr.max(strength), 0.95))
+
+
+@dataclass
+class Reservoir:
+    """Of many connections, one drawn in proportion to its light, which carries the light of all: ``value``.
+
+    ``source`` is its projector pixel, the rest where it is filed.
+    """
+
+    value: Any
+    source: Any
+    tau_row: Any
+    tau_column: Any
+    near: Any
+
+    @classmethod
+    def empty(cls) -> Reservoir:
+        """No light yet."""
+        return cls(mi.Float(0), mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0))
+
+    def joined_by(self, value: Any, source: Any, tau_row: Any, tau_column: Any, near: Any, rng: Any) -> Reservoir:
+        """With one more connection, which stands for all with the chance of its part."""
+        total = self.value + value
+        new = rng.next_float32() * total < value
+        mine = (self.source, self.tau_row, self.tau_column, self.near)
+        chosen = (dr.select(new, a, b) for a, b in zip((source, tau_row, tau_column, near), mine, strict=True))
+        return Reservoir(total, *chosen)

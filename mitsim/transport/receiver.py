@@ -1,0 +1,74 @@
+"""The bare sensor as a receiver: from a lit surface point to the irradiance that it casts on a point of the sensor.
+
+A surface point P that receives the flux phi irradiates the sensor point with::
+
+    E = f(P) cos_s / cos_g  phi  cos_P cos_a / r^2  r(t)        [W m^-2]
+
+f is the BSDF, cos_s and cos_g the arriving light's cosines to the shading and the geometric normal at P, cos_P and
+cos_a those of the connection at P and at the sensor, and r(t) the pixel's angular response. Without a lens, every
+surface point that is not in the shadow of another sees the sensor: light can be followed from the projector's side,
+where every path counts for a pixel that is known from the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsim.optics.camera import CameraGeometry
+
+
+@dataclass
+class Reception:
+    """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
+
+    ``tau_row``, ``tau_column`` and ``near`` (1/z) as in :class:`mitsim.transport.histogram.Deposits`; ``pdf`` is that
+    of sampling the turn at P from the sensor's side.
+    """
+
+    irradiance: Any
+    tau_row: Any
+    tau_column: Any
+    near: Any
+    pdf: Any
+
+
+class Receiver:
+    """Prepared once for a scene and a camera; ``geometry`` stands in for the camera's own."""
+
+    def __init__(self, scene: Any, camera: Any, geometry: CameraGeometry | None = None) -> None:
+        self.scene, self.camera = scene, camera
+        self.geometry: CameraGeometry = geometry or camera.geometry
+
+    def receive(self, si: Any, toward: Any, local: Any, active: Any) -> Reception:
+        """Connect surface points, lit from directions ``toward``, to sensor points ``local`` in the camera's frame."""
+        to_world = self.camera.world_transform()
+        point = to_world.inverse() @ si.p
+        sensor = to_world @ local
+        offset = sensor - si.p
+        squared = dr.squared_norm(offset)
+        direction = offset * dr.rsqrt(squared)
+        t = mi.Vector2f(point.x - local.x, point.y - local.y) / point.z
+        stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
+        active = active & (point.z > dr.opaque(mi.Float, self.geometry.mask_distance))
+        active &= (dr.abs(t.x) <= stop) & (dr.abs(t.y) <= stop)
+        active &= ~self.scene.ray_test(si.spawn_ray_to(sensor), active)
+        si.wi = si.to_local(direction)
+        reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), active)
+        cosine = dr.rsqrt(1 + dr.squared_norm(t))
+        geometric = dr.abs(dr.dot(si.n, direction)) * cosine / (squared * dr.abs(dr.dot(si.n, toward)))
+        if self.geometry.angular_exponent > 0:
+            geometric *= dr.power(cosine, dr.opaque(mi.Float, self.geometry.angular_exponent))
+        near = dr.rcp(point.z)
+        irradiance = dr.select(active, mi.unpolarized_spectrum(reflected) * geometric, 0)
+        return Reception(irradiance, -point.y * near, -point.x * near, near, pdf)
+
+    def wavelengths(self, rng: Any) -> tuple[Any, Any]:
+        """Wavelengths of a path, and the weight of its light; neither matters but in spectral variants."""
+        found: tuple[Any, Any] = self.camera.sample_wavelengths(
+            dr.zeros(mi.SurfaceInteraction3f), rng.next_float32(), True
+        )
+        return found

@@ -1,0 +1,158 @@
+"""Indirect light from the projector's side, against a sphere and a mirror that have closed forms.
+
+Gates on Monte Carlo means are seven standard errors of eight independent seeds: five sigma of the t distribution.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.core.errors import MitsimError
+from mitsim.transport import paths
+from mitsim.transport.camera_side import CameraTracer, Paths
+from mitsim.transport.cells import aligned_grid
+from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits
+from mitsim.transport.indirect import IndirectTracer
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, SEEDS, SIGMAS = 16, 8, 7.0
+SPHERE = """<shape type="sphere"><float name="radius" value="1000"/><boolean name="flip_normals" value="true"/>
+    {bsdf}</shape>"""
+MATT = '<bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf>'
+# Half of the turns from a lobe of alpha 0.05: both sides find a part of the light.
+SHINY = f"""<bsdf type="blendbsdf"><float name="weight" value="0.5"/>{MATT}
+    <bsdf type="roughconductor"><string name="material" value="none"/><float name="alpha" value="0.05"/>
+        <spectrum name="specular_reflectance" value="0.5"/></bsdf></bsdf>"""
+# A mirror wall at x = -40 mm, from 305 to 385 mm, before the sheet at 400 mm.
+MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="40"/><rotate y="1" angle="90"/>
+        <translate x="-40" z="345"/></transform>
+        <bsdf type="conductor"><string name="material" value="none"/></bsdf></shape>"""
+
+
+def tracer(bench: Bench, mirrors: bool = False, interreflection: bool = True) -> IndirectTracer:
+    loaded = bench.loaded
+    return IndirectTracer(loaded.scene, loaded.camera, bench.source, mirrors, interreflection)
+
+
+def seen(stop: float) -> float:
+    """Integral of (1 + t^2)^-2 over |t_x|, |t_y| < stop: the irradiance of an even radiance of 1."""
+    node, weight = np.polynomial.legendre.leggauss(12)
+    t, w = stop * node, stop * weight
+    return float(w @ (1 + np.square(t)[:, None] + np.square(t)[None, :]) ** -2 @ w)
+
+
+def mean(values: np.ndarray) -> tuple[float, float]:
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+@pytest.fixture(scope="module")
+def hollow(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    """Camera and projector inside a diffuse sphere; the sheet is far outside."""
+    return open_bench(shared_scene("dome", extra=SPHERE.format(bsdf=MATT), sheet_z=3000), variant)
+
+
+def test_a_hollow_sphere_is_lit_evenly_by_its_own_light(hollow: Bench) -> None:
+    """Indirect light in a diffuse sphere is even: E = Phi rho / (A (1 - rho)), Phi being the projector's flux.
+
+    Phi = pi scale (0.3)^2, the window's area at unit distance; every pixel has its equal part of it.
+    """
+    flux = np.pi * 111000 * 0.3**2
+    radiance = 0.5 / np.pi * flux * 0.5 / (4 * np.pi * 1000**2 * (1 - 0.5))
+    expected = radiance * seen(hollow.geometry.tan_half_fov)
+    trace = tracer(hollow)
+    found = [trace.trace(seed, 0, 2048) for seed in range(SEEDS)]
+    assert all((one.order == INDIRECT).all() for one in found)
+    total, error = mean(np.array([one.value.sum() / 2048 for one in found]))
+    assert SIGMAS * error < 0.1 * expected
+    assert abs(total - expected) < SIGMAS * error
+    light = np.mean([np.bincount(one.source, one.value, minlength=N * N) for one in found], axis=0).reshape(N, N)
+    for part in (light[:8], light[8:], light[:, :8], light[:, 8:]):
+        assert part.sum() / 2048 == pytest.approx(expected / 2, rel=0.06)
+    # Even over the directions too, whatever pixel the light came from.
+    place = np.concatenate([one.row for one in found]), np.concatenate([one.column for one in found])
+    assert abs(place[0].mean()) < 0.01 and abs(place[1].mean()) < 0.01
+    assert np.abs(1 / found[0].inverse_depth - 1000).max() < 40
+
+
+def test_a_flat_scene_has_no_indirect_light(small_scene: Callable[..., Path]) -> None:
+    assert not tracer(open_bench(small_scene())).trace(0, 0, 4).value.size
+
+
+def test_both_sides_together_find_all_light(shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a shiny sphere: whatever the threshold between the sides, even when one of them has everything.
+
+    A part counted twice, or by no side, shows: the lobe carries half of the light of the last turn.
+    """
+    bench = open_bench(shared_scene("shiny", extra=SPHERE.format(bsdf=SHINY), sheet_z=3000))
+    grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
+    loaded = bench.loaded
+
+    def found(sharp: float) -> tuple[np.ndarray, np.ndarray]:
+        monkeypatch.setattr(paths, "_SHARP", sharp)
+        camera = CameraTracer(loaded.scene, loaded.camera, bench.source, grid, Paths(interreflection=True))
+        sums = [[one.trace(seed, 0, 1024).value.sum() / 1024 for seed in range(16)] for one in (tracer(bench), camera)]
+        return np.array(sums[0]), np.array(sums[1])
+
+    projector, camera = found(1.0)
+    assert projector.mean() > 0.1 * camera.mean() and camera.mean() > 0.1 * projector.mean()
+    total, error = mean(projector + camera)
+    (_, everything), (most, little) = found(1e-6), found(1e6)
+    assert not little.any()
+    for other, other_error in (mean(everything), mean(most)):
+        bound = SIGMAS * np.hypot(error, other_error)
+        assert bound < 0.2 * total
+        assert abs(total - other) < bound
+
+
+def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Callable[..., Path]) -> None:
+    """A mirror wall x = -40 throws light on the sheet, which seems to come from the projector's image at x = -140.
+
+    Each ray carries pi scale (0.3 / n)^2 to its place on the sheet, wherever that is, and the sheet sends the camera
+    0.5 / pi cos^2 / r^2 of it.
+    """
+    bench = open_bench(shared_scene("caustic", extra=MIRROR))
+    found = tracer(bench, mirrors=True, interreflection=False).trace(2, 0, 64)
+    assert found.value.size > 1000 and (found.order == DIRECT).all()
+    places = np.stack([-found.column, -found.row, np.ones(found.value.size)], axis=1) / found.inverse_depth[:, None]
+    assert places[:, 2] == pytest.approx(np.full(len(places), 400), rel=1e-5)
+    # The way from the image to a lit place goes through the mirror, and through the pixel's part of the image.
+    image = np.array([-140.0, 0, 0])
+    way = (places - image) / (places[:, :1] - image[0])
+    mirror = image + 100 * way
+    assert np.abs(mirror[:, 1]).max() < 40.01 and np.abs(mirror[:, 2] - 345).max() < 40.01
+    row, column = np.divmod(found.source, N)
+    slope_x, slope_y = way[:, 0] / way[:, 2], way[:, 1] / way[:, 2]
+    assert np.abs(slope_y - (0.15 - (row + 0.5) / N * 0.3)).max() < 0.1501 / N
+    assert np.abs(slope_x - (column + 0.5) / N * 0.3).max() < 0.152 / N
+    r2 = np.square(places).sum(axis=1)
+    expected = np.pi * 111000 * (0.3 / N) ** 2 * 0.5 / np.pi * 400**2 / r2**2
+    assert found.value == pytest.approx(expected, rel=1e-4)
+
+
+def test_without_paths_there_is_no_light(hollow: Bench) -> None:
+    assert not tracer(hollow, interreflection=False).trace(0, 0, 2).value.size
+
+
+def test_seeds_and_launches(hollow: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    trace = tracer(hollow)
+    assert trace.lanes == N * N
+    whole, again, other = trace.trace(6, 0, 64), trace.trace(6, 0, 64), trace.trace(7, 0, 64)
+    assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
+    assert np.isin(whole.row, other.row).mean() < 0.01
+    pieces = Deposits.joined([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
+    monkeypatch.setattr(paths, "_LANES_PER_LAUNCH", 3000)
+    for parts in (pieces, trace.trace(6, 0, 64)):
+        assert np.allclose(parts.row, whole.row, atol=1e-6) and np.allclose(parts.value, whole.value, rtol=1e-5)
+
+
+def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:
+    bench = open_bench(small_scene(extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
+    parameters = mi.traverse(bench.loaded.projector)
+    parameters["scale"] = float("nan")
+    parameters.update()
+    with pytest.raises(MitsimError, match="NaN"):
+        tracer(bench).trace(0, 0, 256)
