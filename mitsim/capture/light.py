@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
-from mitsim.capture.simulation import Light as Estimate
-from mitsim.capture.simulation import Simulation
+from mitsim.capture.simulation import Estimate, Simulation
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
 from mitsim.scene.plan import GROUPS, Evidence, Plan, SceneFacts, Settings, check_accuracy, decide

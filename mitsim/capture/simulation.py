@@ -34,7 +34,7 @@ AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class Estimate:
     """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
 
     ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees beyond
@@ -45,11 +45,11 @@ class Light:
     coarse: sparse.csr_array
     smooth: sparse.csr_array
 
-    def __add__(self, other: Light) -> Light:
-        return Light(self.fine + other.fine, self.coarse + other.coarse, self.smooth + other.smooth)
+    def __add__(self, other: Estimate) -> Estimate:
+        return Estimate(self.fine + other.fine, self.coarse + other.coarse, self.smooth + other.smooth)
 
-    def __truediv__(self, count: float) -> Light:
-        return Light(self.fine / count, self.coarse / count, self.smooth / count)
+    def __truediv__(self, count: float) -> Estimate:
+        return Estimate(self.fine / count, self.coarse / count, self.smooth / count)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Stage:
 
     tracer: DirectTracer | IndirectTracer | CameraTracer
     predicted: float
-    file: Callable[[Deposits, Labels, int], Light]
+    file: Callable[[Deposits, Labels, int], Estimate]
 
 
 class Simulation:
@@ -166,25 +166,25 @@ class Simulation:
         positions = anchor_positions(self.settings.anchors, self.geometry.half_width)
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
 
-    def file(self, found: Deposits, labels: Labels, samples: int) -> Light:
+    def file(self, found: Deposits, labels: Labels, samples: int) -> Estimate:
         """Light of :attr:`direct`, per sample."""
         return self._light(fine=self.bundle.file(found, labels, samples))
 
-    def file_anchored(self, found: Deposits, labels: Labels, samples: int) -> Light:
+    def file_anchored(self, found: Deposits, labels: Labels, samples: int) -> Estimate:
         """Light of :attr:`anchored` beyond its mean over the sensor, per sample."""
         mean = self.smooth.file(found.averaged(self.mean_weights), labels, samples)
         return self._light(coarse=self.coarse.file(found, labels, samples) - self.coarse.repeated(mean))
 
-    def file_other(self, found: Deposits, labels: Labels, samples: int) -> Light:
+    def file_other(self, found: Deposits, labels: Labels, samples: int) -> Estimate:
         """Light of :attr:`indirect` or :attr:`other`, per sample."""
         indirect = found.order == INDIRECT
         fine = self.bundle.file(found.where(~indirect), labels, samples)
         return self._light(fine=fine, smooth=self.smooth.file(found.where(indirect), labels, samples))
 
-    def _light(self, **parts: sparse.csr_array) -> Light:
+    def _light(self, **parts: sparse.csr_array) -> Estimate:
         rows = next(iter(parts.values())).shape[0]
         sizes = {"fine": self.bundle.size, "coarse": self.coarse.size, "smooth": self.smooth.size}
-        return Light(**{name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()})
+        return Estimate(**{name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()})
 
     def tracers(self) -> dict[str, Stage]:
         """What is traced: samples a group is predicted to need, and how the light is filed, by name."""
@@ -218,7 +218,7 @@ class Simulation:
         return "diffraction" in self.settings.effects
 
     def expected(
-        self, groups: Sequence[Light], rows: Labels, weights: FloatArray, seed: int, exact: ClassFrames | None = None
+        self, groups: Sequence[Estimate], rows: Labels, weights: FloatArray, seed: int, exact: ClassFrames | None = None
     ) -> ExpectedFrames:
         """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' rows to classes."""
         first = len(rows)

@@ -32,7 +32,7 @@ from scipy.special import fresnel
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
-from mitsim.optics.aperture import Steps, sampled_box_means
+from mitsim.optics.profile import Steps, sampled_box_means
 from mitsim.optics.shadow import Directions, SeparableTerms, Setting, both_axes
 
 FloatArray = npt.NDArray[np.float64]

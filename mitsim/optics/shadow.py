@@ -28,8 +28,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.aperture import Steps
 from mitsim.optics.mask import Mask
+from mitsim.optics.profile import Steps
 
 FloatArray = npt.NDArray[np.float64]
 SeparableTerms = list[tuple[FloatArray, FloatArray]]

@@ -14,8 +14,7 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench, PatternFamily
 from mitsim.capture.light import Light, Settings
-from mitsim.capture.simulation import Light as Estimate
-from mitsim.capture.simulation import Simulation
+from mitsim.capture.simulation import Estimate, Simulation
 from mitsim.optics.camera import CameraGeometry
 from mitsim.optics.diffraction import Spectrum
 from mitsim.optics.frames import ExpectedFrames, FrameOptics

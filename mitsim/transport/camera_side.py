@@ -20,7 +20,7 @@ keeps the estimate unbiased; there is no last bounce.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import MappingProxyType
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -28,13 +28,12 @@ import mitsuba as mi
 
 from mitsim.optics.camera import CameraGeometry
 from mitsim.transport.cells import CellGrid
-from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
-from mitsim.transport.paths import Reservoir, camera_part, launches, survival
+from mitsim.transport.histogram import Deposits
+from mitsim.transport.paths import Walk, camera_part, survival, walked
 from mitsim.transport.sampling import generator, panchromatic, stratified
 from mitsim.transport.source import Projector, Source
 
 _MARGIN = 1e-4
-_KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 
 
 @dataclass(frozen=True)
@@ -80,49 +79,31 @@ class CameraTracer:
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        parts = [
-            part
-            for sample, cell in launches(self.lanes, first, samples)
-            for part in _Walk(self, seed, cell, sample).deposits()
-        ]
-        return Deposits.joined(parts)
+        return walked(
+            partial(_Walk, self, seed), self.lanes, first, samples, self.paths.mirrors or self.paths.interreflection
+        )
 
 
-class _Walk:
-    """One launch: paths from the camera in one kernel, the first vertex apart and all others in a loop.
+class _Walk(Walk):
+    """Paths from the camera: one connection of each kind is kept, of the projector's direct and indirect, of ambient."""
 
-    A path makes many connections, and the kernel hands out one of each kind: direct light of the projector, its
-    indirect light, and ambient light.
-    """
+    STATE = (
+        *("active", "ray", "strength", "part", "bounce", "order", "in_mirror", "mirrored", "by_delta", "travelled"),
+        *("rng", "near", "came_from", "came_pdf", "kept"),
+    )
 
-    def __init__(self, tracer: CameraTracer, seed: int, cell: Any, sample: Any) -> None:
+    def __init__(self, tracer: CameraTracer, seed: int, sample: Any, cell: Any) -> None:
+        super().__init__()
         self.tracer, self.paths, self.source, self.geometry = tracer, tracer.paths, tracer.source, tracer.geometry
         self.scene = tracer.scene
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
         jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, generator(dr.opaque(mi.UInt32, seed), cell))
         self.rng = generator(dr.opaque(mi.UInt32, seed) ^ (sample * 0x9E3779B9 + 1), cell)
         self.strength, self.part = mi.Spectrum(1), mi.Float(1)
-        self.travelled, self.bounce, self.order, self.left_at = mi.Float(0), mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
+        self.travelled, self.bounce, self.order = mi.Float(0), mi.UInt32(0), mi.UInt32(1)
         self.by_delta, self.mirrored, self.in_mirror = mi.Bool(True), mi.Bool(True), mi.Bool(False)
         self.came_from, self.came_pdf = dr.zeros(mi.Point3f), mi.Float(0)
         self._aim(cell, jitter)
-        self.kept = {kind: Reservoir.empty() for kind in _KINDS}
-
-    def deposits(self) -> list[Deposits]:
-        """Follow every path to its end, and take its light to the host."""
-        self._vertex(first=True)
-        if self.paths.mirrors or self.paths.interreflection:
-            self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self._STATE))
-        dr.eval(self.kept)
-        return [
-            Deposits.fetched(kept.value, kept.source, kept.tau_row, kept.tau_column, kept.near, _KINDS[kind])
-            for kind, kept in self.kept.items()
-        ]
-
-    def _body(self, *values: Any) -> tuple[Any, ...]:
-        self._load(values)
-        self._vertex(first=False)
-        return self._values()
 
     # ---- the camera's side ------------------------------------------------------------------------------------------
 
@@ -151,7 +132,7 @@ class _Walk:
 
     # ---- one vertex -------------------------------------------------------------------------------------------------
 
-    def _vertex(self, first: bool) -> None:
+    def vertex(self, first: bool) -> None:
         """Find the next vertex of every path, connect it to the lights, and leave it."""
         si = self.scene.ray_intersect(mi.RayDifferential3f(self.ray), mi.RayFlags.All, first, self.active)
         if first or self.paths.mirrors:
@@ -268,21 +249,7 @@ class _Walk:
 
     def _keep(self, kind: str, active: Any, value: Any, source: Any) -> None:
         light = dr.select(active, value, 0)
-        self.kept[kind] = self.kept[kind].joined_by(light, source, self.tau_row, self.tau_column, self.near, self.rng)
-
-    # ---- state of the loop ------------------------------------------------------------------------------------------
-
-    _STATE = (
-        *("active", "ray", "strength", "part", "bounce", "order", "in_mirror", "mirrored", "by_delta", "travelled"),
-        *("rng", "near", "came_from", "came_pdf", "kept"),
-    )
-
-    def _values(self) -> tuple[Any, ...]:
-        return tuple(getattr(self, name) for name in self._STATE)
-
-    def _load(self, values: tuple[Any, ...]) -> None:
-        for name, value in zip(self._STATE, values, strict=True):
-            setattr(self, name, value)
+        self.keep(kind, light, source, self.tau_row, self.tau_column, self.near, self.rng)
 
 
 def _place(axis: Any, index: Any, jitter: Any) -> Any:

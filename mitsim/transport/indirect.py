@@ -13,21 +13,19 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 
 from __future__ import annotations
 
-from types import MappingProxyType
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mitsim.optics.camera import CameraGeometry
-from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits
-from mitsim.transport.paths import Reservoir, camera_part, launches, survival
+from mitsim.transport.histogram import Deposits
+from mitsim.transport.paths import Walk, camera_part, survival, walked
 from mitsim.transport.rays import ProjectorRays
 from mitsim.transport.receiver import Receiver
 from mitsim.transport.sampling import generator, panchromatic, stratified
 from mitsim.transport.source import Projector
-
-_KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT})
 
 
 class IndirectTracer:
@@ -62,18 +60,16 @@ class IndirectTracer:
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        parts = [
-            part
-            for sample, pixel in launches(self.lanes, first, samples)
-            for part in _Walk(self, seed, pixel, sample).deposits()
-        ]
-        return Deposits.joined(parts)
+        return walked(partial(_Walk, self, seed), self.lanes, first, samples)
 
 
-class _Walk:
-    """One launch: the first surface apart, and all others in a loop of one kernel."""
+class _Walk(Walk):
+    """Paths from the projector's pixels."""
 
-    def __init__(self, tracer: IndirectTracer, seed: int, pixel: Any, sample: Any) -> None:
+    STATE = ("active", "ray", "strength", "bounce", "scattered", "rng", "kept")
+
+    def __init__(self, tracer: IndirectTracer, seed: int, sample: Any, pixel: Any) -> None:
+        super().__init__()
         self.tracer, self.scene, self.pixel = tracer, tracer.scene, pixel
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         self.first_turn = stratified(sample, generator(dr.opaque(mi.UInt32, seed), pixel))
@@ -84,24 +80,8 @@ class _Walk:
         self.flux = tracer.rays.flux(pixel, wavelengths) * spectral
         self.strength, self.active = mi.Spectrum(1), mi.Bool(True)
         self.bounce, self.scattered = mi.UInt32(0), mi.UInt32(0)
-        self.kept = {kind: Reservoir.empty() for kind in _KINDS}
 
-    def deposits(self) -> list[Deposits]:
-        """Follow every path to its end, and take its light to the host."""
-        self._vertex(first=True)
-        self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self._STATE))
-        dr.eval(self.kept, self.pixel)
-        return [
-            Deposits.fetched(kept.value, self.pixel, kept.tau_row, kept.tau_column, kept.near, _KINDS[kind])
-            for kind, kept in self.kept.items()
-        ]
-
-    def _body(self, *values: Any) -> tuple[Any, ...]:
-        self._load(values)
-        self._vertex(first=False)
-        return self._values()
-
-    def _vertex(self, first: bool) -> None:
+    def vertex(self, first: bool) -> None:
         si = self.scene.ray_intersect(self.ray, self.active)
         self.active &= si.is_valid()
         if not first:
@@ -115,9 +95,8 @@ class _Walk:
         caustic = self.scattered == 0
         value *= dr.select(caustic, 1, 1 - camera_part(found.pdf))
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
-            self.kept[kind] = self.kept[kind].joined_by(
-                dr.select(chosen, value, 0), self.pixel, found.tau_row, found.tau_column, found.near, self.rng
-            )
+            light = dr.select(chosen, value, 0)
+            self.keep(kind, light, self.pixel, found.tau_row, found.tau_column, found.near, self.rng)
 
     def _leave(self, si: Any, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
@@ -146,12 +125,3 @@ class _Walk:
         self.active = going & (dr.max(self.strength) > 0)
         self.scattered += dr.select(delta, mi.UInt32(0), mi.UInt32(1))
         self.ray = si.spawn_ray(onward)
-
-    _STATE = ("active", "ray", "strength", "bounce", "scattered", "rng", "kept")
-
-    def _values(self) -> tuple[Any, ...]:
-        return tuple(getattr(self, name) for name in self._STATE)
-
-    def _load(self, values: tuple[Any, ...]) -> None:
-        for name, value in zip(self._STATE, values, strict=True):
-            setattr(self, name, value)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
+from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
+
+_KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 _LANES_PER_LAUNCH = 2**22
 _SHARP = 1.0
 """Density [1/sr] of sampling a turn above which its light is looked for from the camera; 0.32 is a matt surface's."""
@@ -65,3 +70,53 @@ class Reservoir:
         mine = (self.source, self.tau_row, self.tau_column, self.near)
         chosen = (dr.select(new, a, b) for a, b in zip((source, tau_row, tau_column, near), mine, strict=True))
         return Reservoir(total, *chosen)
+
+
+class Walk(ABC):
+    """The paths of one launch, a lane each: the first surface apart, and all others in a loop of one kernel.
+
+    Of each kind of light one connection a path is kept. ``STATE`` names the attributes that change on the way; the
+    first tells which paths still go on.
+    """
+
+    STATE: ClassVar[tuple[str, ...]]
+
+    def __init__(self) -> None:
+        self.kept = {kind: Reservoir.empty() for kind in _KINDS}
+
+    @abstractmethod
+    def vertex(self, first: bool) -> None:
+        """Find the next surface of every path, connect it, and leave it."""
+
+    def keep(self, kind: str, value: Any, source: Any, tau_row: Any, tau_column: Any, near: Any, rng: Any) -> None:
+        """Light of one connection, and where it is filed."""
+        self.kept[kind] = self.kept[kind].joined_by(value, source, tau_row, tau_column, near, rng)
+
+    def deposits(self, further: bool) -> list[Deposits]:
+        """Follow every path to its end, or to the first surface only, and take its light to the host."""
+        self.vertex(first=True)
+        if further:
+            self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
+        dr.eval(self.kept)
+        return [
+            Deposits.fetched(kept.value, kept.source, kept.tau_row, kept.tau_column, kept.near, _KINDS[kind])
+            for kind, kept in self.kept.items()
+        ]
+
+    def _body(self, *values: Any) -> tuple[Any, ...]:
+        self._load(values)
+        self.vertex(first=False)
+        return self._values()
+
+    def _values(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, name) for name in self.STATE)
+
+    def _load(self, values: tuple[Any, ...]) -> None:
+        for name, value in zip(self.STATE, values, strict=True):
+            setattr(self, name, value)
+
+
+def walked(walk: Callable[[Any, Any], Walk], lanes: int, first: int, samples: int, further: bool = True) -> Deposits:
+    """Light of samples ``first`` .. ``first + samples - 1``; ``walk`` makes the paths of some (samples, lanes)."""
+    parts = [walk(*one).deposits(further) for one in launches(lanes, first, samples)]
+    return Deposits.joined([deposits for part in parts for deposits in part])

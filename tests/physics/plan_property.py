@@ -23,7 +23,7 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.pilot import applicable
-from mitsim.capture.simulation import Light, Simulation
+from mitsim.capture.simulation import Estimate, Simulation
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import FrameOptics
@@ -142,7 +142,7 @@ class _Look:
         other = simulation.followed(integer(seed, "other"), self.effort.other)
         return direct.where(self.shown[direct.source]), other.where(self.shown[other.source])
 
-    def _filed(self, simulation: Simulation, deposits: tuple[Deposits, Deposits]) -> Light:
+    def _filed(self, simulation: Simulation, deposits: tuple[Deposits, Deposits]) -> Estimate:
         """What of the deposits a simulation has."""
         direct, other = deposits
         if not simulation.lit_by_lamps:
@@ -150,7 +150,7 @@ class _Look:
         light = simulation.file(direct, self.labels, self.effort.direct)
         return light + simulation.file_other(other, self.labels, self.effort.other)
 
-    def _formed(self, simulation: Simulation, light: Light) -> np.ndarray:
+    def _formed(self, simulation: Simulation, light: Estimate) -> np.ndarray:
         """(captures, pixels, pixels) frames without the projector's black."""
         frames = self._of_classes(simulation.optics, light.fine)
         frames += self._of_classes(simulation.smooth_optics, light.smooth)

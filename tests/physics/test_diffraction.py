@@ -11,9 +11,9 @@ import pytest
 from scipy.integrate import quad
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.aperture import Steps
 from mitsim.optics.camera import CameraGeometry
 from mitsim.optics.diffraction import EdgeWaves, Spectrum
+from mitsim.optics.profile import Steps
 from mitsim.optics.shadow import Directions
 
 STEP = 2.5e-4

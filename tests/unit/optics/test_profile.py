@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mitsim.optics.aperture import Steps, sampled_box_means
 from mitsim.optics.mask import mls_mask
+from mitsim.optics.profile import Steps, sampled_box_means
 from mitsim.optics.shadow import centred_edges, scene_factor
 
 

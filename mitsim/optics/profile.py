@@ -3,7 +3,7 @@
 A profile is a :class:`Steps` function of the mask coordinate s [mm]. A thick mask multiplies two of them, because light
 has to pass both faces. Means over a sensor pixel and a cell (two boxes, one after the other) come from the second
 antiderivative; the mean of the values is taken off first, so that the second difference has little to cancel: 1e-11 is
-left for values of order 1 (measured in tests/unit/optics/test_aperture.py).
+left for values of order 1 (measured in tests/unit/optics/test_profile.py).
 """
 
 from __future__ import annotations
