@@ -143,14 +143,13 @@ class _Fine:
     def __init__(self, bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.family, self.accuracy, self.seed = bench, base, family, accuracy, seed
         self.simulation = Simulation(bench, base)
-        tracer = self.simulation.direct
+        tracer = _tracer(self.simulation, family)
         seeds = [integer(seed, "pilot", "fine", half) for half in range(2)]
         first = tracer.trace(seeds[0], 0, family.fine)
         started = time.perf_counter()
         second = tracer.trace(seeds[1], 0, family.fine)
         self.pace = (time.perf_counter() - started) / (tracer.lanes * family.fine)
         few = [tracer.trace(one, 0, family.fine // 4) for one in seeds]
-        first, second, *few = (_shown(found, family) for found in (first, second, *few))
         self.deposits, self.few = (first, second), (few[0], few[1])
         near, far = self._range()
         self.layers: dict[int, tuple[float, ...]] = {1: (base.depth,)}
@@ -188,7 +187,7 @@ class _Fine:
         few = _noise(self._frames((), 1, self.few, self.family.fine // 4))
         rate = math.log(few / many) / math.log(4) if many > 0 and few > 0 else 1.0
         noise = Noise(many, self.family.fine, min(max(rate, 0.5), 1.0))
-        return Effort(noise, self.simulation.direct.lanes, self.pace)
+        return Effort(noise, self.bench.n**2, self.pace)
 
     def _frames(
         self,
@@ -300,9 +299,8 @@ class _Anchors:
 
     def _traced(self, simulation: Simulation) -> Iterator[Deposits]:
         """Light to every anchor, in two halves."""
-        loaded, anchors = self.bench.loaded, simulation.settings.anchors
-        tracer = DirectTracer(loaded.scene, loaded.camera, simulation.source, anchors, simulation.geometry)
-        return (_shown(tracer.trace(seed, 0, self.family.direct), self.family) for seed in self.seeds)
+        tracer = _tracer(simulation, self.family)
+        return (tracer.trace(seed, 0, self.family.direct) for seed in self.seeds)
 
     def _filed(self, simulation: Simulation, found: Deposits) -> sparse.csr_array:
         return simulation.coarse.file(found, self.family.labels, self.family.direct)
@@ -315,10 +313,11 @@ class _Anchors:
         return np.stack([frame.irradiance for frame in frames])
 
 
-def _shown(found: Deposits, family: _Family) -> Deposits:
-    """Only the light of projector pixels that the family's captures show."""
-    shown = (family.weights != 0).any(axis=0)
-    return found.where(np.append(shown[family.labels], True)[found.source])
+def _tracer(simulation: Simulation, family: _Family) -> DirectTracer:
+    """Direct light to every anchor, of those projector pixels only that the family's captures show."""
+    loaded, pixels = simulation.bench.loaded, np.flatnonzero((family.weights != 0).any(axis=0)[family.labels])
+    parts = loaded.scene, loaded.camera, simulation.source, simulation.settings.anchors, simulation.geometry
+    return DirectTracer(*parts, pixels=pixels)
 
 
 def _ladder(

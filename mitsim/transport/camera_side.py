@@ -85,7 +85,7 @@ class CameraTracer:
 
 
 class _Walk(Walk):
-    """Paths from the camera: one connection of each kind is kept, of the projector's direct and indirect, of ambient."""
+    """Paths from the camera, with light of the projector, direct or indirect, and of lamps."""
 
     STATE = (
         *("active", "ray", "strength", "part", "bounce", "order", "in_mirror", "mirrored", "by_delta", "travelled"),

@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.optics.camera import CameraGeometry, anchor_positions
 from mitsim.transport.histogram import DIRECT, Deposits
@@ -19,6 +20,8 @@ from mitsim.transport.rays import ProjectorRays
 from mitsim.transport.receiver import Receiver
 from mitsim.transport.sampling import generator, panchromatic, stratified
 from mitsim.transport.source import Projector
+
+IntArray = npt.NDArray[np.int64]
 
 
 class DirectTracer:
@@ -32,11 +35,14 @@ class DirectTracer:
         anchors: int,
         geometry: CameraGeometry | None = None,
         spread: bool = False,
+        pixels: IntArray | None = None,
     ) -> None:
         """``spread`` connects to random points of the sensor, all filed as one anchor: the mean over the sensor.
 
-        ``geometry`` stands in for the camera's own.
+        ``geometry`` stands in for the camera's own; ``pixels`` (m,) are those of the projector that are traced, all of
+        them without it.
         """
+        self._pixels = np.arange(projector.n**2) if pixels is None else pixels
         self.scene, self.projector, self.anchors, self.spread = scene, projector, anchors, spread
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
         self.positions = anchor_positions(anchors, self.receiver.geometry.half_width)
@@ -44,7 +50,7 @@ class DirectTracer:
     @property
     def lanes(self) -> int:
         """Connections of one sample: one per projector pixel and anchor."""
-        return self.projector.n**2 * self.anchors**2
+        return len(self._pixels) * self.anchors**2
 
     def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
         """Samples ``first`` .. ``first + samples - 1`` of every pixel, as if ``samples`` of them were all.
@@ -58,8 +64,8 @@ class DirectTracer:
         return Deposits.joined(parts)
 
     def _launch(self, seed: int, sample: Any, within: Any) -> Deposits:
-        pixels = dr.opaque(mi.UInt32, self.projector.n**2)
-        pixel, anchor = within % pixels, within // pixels
+        count = dr.opaque(mi.UInt32, len(self._pixels))
+        pixel, anchor = dr.gather(mi.UInt32, mi.UInt32(self._pixels), within % count), within // count
         anchors = dr.opaque(mi.UInt32, self.anchors)
         row, column = anchor // anchors, anchor % anchors
         # Streams belong to pixels: every anchor is connected to the same points.
