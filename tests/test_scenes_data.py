@@ -6,7 +6,6 @@ import importlib
 import math
 import re
 import sys
-from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,9 +15,8 @@ import pytest
 from PIL import Image
 
 from mitsim.core.configuration import read_toml, shipped
-from mitsim.core.environment import load_variant
+from tests.shipped_scenes import SCENES, opened, projected
 
-SCENES = Path(__file__).parents[1] / "scenes"
 # One sheet of 128 mm at 400 mm, as the paper has it.
 NAMES = ("photograph", "colour_chart", "resolution_target", "lamp_bench")
 ALL = sorted(path.parent.name for path in SCENES.glob("*/scene.xml"))
@@ -124,40 +122,14 @@ def test_group_5_is_the_last_that_the_projector_grid_resolves() -> None:
     assert np.ptp(fine) / (fine.max() + fine.min()) < 0.5 * (white - black) / (white + black)
 
 
-@cache
-def _loaded(name: str) -> tuple[Any, Any]:
-    """Mitsuba and the scene, through mitsim's own checks."""
-    mi = load_variant("llvm_ad_mono")
-    from mitsim.scene.load import load_scene
-    from mitsim.transport.lensless import register
-
-    register()
-    return mi, load_scene(SCENES / name / "scene.xml").scene
-
-
 @pytest.fixture(params=NAMES)
 def scene(request: pytest.FixtureRequest) -> tuple[str, Any, Any]:
-    return request.param, *_loaded(request.param)
+    return request.param, *opened(request.param)
 
 
 @pytest.fixture(params=ALL)
 def any_scene(request: pytest.FixtureRequest) -> tuple[str, Any, Any]:
-    return request.param, *_loaded(request.param)
-
-
-def _emitter(scene: Any, kind: str) -> Any:
-    (found,) = (emitter for emitter in scene.emitters() if emitter.class_name() == kind)
-    return found
-
-
-def _light(mi: Any, scene: Any, x: list[float], y: list[float], z: float) -> tuple[np.ndarray, np.ndarray]:
-    """Projector uv (2, k) at points (x, y, z), and irradiance (k,) on the plane z = const there."""
-    import drjit as dr
-
-    point = dr.zeros(mi.SurfaceInteraction3f, len(x))
-    point.p = mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))
-    sample, weight = _emitter(scene, "Projector").sample_direction(point, mi.Point2f(0.5), True)
-    return np.array(sample.uv), np.array(weight[0] * dr.abs(sample.d.z))
+    return request.param, *opened(request.param)
 
 
 def test_window_lands_squarely_on_the_sheet(scene: tuple[str, Any, Any]) -> None:
@@ -165,12 +137,12 @@ def test_window_lands_squarely_on_the_sheet(scene: tuple[str, Any, Any]) -> None
     _, mi, loaded = scene
     inside = 59.99
     x, y = [inside, -inside, inside, -inside, 0.0], [inside, inside, -inside, -inside, 0.0]
-    uv, irradiance = _light(mi, loaded, x, y, 400.0)
+    uv, irradiance = projected(mi, loaded, x, y, 400.0)
     canvas_column, canvas_row = 256 * uv[0], 128 * uv[1]
     assert np.allclose(canvas_column, 128 + (60 - np.array(x)) / 120 * 128, atol=1e-3)
     assert np.allclose(canvas_row, (60 - np.array(y)) / 120 * 128, atol=1e-3)
     assert np.allclose(irradiance, math.pi * POWER / 400**2, rtol=1e-4)  # float32 geometry
-    outside = _light(mi, loaded, [60.01, -60.01, 0.0, 0.0], [0.0, 0.0, 60.01, -60.01], 400.0)[1]
+    outside = projected(mi, loaded, [60.01, -60.01, 0.0, 0.0], [0.0, 0.0, 60.01, -60.01], 400.0)[1]
     assert np.all(outside == 0.0)
 
 

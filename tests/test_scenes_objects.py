@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.environment import load_variant
+from tests.shipped_scenes import SCENES, emitter, opened, projected
 
-SCENES = Path(__file__).parents[1] / "scenes"
 # Nearest and farthest z [mm] of what the projector's window meets, and the shapes that carry a print.
 DEPTHS = {
     "photograph": (400.0, 400.0),
@@ -40,40 +39,14 @@ POWER = 151250.0  # scale of the scenes' projector
 FIELD_STOP = math.tan(math.radians(10))
 
 
-@cache
-def _loaded(name: str) -> tuple[Any, Any]:
-    """Mitsuba and the scene, through mitsim's own checks."""
-    mi = load_variant("llvm_ad_mono")
-    from mitsim.scene.load import load_scene
-    from mitsim.transport.lensless import register
-
-    register()
-    return mi, load_scene(SCENES / name / "scene.xml").scene
-
-
 @pytest.fixture(params=sorted(DEPTHS))
 def any_scene(request: pytest.FixtureRequest) -> tuple[str, Any, Any]:
-    return request.param, *_loaded(request.param)
-
-
-def _emitter(scene: Any, kind: str) -> Any:
-    (found,) = (emitter for emitter in scene.emitters() if emitter.class_name() == kind)
-    return found
+    return request.param, *opened(request.param)
 
 
 def _shape(scene: Any, name: str) -> Any:
     (found,) = (shape for shape in scene.shapes() if shape.id() == name)
     return found
-
-
-def _light(mi: Any, scene: Any, x: list[float], y: list[float], z: float) -> tuple[np.ndarray, np.ndarray]:
-    """Projector uv (2, k) at points (x, y, z), and irradiance (k,) on the plane z = const there."""
-    import drjit as dr
-
-    point = dr.zeros(mi.SurfaceInteraction3f, len(x))
-    point.p = mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))
-    sample, weight = _emitter(scene, "Projector").sample_direction(point, mi.Point2f(0.5), True)
-    return np.array(sample.uv), np.array(weight[0] * dr.abs(sample.d.z))
 
 
 def _cast(mi: Any, scene: Any, origin: tuple[float, float, float], tan: np.ndarray) -> tuple[Any, np.ndarray]:
@@ -130,7 +103,7 @@ def test_nothing_but_a_lamp_is_closer_than_300_mm(any_scene: tuple[str, Any, Any
 @pytest.mark.parametrize(("name", "shape"), [(name, shape) for name, shapes in PRINTED.items() for shape in shapes])
 def test_every_print_is_upright_and_not_mirrored(name: str, shape: str) -> None:
     """Seen by the camera, u grows to the right (-x) and v downwards (-y): a bitmap lies as it is drawn."""
-    mi, loaded = _loaded(name)
+    mi, loaded = opened(name)
     side = np.linspace(-0.17, 0.17, 120)
     tan, step = _square(side, side), 2e-4
     places = []
@@ -201,7 +174,7 @@ def test_no_material_returns_more_light_than_it_gets(any_scene: tuple[str, Any, 
 
 
 def test_corner_walls_meet_at_a_right_angle() -> None:
-    mi, loaded = _loaded("corner")
+    mi, loaded = opened("corner")
     hit, point = _cast(mi, loaded, (0.0, 0.0, 0.0), np.array([[0.08, -0.08, 0.0001, -0.0001], [0.0] * 4]))
     normal = np.array(hit.n)
     assert normal[:, 0] == pytest.approx([-math.sqrt(0.5), 0, -math.sqrt(0.5)], abs=1e-6)
@@ -213,7 +186,7 @@ def test_corner_walls_meet_at_a_right_angle() -> None:
 
 def test_near_card_hides_and_shades_the_far_one() -> None:
     """The near card's right side, x = -10 at 370, is seen at -11.62 and its shadow ends at -21.35 on the far card."""
-    mi, loaded = _loaded("cards")
+    mi, loaded = opened("cards")
     x = np.array([-11.0, -12.5, -20.5, -22.0])
     seen = _cast(mi, loaded, (0.0, 0.0, 0.0), np.stack([x / 430, np.full(4, -30 / 430)]))[1][2]
     assert seen == pytest.approx([370, 430, 430, 430], abs=1e-3)
@@ -223,7 +196,7 @@ def test_near_card_hides_and_shades_the_far_one() -> None:
 
 def test_mirror_shows_the_projector_at_its_middle() -> None:
     """A ray from the sensor's centre to the mirror's middle goes on to the pinhole at (60, 0, 0)."""
-    mi, loaded = _loaded("mirror")
+    mi, loaded = opened("mirror")
     hit, point = _cast(mi, loaded, (0.0, 0.0, 0.0), np.zeros((2, 1)))
     assert point[:, 0] == pytest.approx([0, 0, 400], abs=1e-3)
     sample, weight = hit.bsdf().sample(mi.BSDFContext(), hit, mi.Float(0.5), mi.Point2f(0.5))
@@ -231,7 +204,7 @@ def test_mirror_shows_the_projector_at_its_middle() -> None:
     away = np.array(hit.to_world(sample.wo))[:, 0]
     assert point[:, 0] - away * point[2, 0] / away[2] == pytest.approx([60, 0, 0], abs=0.01)
     # The image is one of 128 x 128 pixels, at the border of columns 63 and 64.
-    uv, irradiance = _light(mi, loaded, [0.0], [0.0], float(point[2, 0]))
+    uv, irradiance = projected(mi, loaded, [0.0], [0.0], float(point[2, 0]))
     assert 256 * uv[0] - 128 == pytest.approx(64, abs=0.01) and irradiance[0] > 0
 
 
@@ -239,7 +212,7 @@ def test_lamp_adds_a_tenth_of_the_projectors_light() -> None:
     """E at the sheet's middle: radiance x sum of cos cos / r^2 over the lamp; the plugin agrees, sampled (seed 3)."""
     import drjit as dr
 
-    mi, loaded = _loaded("lamp_bench")
+    mi, loaded = opened("lamp_bench")
     x, z = np.meshgrid(np.arange(-199.5, 200), np.arange(220.5, 380))
     radiance = 11.7
     squared = x**2 + 600.0**2 + (400 - z) ** 2
@@ -249,7 +222,7 @@ def test_lamp_adds_a_tenth_of_the_projectors_light() -> None:
     point.p = mi.Point3f(0.0, 0.0, 400.0)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(3, 1 << 16)
-    sample, weight = _emitter(loaded, "AreaLight").sample_direction(point, sampler.next_2d())
+    sample, weight = emitter(loaded, "AreaLight").sample_direction(point, sampler.next_2d())
     # Directions differ little over the lamp: one value spreads by 0.4 of the mean, 2^16 of them by 0.0016.
     assert np.mean(np.array(weight[0] * -sample.d.z)) == pytest.approx(wanted, rel=0.01)
     lamp = next(shape for shape in loaded.shapes() if shape.is_emitter())
@@ -258,14 +231,14 @@ def test_lamp_adds_a_tenth_of_the_projectors_light() -> None:
 
 def test_keystone_lands_as_a_trapezium() -> None:
     """Corners by the rays of a pinhole that looks at (0, 0, 400), 60 mm of window at 404.475 mm; E there."""
-    mi, loaded = _loaded("keystone")
+    mi, loaded = opened("keystone")
     far = math.hypot(60, 400)
     forward, left = np.array([-60, 0, 400]) / far, np.array([400, 0, 60]) / far
     for column, row in ((0, 0), (127, 0), (0, 127), (127, 127), (40, 90)):
         offset = 60 / far * (1 - 2 * (np.array([column, row]) + 0.5) / 128)
         ray = forward + offset[0] * left + offset[1] * np.array([0, 1, 0])
         point = np.array([60, 0, 0]) + ray * 400 / ray[2]
-        uv, irradiance = _light(mi, loaded, [point[0]], [point[1]], 400.0)
+        uv, irradiance = projected(mi, loaded, [point[0]], [point[1]], 400.0)
         assert 128 * uv[:, 0] == pytest.approx([column + 0.5, row + 0.5], abs=0.01)
         # Intensity pi scale / cos^3 of the angle to the projector's axis; E = I cos / r^2.
         long = float(np.linalg.norm(ray))
@@ -275,14 +248,14 @@ def test_keystone_lands_as_a_trapezium() -> None:
     # The corners that the scene file states.
     from mitsim.scene.projector import locate_projector
 
-    grid = locate_projector("keystone", _emitter(loaded, "Projector"), loaded.sensors()[0])
+    grid = locate_projector("keystone", emitter(loaded, "Projector"), loaded.sensors()[0])
     assert np.array(grid.column_tan) * 400 == pytest.approx([-59.35, 62.05], abs=0.01)
     assert np.array(grid.row_tan) * 400 == pytest.approx([-61.37, 61.37], abs=0.01) and grid.keystone > 2.5
 
 
 def test_highlight_of_the_gift_card_is_lower_left_of_its_middle() -> None:
     """Where the line from the sensor's centre to the projector's mirror image in the card's plane meets the card."""
-    mi, loaded = _loaded("gift_card")
+    mi, loaded = opened("gift_card")
     up, left = math.radians(3), math.radians(2)
     normal = np.array([math.sin(left) * math.cos(up), math.sin(up), -math.cos(left) * math.cos(up)])
     middle, projector = np.array([0, 0, 400.0]), np.array([60.0, 0, 0])
@@ -303,7 +276,7 @@ def test_highlight_of_the_gift_card_is_lower_left_of_its_middle() -> None:
 
 
 def test_blade_has_two_facets_14_9_degrees_apart() -> None:
-    mi, loaded = _loaded("metal_blade")
+    mi, loaded = opened("metal_blade")
     # Body and bevel lie above and below the line through the mesh's point (0, -7, -2), turned.
     hit, _ = _cast(mi, loaded, (0.0, 0.0, 0.0), np.array([[0.0, 0.0], [0.0, -12 / 400]]))
     body, bevel = np.array(hit.n).T
@@ -316,7 +289,7 @@ def test_bag_shades_the_box_and_box_and_bag_are_apart() -> None:
     """Of the box's pixels that the camera sees, some are in the bag's shadow; no point of one is inside the other."""
     import drjit as dr
 
-    mi, loaded = _loaded("cookie_bag")
+    mi, loaded = opened("cookie_bag")
     side = np.linspace(-FIELD_STOP, FIELD_STOP, 200)
     hit, point = _cast(mi, loaded, (0.0, 0.0, 0.0), _square(side, side))
     box, bag = (mi.ShapePtr(_shape(loaded, name)) for name in ("box", "bag"))

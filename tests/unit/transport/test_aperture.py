@@ -11,6 +11,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.transport import aperture
 from mitsim.transport.aperture import aperture_scene_parts
+from tests.unit.transport.closed_forms import stock_projector
 
 SCALE, ALBEDO, N = 111000.0, 0.5, 16
 
@@ -21,14 +22,7 @@ def plugin(variant: str) -> None:
 
 
 def stock(place: tuple[float, float, float] = (60, 0, 0), turn: float = 0.0, canvas: np.ndarray | None = None):
-    if canvas is None:
-        canvas = np.zeros((N, 2 * N))
-        canvas[:, N:] = 1
-    bitmap = mi.Bitmap(canvas[..., None].astype(np.float32))
-    picture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-    to_world = mi.ScalarAffineTransform4f().translate(list(place)).rotate([0, 1, 0], turn)
-    light = {"type": "projector", "to_world": to_world, "fov_axis": "x", "fov": 33.398488, "scale": SCALE}
-    return mi.load_dict({**light, "irradiance": picture})
+    return stock_projector(N, SCALE, place, turn, canvas)
 
 
 def board(z: float, bsdf: dict | None = None) -> dict:

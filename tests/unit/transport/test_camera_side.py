@@ -18,6 +18,7 @@ from mitsim.transport import paths
 from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.histogram import AMBIENT, Deposits
+from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SEEDS, SIGMAS = 16, 8, 7.0
@@ -45,17 +46,6 @@ def grid(bench: Bench) -> CellGrid:
 def tracer(bench: Bench, **followed: object) -> CameraTracer:
     loaded = bench.loaded
     return CameraTracer(loaded.scene, loaded.camera, bench.source, grid(bench), Paths(**followed))
-
-
-def seen(stop: float) -> float:
-    """Integral of (1 + t^2)^-2 over |t_x|, |t_y| < stop: the irradiance of an even radiance of 1."""
-    node, weight = np.polynomial.legendre.leggauss(12)
-    t, w = stop * node, stop * weight
-    return float(w @ (1 + np.square(t)[:, None] + np.square(t)[None, :]) ** -2 @ w)
-
-
-def mean(values: np.ndarray) -> tuple[float, float]:
-    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 @pytest.mark.parametrize("interreflection", [False, True])

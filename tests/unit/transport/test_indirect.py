@@ -17,6 +17,7 @@ from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import aligned_grid
 from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits
 from mitsim.transport.indirect import IndirectTracer
+from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SEEDS, SIGMAS = 16, 8, 7.0
@@ -36,17 +37,6 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="
 def tracer(bench: Bench, mirrors: bool = False, interreflection: bool = True) -> IndirectTracer:
     loaded = bench.loaded
     return IndirectTracer(loaded.scene, loaded.camera, bench.source, mirrors, interreflection)
-
-
-def seen(stop: float) -> float:
-    """Integral of (1 + t^2)^-2 over |t_x|, |t_y| < stop: the irradiance of an even radiance of 1."""
-    node, weight = np.polynomial.legendre.leggauss(12)
-    t, w = stop * node, stop * weight
-    return float(w @ (1 + np.square(t)[:, None] + np.square(t)[None, :]) ** -2 @ w)
-
-
-def mean(values: np.ndarray) -> tuple[float, float]:
-    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 @pytest.fixture(scope="module")

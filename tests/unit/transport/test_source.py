@@ -15,6 +15,7 @@ from mitsim.transport import aperture
 from mitsim.transport.aperture import aperture_scene_parts
 from mitsim.transport.sampling import generator
 from mitsim.transport.source import Connection, Projector, Source
+from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
 SCALE, N, SIGMAS, SAMPLES = 111000.0, 128, 5.0, 2**16
@@ -24,15 +25,7 @@ STEP = 0.3 / N
 
 
 def emitter(turn: float = 0.0, canvas: np.ndarray | None = None, place: tuple[float, ...] = PLACE) -> Any:
-    """A stock projector with an n x 2n canvas, the window in its right half."""
-    if canvas is None:
-        canvas = np.zeros((N, 2 * N))
-        canvas[:, N:] = 1
-    bitmap = mi.Bitmap(canvas[..., None].astype(np.float32))
-    picture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-    to_world = mi.ScalarAffineTransform4f().translate(list(place)).rotate([0, 1, 0], turn)
-    light = {"type": "projector", "to_world": to_world, "fov_axis": "x", "fov": 33.398488, "scale": SCALE}
-    return mi.load_dict({**light, "irradiance": picture})
+    return stock_projector(N, SCALE, place, turn, canvas)
 
 
 def source(light: Any = None, n: int = N, first_column: int = N, **lens: float) -> Source:
