@@ -34,7 +34,7 @@ CELL_LADDER = (1, 2, 4, 8)
 _FIRST_JUDGE, _FEW_ANCHORS = 5, 3
 _CAPTURES = 4
 _PIXELS = 64**2
-"""Few projector pixels are sampled more often, until they are as many samples as these pixels take."""
+"""Few pixels are sampled more often, until they take as many samples as so many pixels."""
 
 
 @dataclass(frozen=True)
@@ -45,23 +45,29 @@ class _Family:
     weights: FloatArray
 
     @property
-    def _more(self) -> int:
-        return max(1, _PIXELS // self.labels.size)
+    def shown(self) -> Labels:
+        """Projector pixels that the captures show."""
+        return np.flatnonzero((self.weights != 0).any(axis=0)[self.labels])
 
     @property
     def fine(self) -> int:
-        """Samples a projector pixel to tell cells and layers apart."""
-        return 16 * self._more
+        """Samples a shown pixel to tell cells and layers apart."""
+        return 16 * max(1, _PIXELS // len(self.shown))
+
+    @property
+    def anchored(self) -> int:
+        """Samples a shown pixel to tell anchors apart."""
+        return self.fine // 4
 
     @property
     def direct(self) -> int:
-        """Samples a projector pixel to tell effects and anchors apart."""
-        return 4 * self._more
+        """Samples a projector pixel to tell effects apart."""
+        return 4 * max(1, _PIXELS // len(self.labels))
 
     @property
     def other(self) -> int:
         """Samples a projector pixel of indirect light, and a cell of light that is followed from the camera."""
-        return 2 * self._more
+        return self.direct // 2
 
 
 def applicable(bench: Bench) -> tuple[str, ...]:
@@ -278,14 +284,13 @@ class _Anchors:
         simulation = self._simulation(_FEW_ANCHORS)
         halves = []
         for found in self._traced(simulation):
-            mean = simulation.smooth.file(
-                found.averaged(simulation.mean_weights), self.family.labels, self.family.direct
-            )
+            alike = found.averaged(simulation.mean_weights)
+            mean = simulation.smooth.file(alike, self.family.labels, self.family.anchored)
             everything = self._formed(simulation, self._filed(simulation, found))
             halves.append((everything, everything - self._formed(simulation, simulation.coarse.repeated(mean))))
         (first, only_first), (second, only_second) = halves
         spread, energy = float(np.square(only_first - only_second).sum()) / 2, float(np.vdot(first, second))
-        noise = Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.direct, 0.5)
+        noise = Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.anchored, 0.5)
         return Effort(noise, self.bench.n**2, pace)
 
     def _frames(self, anchors: int) -> Halves:
@@ -300,10 +305,10 @@ class _Anchors:
     def _traced(self, simulation: Simulation) -> Iterator[Deposits]:
         """Light to every anchor, in two halves."""
         tracer = _tracer(simulation, self.family)
-        return (tracer.trace(seed, 0, self.family.direct) for seed in self.seeds)
+        return (tracer.trace(seed, 0, self.family.anchored) for seed in self.seeds)
 
     def _filed(self, simulation: Simulation, found: Deposits) -> sparse.csr_array:
-        return simulation.coarse.file(found, self.family.labels, self.family.direct)
+        return simulation.coarse.file(found, self.family.labels, self.family.anchored)
 
     def _formed(self, simulation: Simulation, light: sparse.csr_array) -> FloatArray:
         """(captures, pixels, pixels) frames of light to every anchor."""
@@ -315,9 +320,9 @@ class _Anchors:
 
 def _tracer(simulation: Simulation, family: _Family) -> DirectTracer:
     """Direct light to every anchor, of those projector pixels only that the family's captures show."""
-    loaded, pixels = simulation.bench.loaded, np.flatnonzero((family.weights != 0).any(axis=0)[family.labels])
+    loaded = simulation.bench.loaded
     parts = loaded.scene, loaded.camera, simulation.source, simulation.settings.anchors, simulation.geometry
-    return DirectTracer(*parts, pixels=pixels)
+    return DirectTracer(*parts, pixels=family.shown)
 
 
 def _ladder(
