@@ -105,10 +105,10 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
     depth = _depth(bench, direct, seed)
     base = Settings(depth=depth, effects=direct)
     fine = _Fine(bench, base, family, accuracy, seed)
-    anchors = _Anchors(bench, base, family, accuracy, seed)
     layer_error = fine.layer_errors()
     cell_error = fine.cell_errors()
     effects = _Effects(bench, replace(base, effects=frozenset(names), subdivision=2), family, seed)
+    anchors = _Anchors(bench, base, family, accuracy, seed, _norm(effects.frames))
     effect_error = effects.errors(names)
     if "speckle" in names:
         effect_error["speckle"] = bench.projector.speckle_contrast
@@ -119,7 +119,8 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
         layer_error=layer_error,
         cell_error=cell_error,
         effect_error=effect_error,
-        direct=fine.effort(),
+        direct_part=anchors.part,
+        direct=fine.effort(_norm(effects.frames)),
         anchored=anchors.effort(fine.pace),
         indirect=effects.effort("indirect"),
         other=effects.effort("other"),
@@ -187,10 +188,10 @@ class _Fine:
         whole = {count: error / (1 - (count / judge) ** 2) for count, error in errors.items() if count < judge}
         return {**whole, judge: whole[before] * (before / judge) ** 2}
 
-    def effort(self) -> Effort:
-        """Monte Carlo error of one estimate, how fast it falls, and what it takes."""
-        many = _noise(self._frames((), 1))
-        few = _noise(self._frames((), 1, self.few, self.family.fine // 4))
+    def effort(self, light: float) -> Effort:
+        """Monte Carlo error of one estimate, relative to all ``light``, how fast it falls, and what it takes."""
+        many = _noise(self._frames((), 1), light)
+        few = _noise(self._frames((), 1, self.few, self.family.fine // 4), light)
         rate = math.log(few / many) / math.log(4) if many > 0 and few > 0 else 1.0
         noise = Noise(many, self.family.fine, min(max(rate, 0.5), 1.0))
         return Effort(noise, self.bench.n**2, self.pace)
@@ -234,10 +235,8 @@ class _Effects:
         started = time.perf_counter()
         found = tuple(stage.tracer.trace(seed, 0, self.family.other) for seed in self.seeds)
         pace = (time.perf_counter() - started) / (2 * stage.tracer.lanes * self.family.other)
-        first, second = self._form(self.simulation, none, found)
-        energy = float(np.vdot(*self.frames))
-        spread = float(np.square(first - second).sum()) / 2
-        noise = Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.other, 0.5)
+        error = _noise(self._form(self.simulation, none, found), _norm(self.frames))
+        noise = Noise(error, self.family.other, 0.5)
         return Effort(noise, stage.tracer.lanes, pace)
 
     def _without(self, name: str) -> Halves:
@@ -274,10 +273,13 @@ class _Anchors:
     Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame.
     """
 
-    def __init__(self, bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int) -> None:
-        self.bench, self.base, self.family = bench, base, family
+    def __init__(self, bench: Bench, base: Settings, family: _Family, accuracy: float, seed: int, light: float) -> None:
+        """``light`` is the norm of frames of all light, of which direct light is ``part``."""
+        self.bench, self.base, self.family, self.light = bench, base, family, light
         self.seeds = [integer(seed, "pilot", "anchors", half) for half in range(2)]
-        self.errors = _ladder(ANCHOR_LADDER, self._frames, ANCHOR_LADDER.index(_FIRST_JUDGE), accuracy)
+        self.part = _norm(self._frames(1)) / light if light else 0.0
+        errors = _ladder(ANCHOR_LADDER, self._frames, ANCHOR_LADDER.index(_FIRST_JUDGE), accuracy)
+        self.errors = {count: self.part * error for count, error in errors.items()}
 
     def effort(self, pace: float) -> Effort:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all light."""
@@ -287,10 +289,8 @@ class _Anchors:
             alike = found.averaged(simulation.mean_weights)
             mean = simulation.smooth.file(alike, self.family.labels, self.family.anchored)
             everything = self._formed(simulation, self._filed(simulation, found))
-            halves.append((everything, everything - self._formed(simulation, simulation.coarse.repeated(mean))))
-        (first, only_first), (second, only_second) = halves
-        spread, energy = float(np.square(only_first - only_second).sum()) / 2, float(np.vdot(first, second))
-        noise = Noise(math.sqrt(spread / energy) if energy > 0 else 0.0, self.family.anchored, 0.5)
+            halves.append(everything - self._formed(simulation, simulation.coarse.repeated(mean)))
+        noise = Noise(_noise((halves[0], halves[1]), self.light), self.family.anchored, 0.5)
         return Effort(noise, self.bench.n**2, pace)
 
     def _frames(self, anchors: int) -> Halves:
@@ -379,7 +379,11 @@ def _difference(changed: Halves, judge: Halves) -> float:
     return math.sqrt(max(product, 0.0) / energy) if energy > 0 else 0.0
 
 
-def _noise(halves: Halves) -> float:
-    """Relative error of one of two independent halves."""
-    energy = float(np.vdot(*halves))
-    return math.sqrt(float(np.square(halves[0] - halves[1]).sum()) / 2 / energy) if energy > 0 else 0.0
+def _norm(halves: Halves) -> float:
+    """Norm of the frames, without their noise."""
+    return math.sqrt(max(float(np.vdot(*halves)), 0.0))
+
+
+def _noise(halves: Halves, light: float) -> float:
+    """Error of one of two independent halves, relative to frames of the norm ``light``."""
+    return math.sqrt(float(np.square(halves[0] - halves[1]).sum()) / 2) / light if light else 0.0

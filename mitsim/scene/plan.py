@@ -159,6 +159,8 @@ class Evidence:
         by cells a side of a projector pixel.
     effect_error
         error of leaving out each effect of :data:`PHYSICAL` that the scene or its devices have.
+    direct_part
+        direct light in all light.
     direct, anchored, indirect, other
         what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
         and what is followed from the camera.
@@ -174,6 +176,7 @@ class Evidence:
     layer_error: Mapping[int, float]
     cell_error: Mapping[int, float]
     effect_error: Mapping[str, float]
+    direct_part: float
     direct: Effort
     anchored: Effort
     indirect: Effort
@@ -294,7 +297,7 @@ def _coarse(evidence: Evidence, settings: Settings, accuracy: float) -> _Coarse:
     part = evidence.anchor_error[1] if settings.anchors > 1 else 0.0
     # Indirect and ambient light is seen from the sensor's centre alone.
     seen = sum(evidence.effect_error.get(name, 0.0) for name in settings.effects & {"interreflection", "ambient"})
-    centre = min(seen, 1.0) * evidence.anchor_error[1]
+    centre = min(seen, 1.0) * evidence.anchor_error[1] / (evidence.direct_part or 1.0)
     if "interreflection" in settings.effects:
         part = math.hypot(part, evidence.effect_error["interreflection"])
     count = len(settings.depths)

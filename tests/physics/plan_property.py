@@ -172,12 +172,14 @@ class _Look:
         return self._of_classes(simulation.coarse_optics, simulation.coarse.file(found, self.labels, _ANCHOR_SAMPLES))
 
     def _all_lit(self, simulation: Simulation, seed: int) -> np.ndarray:
-        """(pixels, pixels) frame of every projector pixel lit, from two samples, whose noise all pixels average."""
+        """(pixels, pixels) frame of every projector pixel lit, from a few samples, whose noise all pixels average."""
         one = np.zeros_like(self.labels)
         light = simulation.file(simulation.direct.trace(integer(seed, "direct"), 0, 2), one, 2)
         light += simulation.file_other(simulation.followed(integer(seed, "other"), 8), one, 8)
         frames = _products_of(simulation.optics, light.fine[[0]])
-        return np.asarray((frames + _products_of(simulation.smooth_optics, light.smooth[[0]]))[0])
+        frames += _products_of(simulation.smooth_optics, light.smooth[[0]])
+        mirrored = simulation.mirrored(one)
+        return np.asarray(frames[0] if mirrored is None else frames[0] + mirrored.irradiance.sum(axis=0))
 
 
 def _products_of(optics: FrameOptics, light: sparse.csr_array) -> np.ndarray:

@@ -29,6 +29,7 @@ EVIDENCE = Evidence(
     layer_error={1: 4e-3, 2: 6e-4, 3: 2e-4, 4: 5e-5},
     cell_error={1: 6e-3, 2: 2e-3, 4: 1e-4, 6: 3e-5, 8: 1e-5},
     effect_error={"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4, "blur": 1e-3, "speckle": 8e-3},
+    direct_part=0.98,
     direct=Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
     anchored=Effort(Noise(3e-4, 4, 0.5), 16_384, 1e-7),
     indirect=Effort(Noise(4e-3, 2, 0.5), 16_384, 2e-7),
