@@ -165,7 +165,7 @@ class Evidence:
         what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
         and what is followed from the camera.
     seconds_per_frame
-        of forming a frame with one anchor, one layer, a geometric shadow and a cell a projector pixel.
+        of forming a frame with one anchor, one layer, a wave-optical shadow and a cell a projector pixel.
     terms
         terms of the shadow, wave-optical over geometric.
     """
@@ -345,11 +345,12 @@ class _Cost:
         )
 
     def forming(self, anchors: int, layers: int, waves: bool) -> float:
-        terms = self.evidence.terms if waves else 1.0
-        fine = layers * self.settings.subdivision**2
-        coarse = (layers if self.settings.coarse_layers else 1) * self.settings.coarse_cells**2
-        parts = (anchors**2 if anchors > 1 else 0) + ("interreflection" in self.settings.effects)
-        return self.captures * terms * self.evidence.seconds_per_frame * (fine + parts * coarse)
+        """Half of a frame's time goes with its rows of cells; anchors add rows in coarse cells (measured)."""
+        coarse = (layers if self.settings.coarse_layers else 1) * self.settings.coarse_cells
+        parts = (anchors if anchors > 1 else 0) + ("interreflection" in self.settings.effects)
+        rows = (1 + layers * self.settings.subdivision) / 2 + parts * coarse / 4
+        terms = 1.0 if waves else 1 / self.evidence.terms
+        return self.captures * self.evidence.seconds_per_frame * rows * terms
 
 
 def _count(errors: Mapping[int, float], accuracy: float, forced: bool | None) -> int:
