@@ -29,7 +29,7 @@ ALLOWED = {
 }
 EXCEPTIONS = {
     # Plain numbers, no renderer: studies of accuracy vary the plan's settings and hold its predictions to account.
-    "study": ("mitsim.scene.plan.",),
+    "study": ("mitsim.scene.plan.", "mitsim.scene.evidence."),
 }
 MITSUBA_ROOMS = ("mitsim.scene", "mitsim.transport", "mitsim.capture", "mitsim.core.environment")
 RENDERER = {"mitsuba", "drjit"}

@@ -16,7 +16,8 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.simulation import Estimate, Simulation
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
-from mitsim.scene.plan import GROUPS, Evidence, Plan, SceneFacts, Settings, check_accuracy, decide
+from mitsim.scene.evidence import GROUPS, Evidence, Settings
+from mitsim.scene.plan import Plan, SceneFacts, check_accuracy, decide
 
 __all__ = [
     "GROUPS",

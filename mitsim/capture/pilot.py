@@ -21,7 +21,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.scene.plan import GROUPS, PHYSICAL, Effort, Evidence, Noise, Settings
+from mitsim.scene.evidence import GROUPS, PHYSICAL, Effort, Evidence, Noise, Settings
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import AMBIENT, INDIRECT, Deposits
 

@@ -23,8 +23,9 @@ from mitsim.core.frames import Channel
 from mitsim.core.manifest import versions
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.scene.evidence import Settings
 from mitsim.scene.patterns import Capture, PatternFamily
-from mitsim.scene.plan import Plan, Settings
+from mitsim.scene.plan import Plan
 from mitsim.sensor.chain import Digital
 
 FloatArray = npt.NDArray[np.float64]

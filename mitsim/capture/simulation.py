@@ -19,7 +19,7 @@ from mitsim.capture.bench import Bench
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 from mitsim.optics.diffraction import Spectrum
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
-from mitsim.scene.plan import Settings
+from mitsim.scene.evidence import Settings
 from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.direct import DirectTracer

@@ -27,7 +27,7 @@ from mitsim.capture.simulation import Estimate, Simulation
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import FrameOptics
-from mitsim.scene.plan import Settings
+from mitsim.scene.evidence import Settings
 from mitsim.transport.histogram import AMBIENT, Deposits
 
 GROUPS = 6

@@ -82,7 +82,7 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     """
     from mitsim.capture.bench import open_bench
     from mitsim.capture.simulation import Simulation
-    from mitsim.scene.plan import Settings
+    from mitsim.scene.evidence import Settings
 
     bench = open_bench(scene, check_camera=False)
     family = bench.family(f"dots:{K}", 0)

@@ -181,7 +181,7 @@ def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     """Frame of the factored estimator when projector pixel (r, c) emits ``light[r, c]`` of its power."""
     from mitsim.capture.bench import open_bench
     from mitsim.capture.simulation import Simulation
-    from mitsim.scene.plan import Settings
+    from mitsim.scene.evidence import Settings
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)

@@ -10,7 +10,7 @@ from mitsim.capture.bench import Bench, load_recipe, open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.scene.plan import Settings
+from mitsim.scene.evidence import Settings
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -12,8 +12,9 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.light import collect, make_plan, scene_facts, uniform_light
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, relative_error
+from mitsim.scene.evidence import GROUPS, PHYSICAL
 from mitsim.scene.patterns import parse_patterns
-from mitsim.scene.plan import GROUPS, PHYSICAL, Plan
+from mitsim.scene.plan import Plan
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16

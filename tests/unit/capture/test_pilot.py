@@ -16,8 +16,8 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
+from mitsim.scene.evidence import PHYSICAL, Evidence, Settings
 from mitsim.scene.patterns import parse_patterns
-from mitsim.scene.plan import PHYSICAL, Evidence, Settings
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16

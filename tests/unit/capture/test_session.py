@@ -16,7 +16,8 @@ from mitsim.capture.light import make_plan
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame
 from mitsim.optics.shadow import centred_edges, scene_factor
-from mitsim.scene.plan import PHYSICAL, Plan
+from mitsim.scene.evidence import PHYSICAL
+from mitsim.scene.plan import Plan
 from mitsim.study.calibration import CalibrationResult, calibrate
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -11,7 +11,7 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.frames import FrameOptics
 from mitsim.optics.shadow import Directions
-from mitsim.scene.plan import PHYSICAL, Settings
+from mitsim.scene.evidence import PHYSICAL, Settings
 from mitsim.transport.histogram import Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")

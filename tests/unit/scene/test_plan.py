@@ -7,19 +7,8 @@ from dataclasses import asdict, replace
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.plan import (
-    PHYSICAL,
-    SWITCHES,
-    Effect,
-    Effort,
-    Evidence,
-    Noise,
-    Plan,
-    SceneFacts,
-    check_accuracy,
-    decide,
-    parse_effects,
-)
+from mitsim.scene.evidence import PHYSICAL, Effort, Evidence, Noise
+from mitsim.scene.plan import SWITCHES, Effect, Plan, SceneFacts, check_accuracy, decide, parse_effects
 
 FACTS = SceneFacts(absent={"mirrors": "no mirror there"}, notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
 EVIDENCE = Evidence(
