@@ -41,7 +41,7 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 def test_plan(call: Callable[..., Any], lab: Any) -> None:
     plan = call("plan", *lab.rig, "--json", "--quiet", "--variant", "llvm_ad_mono").payload
     assert {"effects", "accuracy", "predicted_seconds"} <= plan.keys()
-    assert plan["accuracy"] == 0.02 and number(plan["predicted_seconds"], 1e-6, 600)
+    assert plan["accuracy"] == 0.005 and number(plan["predicted_seconds"], 1e-6, 600)
     assert len({effect["name"] for effect in plan["effects"]}) == len(plan["effects"]) >= 5
     for effect in plan["effects"]:
         assert {"name", "state", "reason", "error_if_off", "seconds"} <= effect.keys()
@@ -62,7 +62,7 @@ def test_capture(lab: Any) -> None:
     assert (captured["frames"], captured["shape"]) == (16, [64, 64])
     assert (captured["variant"], captured["seed"], captured["output"]) == ("llvm_ad_mono", 0, str(lab.run))
     assert_seconds(captured["seconds"], "transport", "optics", "sensor", "write")
-    assert number(captured["mc_error"], 1e-9, 0.02)
+    assert number(captured["mc_error"], 1e-9, 0.005)
     assert len(list(lab.run.glob("*.exr"))) == 17, "16 frames and the truth"
 
 

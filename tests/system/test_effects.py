@@ -46,7 +46,7 @@ def test_a_plan_as_json(call: Callable[..., Any], lab: Any) -> None:
         rows = {row["name"]: row for row in block["effects"]}
         assert set(SWITCHES) <= set(rows) and len(rows) == len(block["effects"])
         assert all(set(row) >= ROW and row["seconds"] >= 0 for row in rows.values())
-        assert block["accuracy"] == 0.02 and block["predicted_seconds"] > 0
+        assert block["accuracy"] == 0.005 and block["predicted_seconds"] > 0
     rows = {row["name"]: row for row in forced["effects"]}
     assert rows["diffraction"]["state"] == "off" and "--effects" in rows["diffraction"]["reason"]
     assert rows["anchors"]["state"] == "approximate" and rows["ambient"]["state"] == "exact"

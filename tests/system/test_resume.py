@@ -24,7 +24,10 @@ def cut_short(how: signal.Signals, least: int, *arguments: object) -> subprocess
     """Start mitsim, send it a signal as soon as ``least`` frames are written."""
     folder = Path(str(arguments[arguments.index("-o") + 1]))
     command = [sys.executable, "-m", "mitsim.cli", *map(str, arguments)]
+    # A shell's background jobs ignore SIGINT, and so would what they start.
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
     limit = time.monotonic() + 120
     while len(list(folder.glob("frame_*.exr"))) < least:
         assert process.poll() is None, process.communicate()

@@ -113,10 +113,13 @@ def test_effects_come_true(bench: Bench, evidence: Evidence, effect: str) -> Non
 
 def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
     base = Settings(depth=evidence.depth, coarse_cells=2, subdivision=2)
+    every = frozenset(pilot.applicable(bench)) - {"speckle"}
+    light = np.linalg.norm(frames(bench, replace(base, effects=every)))
     judge = frames(bench, replace(base, anchors=5), 256)
-    actual = change(frames(bench, base, 256), judge)
+    actual = np.linalg.norm(frames(bench, base, 256) - judge) / light
     assert actual > 2e-3
     assert promised(evidence.anchor_error[1], actual)
+    assert evidence.direct_part == pytest.approx(np.linalg.norm(judge) / light, rel=0.1)
 
 
 def test_cells_come_true(bench: Bench, evidence: Evidence) -> None:
