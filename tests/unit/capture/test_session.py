@@ -12,7 +12,9 @@ import pytest
 
 from mitsim.calibrate.hadamard import Calibration
 from mitsim.capture.bench import Bench, load_recipe, open_bench
-from mitsim.capture.light import make_plan
+from mitsim.capture.clock import Clock
+from mitsim.capture.light import make_plan, silent, uniform_light
+from mitsim.capture.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame
 from mitsim.optics.shadow import centred_edges, scene_factor
@@ -149,3 +151,12 @@ def test_a_used_folder_is_refused_before_any_work(
     monkeypatch.setattr("mitsim.capture.session.make_plan", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match="holds files already"):
         calibrate(bench, result.output)
+
+
+def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[..., Path]) -> None:
+    """Diffraction hardly changes a uniform frame, but single lines, and so the +-1 responses, by a tenth."""
+    board = open_bench(shared_scene("separable16", n=16)).with_board(0.99)
+    uniform = make_plan(board, *uniform_light(16), 2e-2, 0)
+    assert "diffraction" not in uniform.settings.effects
+    session = Session(board, recipe("pair"), 2e-2, 0, Clock(), silent)
+    assert "diffraction" in session.plan.settings.effects
