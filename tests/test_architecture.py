@@ -110,7 +110,7 @@ def test_the_rules_catch_a_planted_violation(module: str, source: str) -> None:
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("mitsim.transport.factored", "import mitsuba\nfrom mitsim.optics import mask"),
+        ("mitsim.transport.direct", "import mitsuba\nfrom mitsim.optics import mask"),
         ("mitsim.core.environment", "import mitsuba"),
         ("mitsim.sensor.chain", "from . import model\nfrom ..core import units"),
         ("mitsim.core.manifest", "import mitsim"),
