@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.evidence import PHYSICAL, Effort, Evidence, Noise
+from mitsim.scene.evidence import GROUPS, PHYSICAL, Effort, Evidence, Noise
 from mitsim.scene.plan import SWITCHES, Effect, Plan, SceneFacts, check_accuracy, decide, parse_effects
 
 FACTS = SceneFacts(absent={"mirrors": "no mirror there"}, notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
@@ -265,3 +265,17 @@ def test_accuracies_that_cannot_be_promised(accuracy: float) -> None:
         check_accuracy(accuracy)
     with pytest.raises(MitsimError, match="--accuracy"):
         plan(accuracy)
+
+
+def test_samples_take_the_fewest_paths_for_the_target() -> None:
+    """Variances v / N add up to the target's, and N is in proportion to sqrt(v / paths): the least sum of N paths."""
+    anchored = replace(EVIDENCE.anchored, noise=Noise(8e-3, 4, 0.5))
+    evidence = replace(EVIDENCE, direct=Effort.none(), anchored=anchored)
+    found = plan(1e-3, evidence)
+    counts = found.settings.anchored_samples, found.settings.indirect_samples, found.settings.other_samples
+    anchors = replace(anchored, paths=anchored.paths * found.settings.anchors**2)
+    efforts = anchors, evidence.indirect, evidence.other
+    variance = sum(effort.variance / count for effort, count in zip(efforts, counts, strict=True))
+    assert math.sqrt(variance / GROUPS) == pytest.approx(found.sampling_target)
+    ratios = [count / math.sqrt(effort.variance / effort.paths) for effort, count in zip(efforts, counts, strict=True)]
+    assert ratios == pytest.approx([ratios[0]] * 3) and min(counts) > 1

@@ -193,3 +193,14 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
     parameters.update()
     with pytest.raises(MitsimError, match="NaN"):
         tracer(bench).trace(0)
+
+
+def test_chosen_pixels_are_traced_as_among_all(white: Bench) -> None:
+    loaded, chosen = white.loaded, np.array([3, 17, 250])
+    some = DirectTracer(loaded.scene, loaded.camera, white.source, 1, pixels=chosen)
+    assert some.lanes == 3
+    mine, whole = some.trace(5, 0, 4), tracer(white).trace(5, 0, 4)
+    expected = whole.where(np.isin(whole.source, chosen))
+    assert np.array_equal(np.sort(mine.source), np.sort(expected.source)) and len(mine.value) == 12
+    for name in ("value", "row", "column"):
+        assert np.sort(getattr(mine, name)) == pytest.approx(np.sort(getattr(expected, name)), rel=1e-6)
