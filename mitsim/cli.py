@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -15,6 +16,7 @@ import typer
 
 import mitsim
 from mitsim.core.errors import MitsimError
+from mitsim.core.worker import enter_worker, stop_signal
 
 app = typer.Typer(
     name="mitsim",
@@ -45,7 +47,13 @@ Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or rand
 
 
 def main() -> None:
-    """Entry point: exit 0 done, 1 done but flagged, 2 refused before work."""
+    """Entry point of the program: :func:`run` in a worker process, whose death leaves a clear line and status."""
+    enter_worker()
+    run()
+
+
+def run() -> None:
+    """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused, 128 + n ended by signal n."""
     try:
         code = app(standalone_mode=False)
     except MitsimError as error:
@@ -63,7 +71,9 @@ def main() -> None:
             _fail(_usage(error))
         raise
     if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
-        print("mitsim: interrupted", file=sys.stderr)
+        number = signal.Signals(stop_signal() or signal.SIGINT)
+        print(f"mitsim: {'interrupted' if number == signal.SIGINT else f'ended by {number.name}'}", file=sys.stderr)
+        code = 128 + number
     sys.exit(code if isinstance(code, int) else 0)
 
 

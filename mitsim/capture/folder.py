@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import Channel, Value, checksum, read_frame, write_frame
-from mitsim.core.manifest import output_folder, read_json, write_json
+from mitsim.core.manifest import read_json, write_json
+from mitsim.core.output import output_folder, sweep
 
 MANIFEST = "manifest.json"
 TRUTH = "truth.exr"
@@ -37,8 +38,7 @@ class RunFolder:
 
     def begin(self) -> None:
         """Mark the folder as an unfinished run of this configuration, and clear what a killed process left."""
-        for part in self.path.glob(".*.part"):
-            part.unlink(missing_ok=True)
+        sweep(self.path)
         write_json(self.path / MANIFEST, {**self._head(), "status": "incomplete"})
 
     def keeps(self, index: int) -> bool:

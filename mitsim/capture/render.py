@@ -18,7 +18,8 @@ from mitsim.capture.light import Progress, collect, make_plan, silent, uniform_l
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
-from mitsim.core.manifest import prepare_output, versions
+from mitsim.core.manifest import versions
+from mitsim.core.output import prepare_output
 from mitsim.core.seeds import integer
 from mitsim.scene.load import LoadedScene, load_scene
 from mitsim.transport import plugins

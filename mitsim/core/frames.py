@@ -20,6 +20,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.output import whole_file
 
 Value = str | int | float
 Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
@@ -36,24 +37,18 @@ def write_frame(path: Path | str, channels: Mapping[str, Channel], metadata: Map
     TypeError or ValueError for channels that cannot be stored as they are (nothing is converted silently),
     MitsimError when the file cannot be written.
     """
-    path = Path(path)
     _check_channels(channels)
     # Noise does not compress: ZIP saves a tenth of the room for four times the time.
     header: dict[str, Any] = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     header.update({_PREFIX + key: json.dumps(_scalar(value)) for key, value in metadata.items()})
     pixels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
-    try:
+    with whole_file(path) as part:
         # Opened here first: OpenEXR reports a folder it cannot write to on stderr, past any caller.
-        temporary.touch()
-        OpenEXR.File(header, pixels).write(str(temporary))
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        raise MitsimError(
-            f"frame {path}: cannot be written ({_one_line(error)}); choose a writable folder with room"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        part.touch()
+        try:
+            OpenEXR.File(header, pixels).write(str(part))
+        except RuntimeError as error:
+            raise OSError(_one_line(error)) from error
 
 
 def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:

@@ -1,20 +1,19 @@
-"""Run folders and their JSON: plain data in, a complete file out; versions of what computed it."""
+"""JSON files: plain data in, a complete file out, and back; versions of what computed it."""
 
 import importlib.metadata
 import json
 import math
 import os
 import platform
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 import mitsim
 from mitsim.core.errors import MitsimError
+from mitsim.core.output import whole_file
 
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
@@ -42,18 +41,9 @@ def plain(value: Any) -> Any:
 def write_json(path: Path | str, obj: Any) -> None:
     """Write `obj` (see `plain`) to `path` as indented JSON, all or nothing. Raises MitsimError when the file
     cannot be written."""
-    path = Path(path)
     text = json.dumps(plain(obj), indent=1, allow_nan=False) + "\n"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise MitsimError(
-            f"file {path}: cannot be written ({error.strerror}); choose a writable folder with room"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def read_json(path: Path | str) -> Any:
@@ -66,37 +56,6 @@ def read_json(path: Path | str) -> Any:
         raise MitsimError(f"file {path}: not valid JSON ({error}); write or copy it again") from error
 
 
-def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> Path:
-    """Make sure, before any work, that output can be written to `path`; returns it as a Path.
-
-    A folder is created if its parent exists. Nothing is deleted: `overwrite` only allows a folder that
-    holds files already, or an existing file. Raises MitsimError when the parent is missing, or the place is
-    not writable, is of the other kind, or holds something and `overwrite` is off.
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise MitsimError(f"output {path}: the folder {path.parent} does not exist; create it or choose another")
-    if kind == "file":
-        _prepare_file(path, overwrite)
-    else:
-        _prepare_folder(path, overwrite)
-    return path
-
-
-@contextmanager
-def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """`prepare_output` for the time of a work: a folder made for nothing is taken away when the work fails."""
-    new = not Path(path).exists()
-    folder = prepare_output(path, overwrite)
-    try:
-        yield folder
-    except BaseException:
-        if new:
-            with suppress(OSError):  # not empty: what was written stays
-                folder.rmdir()
-        raise
-
-
 def versions() -> dict[str, str]:
     """Versions of mitsim, Python and the packages that decide the numbers, by name; imports none of them."""
     found = {"mitsim": mitsim.__version__, "python": platform.python_version()}
@@ -106,35 +65,3 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
     return found
-
-
-def _prepare_file(path: Path, overwrite: bool) -> None:
-    if path.is_dir():
-        raise MitsimError(f"output {path}: is a folder, but a file is to be written; give a file name")
-    if path.exists() and not overwrite:
-        raise MitsimError(f"output {path}: exists already; remove it or choose another name")
-    _try_writing(path, path.parent)
-
-
-def _prepare_folder(path: Path, overwrite: bool) -> None:
-    if path.exists() and not path.is_dir():
-        raise MitsimError(f"output {path}: is a file, but a folder is needed; choose another name")
-    try:
-        path.mkdir(exist_ok=True)
-        occupied = any(path.iterdir())
-    except OSError as error:
-        raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
-    if occupied and not overwrite:
-        raise MitsimError(f"output {path}: the folder holds files already; choose a new one or empty it")
-    _try_writing(path, path)
-
-
-def _try_writing(path: Path, folder: Path) -> None:
-    # Permission bits do not tell (root, read-only mounts, quotas): only a file that was really written does.
-    try:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(b"mitsim")
-    except OSError as error:
-        raise MitsimError(
-            f"output {path}: the folder {folder} is not writable ({error.strerror}); choose another place"
-        ) from error

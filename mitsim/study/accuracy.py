@@ -29,7 +29,8 @@ from mitsim.capture.render import projected, reference
 from mitsim.capture.run import NoiseTarget
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifest import prepare_output, versions, write_json
+from mitsim.core.manifest import versions, write_json
+from mitsim.core.output import output_folder, whole_file
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.study import plots
 from mitsim.study.knobs import Variant, at_once, sampled, variants, without
@@ -141,23 +142,22 @@ def study_accuracy(bench: Bench, output: Path | str, patterns: str, seed: int, p
         for patterns that do not fit, an output that cannot be written, or a scene without light.
     """
     # Only an earlier study is replaced.
-    folder = prepare_output(output, overwrite=(Path(output) / "accuracy.json").is_file())
-    study = _Study(bench, bench.family(patterns, seed), seed, progress)
-    found = replace(study.run(), patterns=patterns, output=str(folder))
-    series: dict[str, list[plots.Point]] = {}
-    for row in found.rows:
-        series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
-    figures = {
-        "accuracy.png": plots.pareto(series, noise=found.sensor_noise, apart=(_SERIES["bounces"],)),
-        "effects.png": plots.effect_costs([(e.name, e.error_if_off, e.seconds) for e in found.effects], QUOTED),
-        "solver.png": plots.solver_costs(found.solver),
-    }
-    for name, figure in figures.items():
-        part = folder / f".{name}.part.png"
-        figure.savefig(part, dpi=150)
-        part.replace(folder / name)
-    write_json(folder / "accuracy.json", {**found.payload(), "seed": seed, "versions": versions()})
-    return found
+    with output_folder(output, overwrite=(Path(output) / "accuracy.json").is_file()) as folder:
+        study = _Study(bench, bench.family(patterns, seed), seed, progress)
+        found = replace(study.run(), patterns=patterns, output=str(folder))
+        series: dict[str, list[plots.Point]] = {}
+        for row in found.rows:
+            series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
+        figures = {
+            "accuracy.png": plots.pareto(series, noise=found.sensor_noise, apart=(_SERIES["bounces"],)),
+            "effects.png": plots.effect_costs([(e.name, e.error_if_off, e.seconds) for e in found.effects], QUOTED),
+            "solver.png": plots.solver_costs(found.solver),
+        }
+        for name, figure in figures.items():
+            with whole_file(folder / name) as part:
+                figure.savefig(part, dpi=150, format="png")
+        write_json(folder / "accuracy.json", {**found.payload(), "seed": seed, "versions": versions()})
+        return found
 
 
 class _Study:

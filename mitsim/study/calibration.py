@@ -16,7 +16,8 @@ from mitsim.capture.light import Progress, silent
 from mitsim.capture.run import digital_block
 from mitsim.capture.session import Session
 from mitsim.core.frames import checksum, write_frame
-from mitsim.core.manifest import output_folder, versions, write_json
+from mitsim.core.manifest import versions, write_json
+from mitsim.core.output import output_folder
 from mitsim.study.metrics import relative_error
 
 FloatArray = npt.NDArray[np.float64]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,8 @@ from mitsim.capture.light import Progress, check_accuracy, collect, pinhole_view
 from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.configuration import shipped
 from mitsim.core.frames import read_frame
-from mitsim.core.manifest import prepare_output, read_json, versions, write_json
+from mitsim.core.manifest import read_json, versions, write_json
+from mitsim.core.output import output_folder, sweep
 from mitsim.study.calibration import CalibrationResult, calibrate
 from mitsim.study.compare import Comparison
 from mitsim.study.describe import scene_line
@@ -41,6 +43,7 @@ from mitsim.study.report import (
 )
 
 FloatArray = npt.NDArray[np.float64]
+_PARTS = ("run", "calibration", "demo.json", "report.html")
 MAIN = "dots:7"
 FAMILIES = {
     "uniform": "Uniform",
@@ -84,7 +87,12 @@ def demo(
     for name in FAMILIES:
         bench.family(name, seed)
     # Only now, with nothing left to refuse, is an earlier demo taken away.
-    folder = _fresh(Path(output))
+    with _fresh(Path(output)) as folder:
+        return _run(bench, folder, accuracy, seed, progress, clock)
+
+
+def _run(bench: Bench, folder: Path, accuracy: float, seed: int, progress: Progress, clock: Clock) -> DemoResult:
+    """The demo in a folder of its own."""
     captured = capture(bench, MAIN, folder / "run", accuracy, seed, progress=progress)
     clock.add(captured.seconds)
     calibrated, factors = calibrate(bench, folder / "calibration", accuracy, seed, progress=progress)
@@ -124,16 +132,18 @@ def _is_demo(path: Path) -> bool:
     return isinstance(found, dict) and found.get("kind") == "demo"
 
 
-def _fresh(folder: Path) -> Path:
-    """The output folder, emptied of an earlier demo and of nothing else."""
-    if folder.is_dir() and (folder / "demo.json").is_file() and _is_demo(folder / "demo.json"):
+@contextmanager
+def _fresh(output: Path) -> Iterator[Path]:
+    """The output folder, emptied of an earlier demo; refused when it holds anything else."""
+    earlier = (output / "demo.json").is_file() and _is_demo(output / "demo.json")
+    alone = earlier and all(item.name in _PARTS or item.name.startswith(".") for item in output.iterdir())
+    with output_folder(output, overwrite=alone) as folder:
+        sweep(folder)
         for part in ("run", "calibration"):
             shutil.rmtree(folder / part, ignore_errors=True)
-        for name in ("demo.json", "report.html"):
-            (folder / name).unlink(missing_ok=True)
-    prepare_output(folder)
-    write_json(folder / "demo.json", {"kind": "demo", "status": "incomplete"})
-    return folder
+        (folder / "report.html").unlink(missing_ok=True)
+        write_json(folder / "demo.json", {"kind": "demo", "status": "incomplete"})
+        yield folder
 
 
 def _report(

@@ -29,7 +29,8 @@ from mitsim.capture.light import Light, Plan, Progress, collect, make_plan, spec
 from mitsim.capture.run import board_flux, truth
 from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
-from mitsim.core.manifest import prepare_output, versions, write_json
+from mitsim.core.manifest import versions, write_json
+from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.mask import MaskKind
@@ -140,26 +141,26 @@ def study_diffraction(
 ) -> DiffractionStudy:
     """Measure shadows and reconstructions and write diffraction.json, quality.png and shadow.png to ``output``."""
     # Only an earlier study is replaced.
-    folder = prepare_output(output, overwrite=(Path(output) / "diffraction.json").is_file())
-    families = [bench.family(name, seed) for name in dict.fromkeys((patterns, "uniform"))]
-    main = families[0].classes()
-    plan = make_plan(bench, *main, ACCURACY, seed, {"diffraction": True})
-    light = collect(bench, plan, *main, seed, progress)
-    flux = float(board_flux(bench, plan, seed).mean())
-    image = truth(bench, plan, light, seed)
-    shadows, quality = [], []
-    spectra = lights(bench)
-    for done, mask in enumerate(MASKS):
-        progress("idealised frames", done / len(MASKS))
-        systems = {name: IdealCamera(bench, mask, spectrum) for name, spectrum in spectra.items()}
-        shadows += [shadow_row(name, systems) for name in systems]
-        quality += list(_idealised(bench, systems, families, image, flux, seed))
-    progress("rendered session", 0.0)
-    quality += list(_rendered(bench, plan, light, families, image, flux, seed))
-    study = DiffractionStudy(str(bench.loaded.path), patterns, tuple(shadows), tuple(quality), str(folder))
-    _plot(bench, study, folder)
-    write_json(folder / "diffraction.json", {**study.payload(), "seed": seed, "versions": versions()})
-    return study
+    with output_folder(output, overwrite=(Path(output) / "diffraction.json").is_file()) as folder:
+        families = [bench.family(name, seed) for name in dict.fromkeys((patterns, "uniform"))]
+        main = families[0].classes()
+        plan = make_plan(bench, *main, ACCURACY, seed, {"diffraction": True})
+        light = collect(bench, plan, *main, seed, progress)
+        flux = float(board_flux(bench, plan, seed).mean())
+        image = truth(bench, plan, light, seed)
+        shadows, quality = [], []
+        spectra = lights(bench)
+        for done, mask in enumerate(MASKS):
+            progress("idealised frames", done / len(MASKS))
+            systems = {name: IdealCamera(bench, mask, spectrum) for name, spectrum in spectra.items()}
+            shadows += [shadow_row(name, systems) for name in systems]
+            quality += list(_idealised(bench, systems, families, image, flux, seed))
+        progress("rendered session", 0.0)
+        quality += list(_rendered(bench, plan, light, families, image, flux, seed))
+        study = DiffractionStudy(str(bench.loaded.path), patterns, tuple(shadows), tuple(quality), str(folder))
+        _plot(bench, study, folder)
+        write_json(folder / "diffraction.json", {**study.payload(), "seed": seed, "versions": versions()})
+        return study
 
 
 def _idealised(
@@ -270,6 +271,5 @@ def _plot(bench: Bench, study: DiffractionStudy, folder: Path) -> None:
         "shadow.png": plots.shadow_profiles((edges[:-1] + edges[1:]) / 2, profiles, PROFILE_MM, message),
     }
     for name, figure in figures.items():
-        part = folder / f".{name}"
-        figure.savefig(part, dpi=150)
-        part.replace(folder / name)
+        with whole_file(folder / name) as part:
+            figure.savefig(part, dpi=150, format="png")

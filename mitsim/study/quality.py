@@ -13,7 +13,8 @@ from matplotlib import image as matplotlib_image
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
-from mitsim.core.manifest import output_folder, write_json
+from mitsim.core.manifest import write_json
+from mitsim.core.output import output_folder, whole_file
 from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run, solve, verify
 from mitsim.reconstruct.solver import Solution
 from mitsim.study.metrics import TRUTH_FILE, psnr, read_truth, ssim
@@ -105,7 +106,6 @@ def _write(folder: Path, result: ReconstructionResult, method: str) -> None:
     write_frame(folder / IMAGE_FILE, {"reflectance": result.image.astype(np.float32)}, {"method": method})
     # Display only: clipped to 0..1 and with the sRGB curve's approximate 1/2.2.
     display = np.clip(result.image, 0, 1) ** (1 / 2.2)
-    part = folder / ".image.part.png"
-    matplotlib_image.imsave(part, display, cmap="gray", vmin=0, vmax=1)
-    part.replace(folder / "image.png")
+    with whole_file(folder / "image.png") as part:
+        matplotlib_image.imsave(part, display, cmap="gray", vmin=0, vmax=1, format="png")
     write_json(folder / "result.json", summary(result))

@@ -7,9 +7,7 @@ carries no time of writing, so the same data give the same bytes.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.output import whole_file
 from mitsim.study import plots
 from mitsim.study.images import PATTERN_CORNER, figure_png, finite, pattern_png, reflectance_png
 
@@ -157,21 +156,14 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
 
 
 def build_report(report: ReportData, path: Path) -> Path:
-    """Write the page to `path` (beside it first, then moved into place) and return it.
+    """Write the page to `path`, all or nothing, and return it.
 
     Raises MitsimError when an image holds values that are not finite or the place cannot be written.
     """
     text = render_html(report)
-    path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise MitsimError(f"{path}: the report cannot be written ({error.strerror}); give another place") from error
-    return path
+    return Path(path)
 
 
 def render_html(report: ReportData) -> str:

@@ -80,7 +80,7 @@ def call(*arguments: object, cwd: Path | None = None) -> Outcome:
     try:
         with _captured() as (out, err):
             try:
-                cli.main()
+                cli.run()
                 code: object = None
             except SystemExit as stop:
                 code = stop.code or 0

@@ -264,7 +264,7 @@ def on_a_terminal(
         patch.setattr(sys, "argv", ["mitsim", *map(str, arguments)])
         patch.setattr(sys, "stderr", file)
         with pytest.raises(SystemExit):
-            cli.main()
+            cli.run()
     reader.join(timeout=10)
     os.close(master)
     return capsys.readouterr().out, b"".join(seen).decode()

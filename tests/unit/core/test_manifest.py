@@ -60,61 +60,6 @@ def test_reading_names_the_file(tmp_path: Path) -> None:
         manifest.read_json(tmp_path / "m.json")
 
 
-def test_prepare_output_makes_the_folder(tmp_path: Path) -> None:
-    assert manifest.prepare_output(str(tmp_path / "run")) == tmp_path / "run"
-    assert (tmp_path / "run").is_dir()
-    manifest.prepare_output(tmp_path / "run")  # empty: still free
-    (tmp_path / "run" / "frame").touch()
-    with pytest.raises(MitsimError, match="holds files already"):
-        manifest.prepare_output(tmp_path / "run")
-    manifest.prepare_output(tmp_path / "run", overwrite=True)
-    assert (tmp_path / "run" / "frame").exists()
-
-
-def test_prepare_output_refuses_before_work(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for path, reason in [
-        (tmp_path / "no" / "run", "does not exist"),
-        (tmp_path / "file", "is a file"),
-        (tmp_path / "file" / "run", "does not exist"),
-    ]:
-        with pytest.raises(MitsimError, match=reason):
-            manifest.prepare_output(path)
-
-
-def test_prepare_output_for_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "frame.exr"
-    assert manifest.prepare_output(path, kind="file") == path
-    assert not path.exists()
-    path.touch()
-    with pytest.raises(MitsimError, match="exists already"):
-        manifest.prepare_output(path, kind="file")
-    manifest.prepare_output(path, overwrite=True, kind="file")
-    with pytest.raises(MitsimError, match="is a folder"):
-        manifest.prepare_output(tmp_path, kind="file")
-
-
-@pytest.mark.parametrize("kind", ["folder", "file"])
-def test_a_place_that_takes_no_files_is_refused(kind: str) -> None:
-    # /proc takes no new files from anyone, root included.
-    if not Path("/proc/self").is_dir():
-        pytest.skip("needs /proc")
-    with pytest.raises(MitsimError, match="output /proc/mitsim"):
-        manifest.prepare_output(Path("/proc/mitsim"), kind=kind)
-
-
-@pytest.mark.parametrize("kind", ["folder", "file"])
-def test_a_folder_without_write_access_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    # Root may write anywhere, so the read-only file system is played.
-    def refuse(dir: Path) -> None:
-        raise OSError(30, f"Read-only file system: {dir}")
-
-    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    path = tmp_path / "frame.exr" if kind == "file" else tmp_path
-    with pytest.raises(MitsimError, match="not writable"):
-        manifest.prepare_output(path, kind=kind)
-
-
 def test_versions_names_what_decides_the_numbers() -> None:
     versions = manifest.versions()
     assert {"mitsim", "mitsuba", "drjit", "numpy", "python"} <= set(versions)

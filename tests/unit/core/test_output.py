@@ -1,0 +1,117 @@
+"""Output places are refused before work, held against other processes, and filled with whole files only."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mitsim.core import output
+from mitsim.core.errors import MitsimError
+from mitsim.core.output import LOCK, output_folder, whole_file
+
+
+def test_prepare_output_makes_the_folder(tmp_path: Path) -> None:
+    assert output.prepare_output(str(tmp_path / "run")) == tmp_path / "run"
+    assert (tmp_path / "run").is_dir()
+    output.prepare_output(tmp_path / "run")  # empty: still free
+    (tmp_path / "run" / "frame").touch()
+    with pytest.raises(MitsimError, match="holds files already"):
+        output.prepare_output(tmp_path / "run")
+    output.prepare_output(tmp_path / "run", overwrite=True)
+    assert (tmp_path / "run" / "frame").exists()
+
+
+def test_prepare_output_refuses_before_work(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path, reason in [
+        (tmp_path / "no" / "run", "does not exist"),
+        (tmp_path / "file", "is a file"),
+        (tmp_path / "file" / "run", "does not exist"),
+    ]:
+        with pytest.raises(MitsimError, match=reason):
+            output.prepare_output(path)
+
+
+def test_prepare_output_for_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "frame.exr"
+    assert output.prepare_output(path, kind="file") == path
+    assert not path.exists()
+    path.touch()
+    with pytest.raises(MitsimError, match="exists already"):
+        output.prepare_output(path, kind="file")
+    output.prepare_output(path, overwrite=True, kind="file")
+    with pytest.raises(MitsimError, match="is a folder"):
+        output.prepare_output(tmp_path, kind="file")
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_a_place_that_takes_no_files_is_refused(kind: str) -> None:
+    # /proc takes no new files from anyone, root included.
+    if not Path("/proc/self").is_dir():
+        pytest.skip("needs /proc")
+    with pytest.raises(MitsimError, match="output /proc/mitsim"):
+        output.prepare_output(Path("/proc/mitsim"), kind=kind)
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_a_folder_without_write_access_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    # Root may write anywhere, so the read-only file system is played.
+    def refuse(dir: Path) -> None:
+        raise OSError(30, f"Read-only file system: {dir}")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    path = tmp_path / "frame.exr" if kind == "file" else tmp_path
+    with pytest.raises(MitsimError, match="not writable"):
+        output.prepare_output(path, kind=kind)
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    path.write_text("old")
+    with pytest.raises(ValueError, match="half way"), whole_file(path) as part:
+        part.write_text("ne")
+        raise ValueError("half way")
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+    with whole_file(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_in_use_is_refused_and_free_again_afterwards(tmp_path: Path) -> None:
+    with output_folder(tmp_path / "run") as folder:
+        with pytest.raises(MitsimError, match="another mitsim is writing there"), output_folder(folder):
+            pass
+        assert (folder / LOCK).exists(), "a refusal does not take the lock away"
+    assert not (folder / LOCK).exists()
+    with output_folder(folder):
+        pass
+
+
+HOLD = """
+import sys, time
+from mitsim.core.output import output_folder
+with output_folder(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "held\n"
+    with pytest.raises(MitsimError, match="another mitsim"), output_folder(tmp_path / "run"):
+        pass
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    assert (tmp_path / "run" / LOCK).exists()
+    with output_folder(tmp_path / "run"):  # what it left behind does not count as content
+        pass
+
+
+def test_a_folder_made_for_nothing_goes_away(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), output_folder(tmp_path / "run"):
+        raise KeyboardInterrupt
+    assert not (tmp_path / "run").exists()
