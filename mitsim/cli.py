@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import signal
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 
 INTERRUPTED = 130
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Scene = Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
@@ -43,6 +45,10 @@ Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", me
 ProjectorFile = Annotated[Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")]
 Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
 Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
+MaxSeconds = Annotated[float, typer.Option("--max-seconds", help="refuse work that would take longer")]
+MaxMemory = Annotated[
+    float | None, typer.Option("--max-memory", help="refuse work that would take more [what is free]", metavar="GIB")
+]
 Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
 
 
@@ -60,11 +66,13 @@ def run() -> None:
         _fail(str(error))
     except (typer.Abort, KeyboardInterrupt):
         code = INTERRUPTED
+    except MemoryError:
+        _fail("out of memory; close other programs, or ask for fewer pixels, frames or less accuracy")
     except OSError as error:
-        # What no check foresees: a full disk, a name too long, a file taken away. Without a file it is a fault of ours.
-        if error.filename is None:
+        # What no check foresees: a full disk, a name too long, a file taken away. Other errors are faults of ours.
+        if error.filename is None and error.errno not in _NO_ROOM:
             raise
-        _fail(f"{error.filename}: {error.strerror}; choose another place")
+        _fail(f"{error.filename or 'output'}: {error.strerror}; choose another place")
     except Exception as error:
         # Usage errors of click (wherever typer keeps it) carry their own one-line message.
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
@@ -141,6 +149,7 @@ def plan(
     quiet: Quiet = False,
 ) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
+    from mitsim.capture.cost import frames_cost
     from mitsim.capture.light import make_plan
     from mitsim.capture.run import plan_block
     from mitsim.scene.plan import parse_effects
@@ -152,8 +161,10 @@ def plan(
     block = plan_block(made)
     payload = {key: block[key] for key in ("effects", "accuracy", "predicted_seconds", "settings", "warnings")}
     payload |= {"sampling_target": made.sampling_target, "systematic_error": made.systematic_error}
+    cost = frames_cost(bench, made.settings, weights.shape[1], len(weights))
+    payload |= {"predicted_memory_bytes": cost.memory_bytes, "predicted_disk_bytes": cost.disk_bytes}
     if not as_json:
-        _print_plan(made)
+        _print_plan(made, cost)
     return _finish(as_json, payload, [], made.warnings)
 
 
@@ -175,6 +186,8 @@ def capture(
     define: Defines = None,
     resume: Annotated[bool, typer.Option("--resume", help="finish an interrupted run")] = False,
     variant: Variant = "llvm_ad_mono",
+    max_seconds: MaxSeconds = 86400.0,
+    max_memory: MaxMemory = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -183,11 +196,13 @@ def capture(
     from mitsim.capture.run import capture as run_capture
     from mitsim.scene.plan import parse_effects
 
-    forced = parse_effects(effects)
+    forced, limits = parse_effects(effects), _limits(max_seconds, max_memory)
     chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
     with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define)
-        result = run_capture(bench, patterns, output, accuracy, seed, chosen, resume, progress, forced, noise_fraction)
+        result = run_capture(
+            bench, patterns, output, accuracy, seed, chosen, resume, progress, forced, noise_fraction, limits
+        )
     payload = {key: value for key, value in asdict(result).items() if key != "plan"}
     seconds = result.seconds
     lines = [
@@ -211,6 +226,8 @@ def calibrate(
     seed: Seed = 0,
     define: Defines = None,
     variant: Variant = "llvm_ad_mono",
+    max_seconds: MaxSeconds = 86400.0,
+    max_memory: MaxMemory = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -218,9 +235,10 @@ def calibrate(
     from mitsim.capture.bench import load_recipe
     from mitsim.study.calibration import calibrate as run_calibration
 
+    limits = _limits(max_seconds, max_memory)
     with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define)
-        result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress)
+        result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress, limits)
     lines = [
         f"{result.frames} frames of {result.n} stripes in {result.seconds['total']:.1f} s: {result.output}",
         f"separability residual {result.separability_residual:.2%} ({result.noise_free_residual:.1e} without noise), "
@@ -271,6 +289,8 @@ def render(
     define: Defines = None,
     effects: Effects = "",
     variant: Variant = "llvm_ad_mono",
+    max_seconds: MaxSeconds = 86400.0,
+    max_memory: MaxMemory = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -280,6 +300,7 @@ def render(
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
+    limits = _limits(max_seconds, max_memory)
     with _work(output, quiet or as_json) as progress:
         result = run_render(
             _scene(scene),
@@ -292,6 +313,7 @@ def render(
             _defines(define),
             progress,
             parse_effects(effects),
+            limits,
         )
     lines = [
         f"{result.estimator}: mean irradiance {result.mean:.4e} W/m^2, relative noise {result.mc_error:.1e}, "
@@ -385,6 +407,12 @@ def _defines(define: Sequence[str] | None) -> dict[str, str]:
     return pairs
 
 
+def _limits(seconds: float, gibibytes: float | None) -> Any:
+    from mitsim.core.resources import Limits
+
+    return Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
+
+
 def _number(option: str, text: str, word: str, least: float | None = None) -> float | None:
     """The number in ``text``, or None for ``word``."""
     if text == word:
@@ -427,7 +455,7 @@ def _progress(silent: bool) -> Iterator[Callable[[str, float], None]]:
         yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
 
 
-def _print_plan(made: Any) -> None:
+def _print_plan(made: Any, cost: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -440,6 +468,7 @@ def _print_plan(made: Any) -> None:
     console = Console()
     console.print(table)
     console.print(f"Predicted time for transport and optics: {made.predicted_seconds:.2f} s")
+    console.print(f"At most {cost.memory_bytes / 2**30:.2g} GiB of memory, {cost.disk_bytes / 2**20:.3g} MiB of disk")
 
 
 def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ class RunFolder:
     """One run on disk; ``digest`` identifies its configuration.
 
     A frame is kept on resume when it is the one that a finished run's checksum names, or, in an interrupted run, when
-    it is readable and carries this run's digest.
+    it is readable, carries this run's digest, and its pixels have the checksum that was noted with it.
     """
 
     def __init__(self, path: Path, digest: str, configuration: Mapping[str, Any], known: Mapping[str, str]) -> None:
@@ -55,7 +56,7 @@ class RunFolder:
 
     def write_frame(self, index: int, channels: Mapping[str, Channel], metadata: Mapping[str, Value]) -> None:
         """Write one frame, whole or not at all."""
-        self._write(frame_name(index), channels, {"run": self.digest, "index": index, **metadata})
+        self._write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
 
     def write_truth(self, reflectance: npt.NDArray[np.float64], board: float) -> None:
         """Write the truth (n, n), relative to a board of that reflectance."""
@@ -79,10 +80,23 @@ class RunFolder:
 
     def _is_ours(self, path: Path, index: int) -> bool:
         try:
-            _, metadata = read_frame(path)
+            channels, metadata = read_frame(path)
         except MitsimError:
             return False
-        return metadata.get("run") == self.digest and metadata.get("index") == index
+        return all(metadata.get(key) == value for key, value in self._identity(index, channels).items())
+
+    def _identity(self, index: int, channels: Mapping[str, Channel]) -> dict[str, Value]:
+        """What tells a frame from one of another run, another place in this one, or one that was damaged."""
+        return {"run": self.digest, "index": index, "pixels_sha256": _pixels(channels)}
+
+
+def _pixels(channels: Mapping[str, Channel]) -> str:
+    """SHA-256 of the channels' names and values: in an interrupted run no manifest holds checksums of files yet."""
+    digest = hashlib.sha256()
+    for name, values in sorted(channels.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
 
 
 @contextmanager

@@ -14,12 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.cost import frames_cost
 from mitsim.capture.light import Progress, collect, make_plan, silent, uniform_light
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
 from mitsim.core.manifest import versions
 from mitsim.core.output import prepare_output
+from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
 from mitsim.scene.load import LoadedScene, load_scene
 from mitsim.transport import plugins
@@ -61,22 +63,27 @@ class Rendered:
         return math.sqrt(noise / energy) if energy > 0 else math.inf
 
 
-def reference(loaded: LoadedScene, spp: int, seed: int, progress: Progress = silent) -> Rendered:
+def reference(
+    loaded: LoadedScene, spp: int, seed: int, progress: Progress = silent, limits: Limits | None = None
+) -> Rendered:
     """Render with the scene's own integrator in independent passes, summed in float64.
 
     Raises
     ------
     MitsimError
-        for fewer than 4 samples a pixel: passes are compared to tell the noise.
+        for fewer than 4 samples a pixel: passes are compared to tell the noise; or when the first pass shows that all
+        of them would take longer than ``limits`` allow.
     """
     import mitsuba as mi
 
     if not _FEWEST_PASSES <= spp <= _MOST_SAMPLES:
         raise MitsimError(f"--spp {spp}: give at least {_FEWEST_PASSES} samples a pixel, at most {_MOST_SAMPLES}")
+    limits = limits or Limits()
     passes = max(_FEWEST_PASSES, math.ceil(spp / _SAMPLES_A_PASS))
     each = math.ceil(spp / passes)
     total: Any = 0.0
     squares: Any = 0.0
+    started = time.perf_counter()
     for index in range(passes):
         child = integer(seed, "reference", index)
         try:
@@ -88,6 +95,8 @@ def reference(loaded: LoadedScene, spp: int, seed: int, progress: Progress = sil
             ) from None
         total, squares = total + image, squares + image**2
         progress("reference", (index + 1) / passes)
+        if index == 0:
+            Cost(seconds=(time.perf_counter() - started) * passes).check(f"--spp {spp}", limits)
     mean = total / passes
     variance = np.maximum(squares / passes - mean**2, 0) / (passes - 1)
     return Rendered(mean.reshape(*mean.shape[:2], -1), np.sqrt(variance).reshape(*mean.shape[:2], -1))
@@ -125,6 +134,7 @@ def render(
     defines: Mapping[str, str] | None = None,
     progress: Progress = silent,
     effects: Mapping[str, bool] | None = None,
+    limits: Limits | None = None,
 ) -> RenderResult:
     """Write one frame of irradiance [W m^-2] and its standard error to ``output``.
 
@@ -134,7 +144,8 @@ def render(
     Raises
     ------
     MitsimError
-        for an unknown estimator, a scene that does not load, or an output that cannot be written.
+        for an unknown estimator, a scene that does not load, an output that cannot be written, or a frame that would
+        take more memory or time than ``limits`` allow.
     """
     if estimator not in ESTIMATORS:
         raise MitsimError(f"--estimator {estimator!r}: use {' or '.join(ESTIMATORS)}")
@@ -146,12 +157,13 @@ def render(
         plugins.register()
         loaded = load_scene(scene, defines, needs_projector=False)
         started = time.perf_counter()
-        frame = reference(loaded, spp, seed, progress)
+        frame = reference(loaded, spp, seed, progress, limits)
     else:
         bench = open_bench(scene, variant, defines=defines, check_camera=False)
         started = time.perf_counter()
         uniform = uniform_light(bench.n)
         plan = make_plan(bench, *uniform, accuracy, seed, effects)
+        frames_cost(bench, plan.settings, 1, 1, plan.predicted_seconds).check(str(scene), limits or Limits(), path)
         light = collect(bench, plan, *uniform, seed, progress, by_pixel=False)
         warnings = plan.warnings
         found = next(iter(light.frames(*uniform, seed)))

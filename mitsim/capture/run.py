@@ -15,13 +15,15 @@ import numpy.typing as npt
 
 from mitsim.capture.bench import Bench, load_recipe
 from mitsim.capture.clock import Clock
+from mitsim.capture.cost import frames_cost
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
 from mitsim.capture.folder import RunFolder, claimed, frame_name
 from mitsim.capture.light import Light, Progress, collect, make_plan, silent, speckle_of, uniform_light
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import Channel
-from mitsim.core.manifest import versions
+from mitsim.core.manifest import DECIDING, versions
 from mitsim.core.parallel import in_threads
+from mitsim.core.resources import Limits
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.evidence import Settings
 from mitsim.scene.patterns import Capture, PatternFamily
@@ -61,6 +63,7 @@ def capture(
     progress: Progress = silent,
     effects: Mapping[str, bool] | None = None,
     noise_fraction: float | None = None,
+    limits: Limits | None = None,
 ) -> CaptureResult:
     """Render, expose and write every frame of a pattern family.
 
@@ -70,13 +73,20 @@ def capture(
     Raises
     ------
     MitsimError
-        for patterns that do not fit, an output that cannot be written or holds something else.
+        for patterns that do not fit, an output that cannot be written or holds something else, or a run that would
+        take more memory, disk or time than ``limits`` allow.
     """
+    limits = limits or Limits()
     exposure = exposure or Exposure()
     exposure.check(bench)
     if noise_fraction is not None and not 0 < noise_fraction <= 1:
         raise MitsimError(f"--noise-fraction {noise_fraction}: give a part of the sensor's noise above 0, up to 1")
     family = bench.family(patterns, seed)
+    labels, weights = family.classes()
+    size = weights.shape[1], len(weights)
+    there = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if resume else 0
+    first_look = frames_cost(bench, Settings(bench.geometry.scene_distance), *size, on_disk=there)
+    first_look.check(patterns, limits, Path(output))
     configuration = {
         **bench.provenance(),
         **bench.identity(),
@@ -86,13 +96,15 @@ def capture(
         "exposure": asdict(exposure),
         "effects": dict(effects or {}),
         "noise_fraction": noise_fraction,
+        "versions": {name: version for name, version in versions().items() if name in DECIDING},
     }
     digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
     clock = Clock()
-    labels, weights = family.classes()
     with claimed(Path(output), digest, configuration, resume) as folder:
         with clock.stage("plan"):
             plan = make_plan(bench, labels, weights, accuracy, seed, effects)
+        cost = frames_cost(bench, plan.settings, *size, plan.predicted_seconds, there)
+        cost.check(patterns, limits, folder.path)
         target = NoiseTarget(bench, exposure, noise_fraction, seed) if noise_fraction is not None else None
         with clock.stage("transport"):
             light = collect(bench, plan, labels, weights, seed, progress, by_pixel=False, target=target)

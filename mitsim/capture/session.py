@@ -15,10 +15,12 @@ import numpy.typing as npt
 
 from mitsim.capture.bench import Bench, SessionRecipe
 from mitsim.capture.clock import Clock
+from mitsim.capture.cost import frames_cost
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
 from mitsim.capture.light import Light, Progress, collect, make_plan, speckle_of, uniform_light
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
+from mitsim.core.resources import Limits
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.scene.patterns import hadamard_matrix
 from mitsim.scene.plan import Plan
@@ -33,8 +35,16 @@ class Session:
     """One calibration session: the board's light, the exposure, and noisy or noise-free responses."""
 
     def __init__(
-        self, bench: Bench, recipe: SessionRecipe, accuracy: float, seed: int, clock: Clock, progress: Progress
+        self,
+        bench: Bench,
+        recipe: SessionRecipe,
+        accuracy: float,
+        seed: int,
+        clock: Clock,
+        progress: Progress,
+        limits: Limits | None = None,
     ) -> None:
+        """MitsimError when the session would take more memory or time than ``limits`` allow."""
         self.bench, self.recipe, self.seed, self.clock, self.progress = bench, recipe, seed, clock, progress
         self.board = bench.with_board(recipe.board_reflectance)
         self.centre = bench.geometry.mask == "flatcam"
@@ -50,6 +60,8 @@ class Session:
         lines = _lines(n)
         with clock.stage("plan"):
             self.plan: Plan = make_plan(self.board, *lines, accuracy, seed)
+        cost = frames_cost(bench, self.plan.settings, n * n, self.captures, self.plan.predicted_seconds)
+        cost.check("calibration", limits or Limits())
         with clock.stage("transport"):
             self.light: Light = collect(self.board, self.plan, *lines, seed, progress, "calibration").merged()
         with clock.stage("optics"):

@@ -15,6 +15,8 @@ import mitsim
 from mitsim.core.errors import MitsimError
 from mitsim.core.output import whole_file
 
+DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
+"""Packages of which another version may give other frames from the same seed."""
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
 

@@ -139,6 +139,15 @@ class Filed:
     groups: tuple[sparse.csr_array, ...]
 
 
+def frames_in_memory(classes: int, captures: int) -> int:
+    """Frames that :class:`ExpectedFrames` of so many classes and captures holds at once."""
+    return (classes if _mixes(classes, captures) else _AT_ONCE) + _AT_ONCE
+
+
+def _mixes(classes: int, captures: int) -> bool:
+    return classes <= min(_LARGEST_BASIS, captures)
+
+
 class ExpectedFrames:
     """Frames of every capture of a family, each with the Monte Carlo variance of its mean; iterate as often as needed.
 
@@ -173,7 +182,7 @@ class ExpectedFrames:
         self._seed = seed
         classes, rows = weights.shape[1], labels.size
         indicator = sparse.csr_array((np.ones(rows), (labels, np.arange(rows))), shape=(classes, rows))
-        self._mixed = classes <= min(_LARGEST_BASIS, len(weights))
+        self._mixed = _mixes(classes, len(weights))
         self._shares = np.eye(classes) if self._mixed else weights
         self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(weights) @ indicator)
         self._weights = weights

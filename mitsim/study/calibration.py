@@ -18,6 +18,7 @@ from mitsim.capture.session import Session
 from mitsim.core.frames import checksum, write_frame
 from mitsim.core.manifest import versions, write_json
 from mitsim.core.output import output_folder
+from mitsim.core.resources import Limits
 from mitsim.study.metrics import relative_error
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,19 +53,20 @@ def calibrate(
     seed: int = 0,
     recipe: SessionRecipe | None = None,
     progress: Progress = silent,
+    limits: Limits | None = None,
 ) -> tuple[CalibrationResult, Calibration]:
     """Run a session and write its factors to a CAL folder; returns the report and the factors.
 
     Raises
     ------
     MitsimError
-        for an output that cannot be written, or a recipe that cannot be used.
+        for an output that cannot be written, a recipe that cannot be used, or a session beyond the ``limits``.
     """
     recipe = recipe or load_recipe()
     clock = Clock()
     Exposure(None, recipe.exposure_fraction).check(bench)
     with output_folder(output) as folder:
-        session = Session(bench, recipe, accuracy, seed, clock, progress)
+        session = Session(bench, recipe, accuracy, seed, clock, progress, limits)
         noisy = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
         with clock.stage("noise-free check"):
             clean = estimate_factors(*session.noise_free(), session.signs, centre=session.centre)

@@ -1,0 +1,35 @@
+"""What forming and writing frames takes, before it is begun: from a camera's size and a family to bytes and seconds."""
+
+from __future__ import annotations
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.exposer import FRAMES_AT_ONCE
+from mitsim.core.resources import Cost
+from mitsim.optics.frames import frames_in_memory
+from mitsim.scene.evidence import GROUPS, Settings
+
+_LANES_BYTES = 350e6  # paths in flight, compiled kernels, LLVM; measured
+_DEPOSIT_BYTES = 36.0  # an entry of a sparse matrix, and the sum that it is added to
+_SECONDS_PER_PIXEL = 9e-8  # exposing and writing; measured on two cores
+_BYTES_PER_PIXEL = 8  # digital number and expected electrons, uncompressed
+_HEADER_BYTES = 2000
+
+
+def frames_cost(
+    bench: Bench, settings: Settings, classes: int, captures: int, seconds: float = 0.0, on_disk: float = 0.0
+) -> Cost:
+    """Memory, disk and time of a capture of so many frames; ``seconds`` is what its light takes.
+
+    ``on_disk``: bytes of frames that are there already.
+
+    Memory is an upper estimate: measured runs take between a third and all of it
+    (``tests/hard/test_resources.py``).
+    """
+    pixels = bench.geometry.pixels**2
+    held = frames_in_memory(classes, captures) + 4 * FRAMES_AT_ONCE
+    places = bench.n**2 * (2 * settings.subdivision**2 + (settings.anchors**2 + 1) * settings.coarse_cells**2)
+    return Cost(
+        seconds=seconds + captures * pixels * _SECONDS_PER_PIXEL,
+        memory_bytes=_LANES_BYTES + 8.0 * held * pixels + GROUPS * places * _DEPOSIT_BYTES,
+        disk_bytes=max(captures * (_BYTES_PER_PIXEL * pixels + _HEADER_BYTES) + 4.0 * bench.n**2 - on_disk, 0.0),
+    )

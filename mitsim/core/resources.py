@@ -1,0 +1,85 @@
+"""What this machine has left, and the refusal of work that would take more: estimates in, silence or one line out."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from mitsim.core.errors import MitsimError
+
+_CGROUPS = (
+    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
+    (Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"), Path("/sys/fs/cgroup/memory/memory.usage_in_bytes")),
+)
+_USABLE = 0.9
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one command may take: wall seconds, and bytes of memory (None: nine tenths of what is free)."""
+
+    seconds: float = 86400.0
+    memory_bytes: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.seconds > 0:
+            raise MitsimError(f"--max-seconds {self.seconds:g}: give a number above 0")
+        if self.memory_bytes is not None and not self.memory_bytes > 0:
+            raise MitsimError(f"--max-memory {self.memory_bytes / 2**30:g}: give a number of GiB above 0")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a work is estimated to take: wall seconds, bytes of memory beyond those in use now, bytes of disk."""
+
+    seconds: float = 0.0
+    memory_bytes: float = 0.0
+    disk_bytes: float = 0.0
+
+    def check(self, what: str, limits: Limits, output: Path | None = None) -> None:
+        """MitsimError when the work takes more than its limits, or than the disk of ``output`` has free."""
+        if not self.seconds <= limits.seconds:
+            raise MitsimError(
+                f"{what}: would take about {self.seconds:.3g} s; allowed are {limits.seconds:.3g} s; "
+                "ask for less accuracy or fewer frames, or raise --max-seconds"
+            )
+        free = free_memory() * _USABLE
+        allowed = free if limits.memory_bytes is None else min(limits.memory_bytes, free)
+        if not self.memory_bytes <= allowed:
+            raise MitsimError(
+                f"{what}: would take about {_size(self.memory_bytes)} of memory; allowed are {_size(allowed)}; "
+                "ask for fewer pixels or patterns, or free memory"
+            )
+        if output is not None and not self.disk_bytes <= (left := free_disk(output)):
+            raise MitsimError(
+                f"{what}: would write about {_size(self.disk_bytes)}, but {output} has {_size(left)} left; "
+                "choose another place or fewer frames"
+            )
+
+
+def free_memory() -> float:
+    """Bytes that this process can still take: the machine's, its control group's, or its own limit's, the least."""
+    left = [float(psutil.virtual_memory().available)]
+    for limit, used in _CGROUPS:
+        try:
+            left.append(float(limit.read_text()) - float(used.read_text()))
+        except (OSError, ValueError):  # no such group, or "max"
+            continue
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if soft != resource.RLIM_INFINITY:
+        left.append(float(soft - psutil.Process().memory_info().vms))
+    return max(min(left), 0.0)
+
+
+def free_disk(path: Path) -> float:
+    """Bytes left on the disk where ``path`` is, or will be."""
+    there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    return float(shutil.disk_usage(there).free)
+
+
+def _size(count: float) -> str:
+    return f"{count / 2**30:.3g} GiB" if count >= 2**30 else f"{count / 2**20:.3g} MiB"
