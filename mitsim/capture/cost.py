@@ -12,7 +12,7 @@ _LANES_BYTES = 350e6  # paths in flight, compiled kernels, LLVM; measured
 _DEPOSIT_BYTES = 36.0  # an entry of a sparse matrix, and the sum that it is added to
 _SECONDS_PER_PIXEL = 9e-8  # exposing and writing; measured on two cores
 _BYTES_PER_PIXEL = 8  # digital number and expected electrons, uncompressed
-_HEADER_BYTES = 2000
+_BYTES_PER_ROW, _HEADER_BYTES = 16, 2000
 
 
 def frames_cost(
@@ -23,13 +23,16 @@ def frames_cost(
     ``on_disk``: bytes of frames that are there already.
 
     Memory is an upper estimate: measured runs take between a third and all of it
-    (``tests/hard/test_resources.py``).
+    (``tests/hard/test_memory.py``).
     """
-    pixels = bench.geometry.pixels**2
+    rows = bench.geometry.pixels
+    pixels = rows**2
+    files = captures * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
+    truth = 4.0 * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES
     held = frames_in_memory(classes, captures) + 4 * FRAMES_AT_ONCE
     places = bench.n**2 * (2 * settings.subdivision**2 + (settings.anchors**2 + 1) * settings.coarse_cells**2)
     return Cost(
         seconds=seconds + captures * pixels * _SECONDS_PER_PIXEL,
         memory_bytes=_LANES_BYTES + 8.0 * held * pixels + GROUPS * places * _DEPOSIT_BYTES,
-        disk_bytes=max(captures * (_BYTES_PER_PIXEL * pixels + _HEADER_BYTES) + 4.0 * bench.n**2 - on_disk, 0.0),
+        disk_bytes=max(files + truth - on_disk, 0.0),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,9 +68,11 @@ def free_memory() -> float:
             left.append(float(limit.read_text()) - float(used.read_text()))
         except (OSError, ValueError):  # no such group, or "max"
             continue
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if soft != resource.RLIM_INFINITY:
-        left.append(float(soft - psutil.Process().memory_info().vms))
+    if hasattr(psutil, "RLIMIT_AS"):  # Linux and FreeBSD
+        process = psutil.Process()
+        soft, _ = process.rlimit(psutil.RLIMIT_AS)
+        if soft != psutil.RLIM_INFINITY:
+            left.append(float(soft - process.memory_info().vms))
     return max(min(left), 0.0)
 
 

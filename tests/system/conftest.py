@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.system.interrupted import PATTERNS
+
 ACCURACY = "0.005"
 """Relative error of expected frames; at 0.02 the uniform frame comes without diffraction, and its image loses 10 dB."""
 
@@ -212,3 +214,11 @@ def refused(tmp_path: Path, lab: Laboratory) -> Callable[..., str]:
         return line
 
     return check
+
+
+@pytest.fixture(scope="session")
+def whole(lab: Laboratory, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of many frames that nothing disturbed."""
+    run: Path = tmp_path_factory.mktemp("whole") / "run"
+    assert call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS).code == 0
+    return run

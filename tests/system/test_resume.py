@@ -5,9 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,34 +13,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.frames import read_frame
-
-PATTERNS = "hadamard:16"  # 512 frames: long enough to be hit in the middle
-
-
-def cut_short(how: signal.Signals, least: int, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Start mitsim, send it a signal as soon as ``least`` frames are written."""
-    folder = Path(str(arguments[arguments.index("-o") + 1]))
-    command = [sys.executable, "-m", "mitsim.cli", *map(str, arguments)]
-    # A shell's background jobs ignore SIGINT, and so would what they start.
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    signal.signal(signal.SIGINT, before)
-    limit = time.monotonic() + 120
-    while len(list(folder.glob("frame_*.exr"))) < least:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < limit
-        time.sleep(0.001)
-    process.send_signal(how)
-    out, err = process.communicate(timeout=60)
-    return subprocess.CompletedProcess(command, process.returncode, out, err)
-
-
-@pytest.fixture(scope="module")
-def whole(call: Callable[..., Any], lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that nothing disturbed."""
-    run: Path = tmp_path_factory.mktemp("whole") / "run"
-    assert call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS).code == 0
-    return run
+from tests.system.interrupted import PATTERNS, assert_equal_runs, cut_short
 
 
 @pytest.fixture(scope="module")
@@ -59,19 +29,6 @@ def killed(lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def interrupted(killed: Path, tmp_path: Path) -> Path:
     """A copy of the killed run."""
     return Path(shutil.copytree(killed, tmp_path / "run"))
-
-
-def assert_equal_runs(run: Path, whole: Path) -> None:
-    """The same frames with the same pixels, and manifests that agree on all but time."""
-    names = sorted(path.name for path in whole.glob("*.exr"))
-    assert sorted(path.name for path in run.glob("*.exr")) == names
-    for name in names:
-        ours, theirs = read_frame(run / name)[0], read_frame(whole / name)[0]
-        assert ours.keys() == theirs.keys()
-        assert all(np.array_equal(ours[channel], theirs[channel]) for channel in theirs), name
-    ours, theirs = (json.loads((folder / "manifest.json").read_text()) for folder in (run, whole))
-    for key in ("status", "camera", "digital", "patterns", "checksums", "configuration"):
-        assert ours[key] == theirs[key], key
 
 
 def test_a_killed_run_has_whole_frames_only(killed: Path, whole: Path) -> None:

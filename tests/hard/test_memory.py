@@ -1,0 +1,42 @@
+"""The memory that a capture is estimated to take, against what it took in a process of its own."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = """
+import resource, sys
+from pathlib import Path
+from mitsim.capture import run
+from mitsim.capture.bench import open_bench
+from mitsim.capture.cost import frames_cost
+from mitsim.core.configuration import shipped
+
+def used():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
+
+bench = open_bench(shipped("scenes", sys.argv[1], "scene.xml"))
+before = used()
+result = run.capture(bench, sys.argv[2], Path(sys.argv[3]), float(sys.argv[4]))
+labels, weights = bench.family(sys.argv[2]).classes()
+cost = frames_cost(bench, result.plan.settings, weights.shape[1], len(weights))
+written = sum(path.stat().st_size for path in Path(sys.argv[3]).glob("*.exr"))
+print(used() - before, cost.memory_bytes, written, cost.disk_bytes)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "patterns", "accuracy"),
+    [("photograph", "dots:7", 1e-3), ("photograph", "hadamard:8", 1e-3), ("cookie_bag", "dots:7", 5e-3)],
+)
+def test_the_estimate_is_an_upper_one_within_a_factor_of_three(
+    variant: str, tmp_path: Path, scene: str, patterns: str, accuracy: float
+) -> None:
+    arguments = [sys.executable, "-c", PROGRAM, scene, patterns, str(tmp_path / "run"), str(accuracy)]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    taken, estimated, written, on_disk = map(float, done.stdout.split())
+    assert estimated / 3 < taken <= estimated, f"took {taken / 2**20:.0f} of {estimated / 2**20:.0f} MiB"
+    assert on_disk / 1.1 < written <= on_disk

@@ -1,0 +1,59 @@
+"""Captures that are cut short, and what they must come to when they are resumed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsim.core.frames import read_frame
+
+PATTERNS = "hadamard:16"  # 512 frames: long enough to be hit in the middle
+
+
+def running(least: int, *arguments: object, **options: Any) -> subprocess.Popen[str]:
+    """Start mitsim; back as soon as ``least`` frames are written, for 0 as soon as the run's folder is there."""
+    folder = Path(str(arguments[arguments.index("-o") + 1]))
+    command = [sys.executable, "-m", "mitsim.cli", *map(str, arguments)]
+    # A shell's background jobs ignore SIGINT, and so would what they start.
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+    signal.signal(signal.SIGINT, before)
+    limit = time.monotonic() + 120
+    while len(list(folder.glob("frame_*.exr"))) < least or not folder.exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < limit
+        time.sleep(0.001)
+    return process
+
+
+def ended(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
+    """The process once it is over, with all that it said."""
+    out, err = process.communicate(timeout=60)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def cut_short(how: signal.Signals, least: int, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Start mitsim, send it a signal as soon as ``least`` frames are written."""
+    process = running(least, *arguments)
+    process.send_signal(how)
+    return ended(process)
+
+
+def assert_equal_runs(run: Path, whole: Path) -> None:
+    """The same frames with the same pixels, and manifests that agree on all but time."""
+    names = sorted(path.name for path in whole.glob("*.exr"))
+    assert sorted(path.name for path in run.glob("*.exr")) == names
+    for name in names:
+        ours, theirs = read_frame(run / name)[0], read_frame(whole / name)[0]
+        assert ours.keys() == theirs.keys()
+        assert all(np.array_equal(ours[channel], theirs[channel]) for channel in theirs), name
+    ours, theirs = (json.loads((folder / "manifest.json").read_text()) for folder in (run, whole))
+    for key in ("status", "camera", "digital", "patterns", "checksums", "configuration"):
+        assert ours[key] == theirs[key], key

@@ -1,0 +1,71 @@
+"""Work that would take more than there is, or than is allowed, is refused in one line that says how much."""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from mitsim.core import resources
+from mitsim.core.errors import MitsimError
+from mitsim.core.resources import Cost, Limits, free_disk, free_memory
+
+
+def refusal(cost: Cost, limits: Limits, output: Path | None = None) -> str:
+    with pytest.raises(MitsimError) as caught:
+        cost.check("dots:7", limits, output)
+    return str(caught.value)
+
+
+def test_what_fits_passes(tmp_path: Path) -> None:
+    Cost(1.0, 1e6, 1e3).check("dots:7", Limits(2.0, 2e6), tmp_path / "not" / "yet")
+
+
+def test_each_limit_is_named_with_what_is_allowed(tmp_path: Path) -> None:
+    assert "about 90 s; allowed are 60 s" in refusal(Cost(seconds=90), Limits(seconds=60))
+    assert "about 2 GiB of memory; allowed are 1 GiB" in refusal(Cost(memory_bytes=2**31), Limits(memory_bytes=2**30))
+    line = refusal(Cost(disk_bytes=1e18), Limits(), tmp_path / "run")
+    assert "would write about" in line and f"{tmp_path / 'run'} has" in line
+
+
+def test_an_estimate_that_is_no_number_is_too_much() -> None:
+    assert "would take about nan s" in refusal(Cost(seconds=float("nan")), Limits())
+
+
+def test_free_memory_is_a_limit_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resources, "free_memory", lambda: 1e9)
+    Cost(memory_bytes=0.89e9).check("dots:7", Limits(memory_bytes=1e15))
+    refusal(Cost(memory_bytes=0.91e9), Limits(memory_bytes=1e15))
+
+
+def test_a_control_group_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A container with 2 GiB of which 0.5 are in use has 1.5 left, whatever the machine has; "max" is no limit."""
+    limit, used = tmp_path / "max", tmp_path / "current"
+    limit.write_text(f"{2 * 2**30}\n")
+    used.write_text(f"{2**29}\n")
+    monkeypatch.setattr(resources, "_CGROUPS", ((limit, used),))
+    assert free_memory() == min(1.5 * 2**30, psutil.virtual_memory().available)
+    limit.write_text("max\n")
+    assert free_memory() > 0
+
+
+def test_the_limit_of_the_process_counts() -> None:
+    program = "from mitsim.core.resources import free_memory; print(free_memory())"
+
+    def bound() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (2**30, 2**30))
+
+    out = subprocess.run([sys.executable, "-c", program], preexec_fn=bound, capture_output=True, text=True, check=True)
+    assert 0 < float(out.stdout) < 2**30
+
+
+@pytest.mark.parametrize("wrong", [{"seconds": 0.0}, {"seconds": float("nan")}, {"memory_bytes": -1.0}])
+def test_limits_that_are_no_limits(wrong: dict[str, float]) -> None:
+    with pytest.raises(MitsimError, match="above 0"):
+        Limits(**wrong)
+
+
+def test_the_disk_of_a_place_that_is_not_there_yet(tmp_path: Path) -> None:
+    assert free_disk(tmp_path / "a" / "b") == pytest.approx(free_disk(tmp_path), rel=0.1)

@@ -1,0 +1,114 @@
+"""The worker process: its end becomes an exit status and one line, whatever that end is."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process where there is no fork")
+
+PROGRAM = """
+import ctypes, os, signal, sys, time
+from mitsim.core.worker import enter_worker, stop_signal
+enter_worker()
+{work}
+"""
+WAIT = "print(os.getpid(), flush=True)\ntime.sleep(60)"
+HEED = """
+try:
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+except KeyboardInterrupt:
+    sys.exit(f"stopped by {signal.Signals(stop_signal()).name}")
+"""
+STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + WAIT
+
+
+def start(work: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM.format(work=work)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def started(work: str) -> tuple[subprocess.Popen[str], int]:
+    """The parent, and the worker's process number once it works."""
+    process = start(work)
+    assert process.stdout is not None
+    return process, int(process.stdout.readline())
+
+
+@pytest.mark.parametrize("status", [0, 1, 2, 77])
+def test_an_exit_status_is_passed_on(status: int) -> None:
+    process = start(f"print('out'); print('err', file=sys.stderr); sys.exit({status})")
+    assert (*process.communicate(), process.returncode) == ("out\n", "err\n", status)
+
+
+@pytest.mark.parametrize(
+    ("work", "name", "words"),
+    [
+        ("os.abort()", "SIGABRT", "a crash in native code"),
+        ("ctypes.string_at(0)", "SIGSEGV", "a crash in native code"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", "SIGKILL", "out of memory, or killed from outside"),
+    ],
+)
+def test_a_worker_that_dies_leaves_one_clear_line(work: str, name: str, words: str) -> None:
+    process = start(work)
+    out, err = process.communicate()
+    assert process.returncode == 128 + signal.Signals[name] and out == ""
+    assert err.startswith(f"mitsim: the worker process was ended by {name} ({words})")
+    assert "--resume" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_the_parent_stops_the_worker(number: signal.Signals) -> None:
+    # A shell's background jobs ignore SIGINT, and so would what they start.
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process, _ = started(HEED)
+    signal.signal(signal.SIGINT, before)
+    process.send_signal(number)
+    assert (*process.communicate(timeout=20), process.returncode) == ("", f"stopped by {number.name}\n", 1)
+
+
+def test_a_second_signal_stops_a_worker_that_does_not_listen() -> None:
+    process, worker = started(STUBBORN)
+    process.send_signal(signal.SIGTERM)
+    time.sleep(0.2)
+    assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 128 + signal.SIGTERM and not psutil.pid_exists(worker)
+    assert out == "" and err.startswith("mitsim: stopped at once") and err.count("\n") == 1
+
+
+def test_a_killed_parent_takes_the_worker_along() -> None:
+    process, worker = started(WAIT)
+    watched = psutil.Process(worker)
+    process.kill()
+    process.communicate(timeout=20)
+    limit = time.monotonic() + 20
+    while watched.is_running() and watched.status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+
+
+def test_a_worker_killed_from_outside_is_noticed() -> None:
+    process, worker = started(WAIT)
+    os.kill(worker, signal.SIGKILL)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 137 and "SIGKILL" in err
+
+
+def test_signals_that_are_ignored_stay_ignored() -> None:
+    """`nohup` and a shell's background jobs ignore signals before the program starts."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        process, _ = started("print(os.getpid(), flush=True)\ntime.sleep(0.3)\nprint('done')")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    process.send_signal(signal.SIGHUP)
+    out, err = process.communicate(timeout=20)
+    assert (out, err, process.returncode) == ("done\n", "", 0)
