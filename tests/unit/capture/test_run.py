@@ -18,6 +18,7 @@ from mitsim.capture.light import GROUPS, collect, make_plan
 from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame
+from mitsim.core.resources import Limits
 from mitsim.scene.patterns import parse_patterns
 from mitsim.sensor.chain import frame_moments
 
@@ -385,3 +386,15 @@ def test_noise_fractions_that_make_no_sense(bench: Bench, tmp_path: Path, fracti
     with pytest.raises(MitsimError, match="--noise-fraction"):
         capture(bench, "dots:3", tmp_path / "run", ACCURACY, noise_fraction=fraction)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(seconds=1e-3), Limits(memory_bytes=1e8), Limits(seconds=1e-9, memory_bytes=1e3)]
+)
+def test_what_frames_alone_take_is_looked_at_before_the_plan(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limits: Limits
+) -> None:
+    monkeypatch.setattr(run, "make_plan", lambda *_: pytest.fail("work was begun"))
+    with pytest.raises(MitsimError, match="dots:3: would take about"):
+        capture(bench, "dots:3", tmp_path / "run", ACCURACY, limits=limits)
+    assert not list(tmp_path.iterdir())
