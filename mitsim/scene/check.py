@@ -60,7 +60,7 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
             check_camera(element)
         if is_reflectance(element.name):
             meant = known[element.attributes["id"]] if element.tag == "ref" else element
-            check_reflectance(meant, lambda child: _spectrum(child, files))
+            check_reflectance(element.name, meant, lambda child: _spectrum(child, files))
     return tuple(files.used)
 
 

@@ -150,7 +150,7 @@ def _ply_header(header: bytes) -> tuple[str | None, _Part, _Part]:
                 continue
             case ["format", name, _]:
                 order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}.get(name, "")
-            case ["element", name, count] if re.fullmatch(r"\d{1,9}", count) and name not in parts:
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,9}", count) and name not in parts:
                 parts[name] = int(count), []
             case ["property", *_, name] if parts and len(words) in (3, 5) and {*kinds} <= _PLY_TYPES.keys():
                 parts[[*parts][-1]][1].append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))

@@ -107,7 +107,7 @@ class _Reader:
         if self.elements > MOST_ELEMENTS:
             raise MitsimError(f"{shown}: over {MOST_ELEMENTS} elements with all its includes; make the scene smaller")
         version = root.raw.get("version", "")
-        if not re.fullmatch(r"[23]\.\d{1,3}\.\d{1,3}", version):
+        if not re.fullmatch(r"[23]\.[0-9]{1,3}\.[0-9]{1,3}", version):
             raise root.refusal("version", version or "none", 'give the scene version="3.0.0"; 2 and 3 are read')
         self._resolve(root, (*above, path.resolve()))
         return root

@@ -18,8 +18,8 @@ Matrix = npt.NDArray[np.float64]
 _LARGEST = 1e20
 """Squared, still far from the end of single precision (3.4e38) in which Mitsuba calculates."""
 _RIGID = 1e-4
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
-_INTEGER = re.compile(r"[+-]?\d{1,9}")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
+_INTEGER = re.compile(r"[+-]?[0-9]{1,9}")
 _SPECIAL = re.compile(r"[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 _ODD_LENGTH = "; 1 unit is 1 mm, and this looks like metres"
 
@@ -112,8 +112,9 @@ def check_numbers(element: Element, parent: Element | None) -> None:
         raise element.refusal(name, repr(element.attributes["value"]), "give true or false")
 
 
-def check_reflectance(element: Element, read: Callable[[Element], list[tuple[float, float]]]) -> None:
-    """MitsimError when a texture that a surface reflects by holds numbers above 1; ``read`` opens a spectrum's file."""
+def check_reflectance(name: str, element: Element, read: Callable[[Element], list[tuple[float, float]]]) -> None:
+    """MitsimError when what a surface reflects by, under that name, holds numbers above 1; ``read`` opens a spectrum's
+    file."""
     for child in (element, *element.children):
         if child is element and is_plugin(element):
             continue
@@ -124,7 +125,7 @@ def check_reflectance(element: Element, read: Callable[[Element], list[tuple[flo
         else:
             continue
         for number in numbers:
-            _check(child, element.name, number, _REFLECTED)
+            _check(child, name, number, _REFLECTED)
 
 
 def is_reflectance(name: str) -> bool:
