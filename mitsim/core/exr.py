@@ -22,6 +22,7 @@ _LARGEST_RATIO = 1100
 """Deflate cannot shrink more than 1032 times; a small file of any compression may claim ``_SMALL`` bytes."""
 _SMALL = 1 << 24
 _LARGEST_SIDE = 16384
+_MOST_BYTES = 4 << 30
 _MOST_CHANNELS = 64
 
 
@@ -58,6 +59,8 @@ def read_header(path: Path) -> ExrHeader:
     if compression not in _LINES:
         raise ValueError(f"compression {compression} is not known; save it without")
     decoded = width * height * sum(sizes)
+    if decoded > _MOST_BYTES:
+        raise ValueError(f"claims {width}x{height} pixels of {len(sizes)} channels; at most 4 GiB are read")
     chunks = -(-height // _LINES[compression])
     first = end + 8 * chunks
     room = size - first - 8 * chunks

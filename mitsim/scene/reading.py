@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut
 from mitsim.scene.files import SceneFiles
 
 DEEPEST = 16
@@ -25,7 +25,6 @@ _RESERVED = ("path", "filename", "parallel", "optimize", "update_scene", "varian
 _PARAMETER = re.compile(r"\$([A-Za-z0-9_]*)(\$?)")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _ENCODINGS = ("utf-8", "us-ascii")
-_CUT = 60
 
 
 @dataclass
@@ -55,12 +54,6 @@ class Element:
         got = cut(value if isinstance(value, str) else f"{value:g}")
         tag = cut(self.tag + written, 200)
         return MitsimError(f"{self.path}:{self.line}: {cut(what)}: got {got} in <{tag}>; {rule}")
-
-
-def cut(text: str, length: int = _CUT) -> str:
-    """One printable line of at most ``length`` characters."""
-    shown = "".join(letter if letter.isprintable() else " " for letter in text)
-    return shown if len(shown) <= length else shown[: length - 3] + "..."
 
 
 def read_scene(path: Path, defines: Mapping[str, str], files: SceneFiles) -> Element:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import difflib
 
-from mitsim.scene.reading import Element, cut
+from mitsim.core.errors import cut
+from mitsim.scene.reading import Element
 
 _ATTRIBUTES = {
     "alias": ("id as", ""),
