@@ -15,7 +15,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_MOST_BYTES = 1 << 20
+_MOST_BYTES = 1 << 16
+_MOST_DOTS = 200
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 100
 Model = TypeVar("Model", bound=pydantic.BaseModel)
@@ -31,9 +32,13 @@ def shipped(*parts: str) -> Path:
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:
-    """The table in a TOML file of at most 1 MiB. Raises MitsimError when it cannot be read or is not TOML."""
+    """The table in a TOML file of at most 64 KiB. Raises MitsimError when it cannot be read or is not TOML."""
     try:
-        return tomllib.loads(read_text(path, _MOST_BYTES))
+        text = read_text(path, _MOST_BYTES)
+        # The parser's time grows with the square of the parts of a dotted name.
+        if any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
+            raise ValueError(f"a line with over {_MOST_DOTS} dots")
+        return tomllib.loads(text)
     except RecursionError as error:
         raise MitsimError(f"file {path}: not valid TOML (it is nested too deep); flatten it") from error
     except ValueError as error:

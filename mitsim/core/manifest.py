@@ -17,7 +17,7 @@ import mitsim
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.plainfile import read_text
 
-_MOST_BYTES = 64 << 20
+_MOST_BYTES = 16 << 20
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
 
@@ -76,7 +76,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_json(path: Path | str) -> Any:
-    """The object in a JSON file of at most 64 MiB. Raises MitsimError when it cannot be read or is not JSON, or has a
+    """The object in a JSON file of at most 16 MiB. Raises MitsimError when it cannot be read or is not JSON, or has a
     key twice."""
     try:
         return parse_json(read_text(path, _MOST_BYTES))

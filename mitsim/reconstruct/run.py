@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, StrictBool
+from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, StrictBool
 
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError, cut
@@ -24,10 +24,23 @@ from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 
 FloatArray = npt.NDArray[np.float64]
+_MOST_PIXELS = 4096
 # Bounds far from any camera, within which products of these numbers stay finite.
 Weight = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Row = Annotated[tuple[Weight, ...], Field(max_length=_MOST_PIXELS), FailFast()]
 Positive = Annotated[float, Field(ge=1e-12, le=1e12, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
+
+
+def _texts(checksums: dict[str, Any]) -> dict[str, str]:
+    """One complaint, where pydantic would list each of a million."""
+    wrong = next((name for name, value in checksums.items() if not isinstance(value, str)), None)
+    if wrong is not None:
+        raise ValueError(f"that of {cut(wrong)!r} is no text")
+    return checksums
+
+
+Checksums = Annotated[dict[str, Any], AfterValidator(_texts)]
 
 
 class Digital(BaseModel):
@@ -59,9 +72,9 @@ class Patterns(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    P_L: tuple[tuple[Weight, ...], ...] = Field(description="(n, K) rows of P_L")
-    P_R: tuple[tuple[Weight, ...], ...] = Field(description="(n', K') rows of P_R")
-    captures: tuple[Shot, ...] = Field(description="every frame of the run")
+    P_L: Annotated[tuple[Row, ...], FailFast()] = Field(max_length=_MOST_PIXELS, description="(n, K) rows of P_L")
+    P_R: Annotated[tuple[Row, ...], FailFast()] = Field(max_length=_MOST_PIXELS, description="(n', K') rows of P_R")
+    captures: Annotated[tuple[Shot, ...], FailFast()] = Field(max_length=1 << 16, description="every frame of the run")
 
 
 class RunManifest(BaseModel):
@@ -72,7 +85,7 @@ class RunManifest(BaseModel):
     camera: dict[str, Any] = Field(description="identity that a calibration must share")
     digital: Digital = Field(description="how frames are read")
     patterns: Patterns = Field(description="what was projected")
-    checksums: dict[str, str] = Field(default={}, description="SHA-256 by file name, where known")
+    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
 
 
 class CalibrationManifest(BaseModel):
@@ -85,7 +98,7 @@ class CalibrationManifest(BaseModel):
     board_reflectance: float | None = Field(
         default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; None: unknown"
     )
-    checksums: dict[str, str] = Field(default={}, description="SHA-256 by file name, where known")
+    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
 
 
 @dataclass(frozen=True)
