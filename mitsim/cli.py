@@ -44,6 +44,7 @@ Accuracy = Annotated[float, typer.Option(help="relative rms error of the expecte
 Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", metavar="FILE.toml")]
 ProjectorFile = Annotated[Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")]
 Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
+Outside = Annotated[bool, typer.Option("--allow-outside-files", help="let the scene read files outside its own folder")]
 Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
 MaxSeconds = Annotated[float, typer.Option("--max-seconds", help="refuse work that would take longer")]
 MaxMemory = Annotated[
@@ -143,6 +144,7 @@ def plan(
     camera: Camera = None,
     projector: ProjectorFile = None,
     define: Defines = None,
+    outside: Outside = False,
     effects: Effects = "",
     variant: Variant = "llvm_ad_mono",
     as_json: Json = False,
@@ -155,7 +157,7 @@ def plan(
     from mitsim.scene.plan import parse_effects
 
     forced = parse_effects(effects)
-    bench = _bench(scene, variant, camera, projector, define)
+    bench = _bench(scene, variant, camera, projector, define, outside)
     labels, weights = bench.family(patterns, seed).classes()
     made = make_plan(bench, labels, weights, accuracy, seed, forced)
     block = plan_block(made)
@@ -184,6 +186,7 @@ def capture(
     ] = None,
     seed: Seed = 0,
     define: Defines = None,
+    outside: Outside = False,
     resume: Annotated[bool, typer.Option("--resume", help="finish an interrupted run")] = False,
     variant: Variant = "llvm_ad_mono",
     max_seconds: MaxSeconds = 86400.0,
@@ -199,7 +202,7 @@ def capture(
     forced, limits = parse_effects(effects), _limits(max_seconds, max_memory)
     chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
     with _work(output, quiet or as_json) as progress:
-        bench = _bench(scene, variant, camera, projector, define)
+        bench = _bench(scene, variant, camera, projector, define, outside)
         result = run_capture(
             bench, patterns, output, accuracy, seed, chosen, resume, progress, forced, noise_fraction, limits
         )
@@ -225,6 +228,7 @@ def calibrate(
     recipe: Annotated[Path | None, typer.Option(help="session recipe, TOML", metavar="FILE.toml")] = None,
     seed: Seed = 0,
     define: Defines = None,
+    outside: Outside = False,
     variant: Variant = "llvm_ad_mono",
     max_seconds: MaxSeconds = 86400.0,
     max_memory: MaxMemory = None,
@@ -237,7 +241,7 @@ def calibrate(
 
     limits = _limits(max_seconds, max_memory)
     with _work(output, quiet or as_json) as progress:
-        bench = _bench(scene, variant, camera, projector, define)
+        bench = _bench(scene, variant, camera, projector, define, outside)
         result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress, limits)
     lines = [
         f"{result.frames} frames of {result.n} stripes in {result.seconds['total']:.1f} s: {result.output}",
@@ -287,6 +291,7 @@ def render(
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
     define: Defines = None,
+    outside: Outside = False,
     effects: Effects = "",
     variant: Variant = "llvm_ad_mono",
     max_seconds: MaxSeconds = 86400.0,
@@ -314,6 +319,7 @@ def render(
             progress,
             parse_effects(effects),
             limits,
+            outside,
         )
     lines = [
         f"{result.estimator}: mean irradiance {result.mean:.4e} W/m^2, relative noise {result.mc_error:.1e}, "
@@ -330,6 +336,7 @@ def study(
     patterns: Patterns = "dots:7",
     seed: Seed = 0,
     define: Defines = None,
+    outside: Outside = False,
     variant: Variant = "llvm_ad_mono",
     as_json: Json = False,
     quiet: Quiet = False,
@@ -342,7 +349,7 @@ def study(
     with _work(output, quiet or as_json) as progress:
         module, function = STUDIES[name].split(":")
         run_study = getattr(importlib.import_module(module), function)
-        result = run_study(_bench(scene, variant, None, None, define), output, patterns, seed, progress)
+        result = run_study(_bench(scene, variant, None, None, define, outside), output, patterns, seed, progress)
     return _finish(as_json, result.payload(), result.lines(), ())
 
 
@@ -391,10 +398,17 @@ def _variant(name: str) -> str:
     return name
 
 
-def _bench(scene: Path, variant: str, camera: Path | None, projector: Path | None, define: Sequence[str] | None) -> Any:
+def _bench(
+    scene: Path,
+    variant: str,
+    camera: Path | None,
+    projector: Path | None,
+    define: Sequence[str] | None,
+    outside: bool,
+) -> Any:
     from mitsim.capture.bench import open_bench
 
-    return open_bench(_scene(scene), variant, camera, projector, _defines(define))
+    return open_bench(_scene(scene), variant, camera, projector, _defines(define), outside=outside)
 
 
 def _defines(define: Sequence[str] | None) -> dict[str, str]:

@@ -170,10 +170,11 @@ class Bench:
         }
 
     def provenance(self) -> dict[str, Any]:
-        """Where the scene came from: path, checksum of the XML, parameters, variant."""
+        """Where the scene came from: path, checksums of the XML and all that it reads, parameters, variant."""
         return {
             "scene": str(self.loaded.path),
             "scene_sha256": checksum(self.loaded.path),
+            "scene_files": {str(path): checksum(path) for path in self.loaded.files[1:]},
             "defines": self.defines,
             "variant": self.variant,
             "projector_model": {
@@ -207,10 +208,12 @@ def open_bench(
     projector: Path | str | None = None,
     defines: Mapping[str, str] | None = None,
     check_camera: bool = True,
+    outside: bool = False,
 ) -> Bench:
     """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
 
     ``camera`` and ``projector`` are TOML files; the shipped IMX249 and MP-CL1 are used without them.
+    ``outside`` allows files of the scene outside its folder.
     ``check_camera`` is off where only light matters and the electronics are not used.
 
     Raises
@@ -225,7 +228,7 @@ def open_bench(
     sensor = load_sensor(sensor_path)
     projector_path = Path(projector) if projector is not None else shipped("calibration", "mp_cl1.toml")
     light = load_model(projector_path, ProjectorModel)
-    loaded = load_scene(Path(scene), defines)
+    loaded = load_scene(Path(scene), defines, outside=outside)
     pitch, stated = sensor.superpixel_pitch_um * 1e-3, loaded.camera.geometry.pixel_pitch
     if check_camera and abs(pitch - stated) > _PITCH_TOLERANCE * stated:
         raise MitsimError(

@@ -135,11 +135,12 @@ def render(
     progress: Progress = silent,
     effects: Mapping[str, bool] | None = None,
     limits: Limits | None = None,
+    outside: bool = False,
 ) -> RenderResult:
     """Write one frame of irradiance [W m^-2] and its standard error to ``output``.
 
     The reference works on any scene with a ``mitsim_lensless`` sensor and any integrator; the factored estimator needs
-    a projector too.
+    a projector too. ``outside`` allows files of the scene outside its folder.
 
     Raises
     ------
@@ -155,11 +156,11 @@ def render(
         mi = load_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
         plugins.register()
-        loaded = load_scene(scene, defines, needs_projector=False)
+        loaded = load_scene(scene, defines, needs_projector=False, outside=outside)
         started = time.perf_counter()
         frame = reference(loaded, spp, seed, progress, limits)
     else:
-        bench = open_bench(scene, variant, defines=defines, check_camera=False)
+        bench = open_bench(scene, variant, defines=defines, check_camera=False, outside=outside)
         started = time.perf_counter()
         uniform = uniform_light(bench.n)
         plan = make_plan(bench, *uniform, accuracy, seed, effects)

@@ -1,8 +1,22 @@
 """The one exception for what a user can cause and mend."""
 
+from __future__ import annotations
+
+_LONGEST = 1500
+
 
 class MitsimError(Exception):
     """A request that cannot be served; the command line prints it on one line and exits with status 2.
 
-    The message is one line: what is wrong, where, the value received, what is allowed, and what to do.
+    The message is one line: what is wrong, where, the value received, what is allowed, and what to do. Whatever a
+    hostile file brought into it, it is printable and not long.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(cut(message, _LONGEST))
+
+
+def cut(text: str, length: int = 60) -> str:
+    """One printable line of at most ``length`` characters."""
+    shown = "".join(letter if letter.isprintable() else " " for letter in text[: length + 1])
+    return shown if len(text) <= length else shown[: length - 3] + "..."

@@ -19,14 +19,16 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut
+from mitsim.core.exr import read_header
+from mitsim.core.manifest import parse_json
 from mitsim.core.output import whole_file
+from mitsim.core.plainfile import check_plain
 
 Value = str | int | float
 Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
 
 _PREFIX = "mitsim."
-_MAGIC = b"\x76\x2f\x31\x01"
 _stdout_lock = threading.Lock()
 
 
@@ -58,14 +60,15 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
     missing, is not OpenEXR, or is damaged.
     """
     path = Path(path)
-    _check_magic(path)
+    check_plain(path, "frame")
     try:
+        read_header(path)
         with _open(path) as file:
             header = file.header()
             # Both are emptied when the file closes, so they are copied here.
-            metadata = {key[len(_PREFIX) :]: json.loads(header[key]) for key in header if key.startswith(_PREFIX)}
+            metadata = {key[len(_PREFIX) :]: _plain(header[key]) for key in header if key.startswith(_PREFIX)}
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, TypeError) as error:
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
         raise MitsimError(
             f"frame {path}: damaged or incomplete OpenEXR file ({_one_line(error)}); write or copy it again"
         ) from error
@@ -76,6 +79,7 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
 def checksum(path: Path | str) -> str:
     """SHA-256 of a file's bytes as 64 hexadecimal digits. Raises MitsimError when it cannot be read."""
     digest = hashlib.sha256()
+    check_plain(path)
     try:
         with open(path, "rb") as file:
             for block in iter(lambda: file.read(1 << 20), b""):
@@ -94,6 +98,13 @@ def _check_channels(channels: Mapping[str, Channel]) -> None:
     for name, values in channels.items():
         if np.asarray(values).dtype not in (np.float32, np.uint32):
             raise TypeError(f"write_frame: channel {name!r} is {np.asarray(values).dtype}; make it float32 or uint32")
+
+
+def _plain(text: str) -> Value:
+    value = parse_json(text)
+    if not isinstance(value, (str, int, float)):
+        raise ValueError(f"metadata {cut(text)!r} is no text or number")
+    return value
 
 
 def _scalar(value: Value) -> Value:
@@ -120,16 +131,6 @@ def _stderr_nowhere() -> Iterator[None]:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-
-
-def _check_magic(path: Path) -> None:
-    try:
-        with open(path, "rb") as file:
-            start = file.read(4)
-    except OSError as error:
-        raise MitsimError(f"frame {path}: cannot be read ({error.strerror}); check the path") from error
-    if start != _MAGIC:
-        raise MitsimError(f"frame {path}: not an OpenEXR file (first bytes {start!r}); give a .exr frame")
 
 
 def _one_line(error: BaseException) -> str:

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 
 import mitsim
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut
 from mitsim.core.output import whole_file
+from mitsim.core.plainfile import read_text
 
 DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
 """Packages of which another version may give other frames from the same seed."""
+_MOST_BYTES = 16 << 20
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
 
@@ -48,12 +50,28 @@ def write_json(path: Path | str, obj: Any) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def read_json(path: Path | str) -> Any:
-    """The object in a JSON file. Raises MitsimError when it cannot be read or is not JSON."""
+def parse_json(text: str) -> Any:
+    """The object in a JSON text. ValueError when it is not JSON, has a key twice, or is nested too deep."""
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MitsimError(f"file {path}: cannot be read ({error.strerror}); check the path") from error
+        return json.loads(text, object_pairs_hook=_once)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"key {cut(key)!r} is there twice")
+        found[key] = value
+    return found
+
+
+def read_json(path: Path | str) -> Any:
+    """The object in a JSON file of at most 16 MiB. Raises MitsimError when it cannot be read or is not JSON, or has a
+    key twice."""
+    try:
+        return parse_json(read_text(path, _MOST_BYTES))
     except ValueError as error:
         raise MitsimError(f"file {path}: not valid JSON ({error}); write or copy it again") from error
 

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, StrictBool
+from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, StrictBool
 
 from mitsim.core.configuration import validated
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut
 from mitsim.core.frames import checksum, read_frame
 from mitsim.core.manifest import read_json
 from mitsim.reconstruct.accumulator import Accumulator
@@ -24,9 +24,23 @@ from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 
 FloatArray = npt.NDArray[np.float64]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_MOST_PIXELS = 4096
+# Bounds far from any camera, within which products of these numbers stay finite.
+Weight = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Row = Annotated[tuple[Weight, ...], Field(max_length=_MOST_PIXELS), FailFast()]
+Positive = Annotated[float, Field(ge=1e-12, le=1e12, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
+
+
+def _texts(checksums: dict[str, Any]) -> dict[str, str]:
+    """One complaint, where pydantic would list each of a million."""
+    wrong = next((name for name, value in checksums.items() if not isinstance(value, str)), None)
+    if wrong is not None:
+        raise ValueError(f"that of {cut(wrong)!r} is no text")
+    return checksums
+
+
+Checksums = Annotated[dict[str, Any], AfterValidator(_texts)]
 
 
 class Digital(BaseModel):
@@ -45,7 +59,9 @@ class Shot(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    file: str = Field(min_length=1, description="name of the frame in the run's folder")
+    file: str = Field(
+        pattern=r"^[^/\\\x00]+$", max_length=255, description="name of the frame in the run's folder, without a path"
+    )
     row: int = Field(ge=0, description="column i of P_L")
     column: int = Field(ge=0, description="column j of P_R")
     sign: Literal[-1, 0, 1] = Field(description="0, or the half of a signed pattern")
@@ -56,9 +72,9 @@ class Patterns(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    P_L: tuple[tuple[Finite, ...], ...] = Field(description="(n, K) rows of P_L")
-    P_R: tuple[tuple[Finite, ...], ...] = Field(description="(n', K') rows of P_R")
-    captures: tuple[Shot, ...] = Field(description="every frame of the run")
+    P_L: Annotated[tuple[Row, ...], FailFast()] = Field(max_length=_MOST_PIXELS, description="(n, K) rows of P_L")
+    P_R: Annotated[tuple[Row, ...], FailFast()] = Field(max_length=_MOST_PIXELS, description="(n', K') rows of P_R")
+    captures: Annotated[tuple[Shot, ...], FailFast()] = Field(max_length=1 << 16, description="every frame of the run")
 
 
 class RunManifest(BaseModel):
@@ -69,7 +85,7 @@ class RunManifest(BaseModel):
     camera: dict[str, Any] = Field(description="identity that a calibration must share")
     digital: Digital = Field(description="how frames are read")
     patterns: Patterns = Field(description="what was projected")
-    checksums: dict[str, str] = Field(default={}, description="SHA-256 by file name, where known")
+    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
 
 
 class CalibrationManifest(BaseModel):
@@ -82,7 +98,7 @@ class CalibrationManifest(BaseModel):
     board_reflectance: float | None = Field(
         default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; None: unknown"
     )
-    checksums: dict[str, str] = Field(default={}, description="SHA-256 by file name, where known")
+    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
 
 
 @dataclass(frozen=True)
@@ -149,6 +165,8 @@ def read_calibration(folder: Path | str) -> Factors:
 
 def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -> None:
     """MitsimError when a file is not the one whose checksum was noted; files without one are taken as they are."""
+    if not (folder / name).resolve().is_relative_to(folder.resolve()):
+        raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
     expected = checksums.get(name)
     if expected is not None and checksum(folder / name) != expected:
         raise MitsimError(f"{folder / name}: not the file that was written (its checksum differs); {remedy}")
@@ -165,7 +183,8 @@ def check_fit(run: Measurements, factors: Factors, calibration: Path | str) -> N
             key = next(key for key in sorted({*ours, *theirs}) if ours.get(key) != theirs.get(key))
             part, ours, theirs = f"{part}.{key}", ours.get(key), theirs.get(key)
         raise MitsimError(
-            f"calibration {calibration}: {part} is {theirs}, but {run.folder} has {ours}; calibrate this camera"
+            f"calibration {calibration}: {cut(part)} is {cut(str(theirs))}, but {run.folder} has {cut(str(ours))}; "
+            "calibrate this camera"
         )
     for side, pattern, factor in (("P_L", run.left, factors.left), ("P_R", run.right, factors.right)):
         if len(pattern) != factor.shape[1]:
@@ -201,9 +220,9 @@ def _manifest(folder: Path, kind: str) -> dict[str, Any]:
     manifest = read_json(folder / "manifest.json")
     if not isinstance(manifest, dict) or manifest.get("kind") != kind:
         found = manifest.get("kind") if isinstance(manifest, dict) else type(manifest).__name__
-        raise MitsimError(f"{folder}: holds a {found}, not a {kind}; give the right folder")
+        raise MitsimError(f"{folder}: holds a {cut(str(found))}, not a {kind}; give the right folder")
     if manifest.get("status") != "complete":
-        raise MitsimError(f"{folder}: the {kind} is {manifest.get('status')}; finish it with --resume")
+        raise MitsimError(f"{folder}: the {kind} is {cut(str(manifest.get('status')))}; finish it with --resume")
     return manifest
 
 
@@ -243,11 +262,12 @@ def _check_captures(where: str, captures: tuple[Shot, ...], rows: int, columns: 
                 f"{where}: patterns.captures: pattern ({row}, {column}) has frames of signs {found}; "
                 "give one of sign 0, or one of +1 and one of -1"
             )
-    missing = [(i, j) for i in range(rows) for j in range(columns) if (i, j) not in signs]
+    missing = rows * columns - len(signs)
     if missing:
+        first = next((i, j) for i in range(rows) for j in range(columns) if (i, j) not in signs)
         raise MitsimError(
-            f"{where}: patterns.captures: {len(missing)} of {rows * columns} patterns have no frame, "
-            f"first {missing[0]}; capture them all"
+            f"{where}: patterns.captures: {missing} of {rows * columns} patterns have no frame, "
+            f"first {first}; capture them all"
         )
 
 

@@ -1,141 +1,158 @@
-"""A scene file's text in, a refusal or silence out: what Mitsuba would crash on, obey or silently accept.
+"""A scene file in, a refusal or the list of its files out: what Mitsuba would crash on, obey or silently accept.
 
-Loading a scene can run native code or overflow a stack, and it takes NaN, negative light or a reflectance of 2 without
-a word (DESIGN section 9), so the XML is read here first.
+Loading a scene can run native code, read any file or overflow a stack, and it takes NaN, negative light or a
+reflectance of 2 without a word (DESIGN section 9), so the XML and all files that it names are read here first.
+``reading`` gives the elements, ``vocabulary`` the words, ``sanity`` the numbers, ``files`` and ``headers`` the files.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from xml.etree import ElementTree
 
-from defusedxml import ElementTree as SafeTree
-from defusedxml.common import DefusedXmlException
+from mitsim.scene.files import SceneFiles
+from mitsim.scene.headers import MOST_TEXELS, check_image, check_obj, check_ply, read_spectrum
+from mitsim.scene.reading import DEEPEST, MOST_ELEMENTS, Element, read_scene
+from mitsim.scene.sanity import check_camera, check_numbers, check_reflectance, is_reflectance
+from mitsim.scene.vocabulary import check_words, is_plugin
 
-from mitsim.core.errors import MitsimError
-
-_DEEPEST = 16
-_RESERVED = ("path", "parallel", "update_scene", "variant")
-_NATIVE = (".so", ".dylib", ".dll")
-_NUMBERS = (
-    *("float", "integer", "point", "vector", "spectrum", "rgb"),
-    *("translate", "scale", "rotate", "lookat", "matrix"),
-)
-_LIGHT = ("spectrum", "rgb")
-_REFLECTANCES = (
-    *("reflectance", "diffuse_reflectance", "albedo", "base_color"),
-    *("specular_reflectance", "specular_transmittance"),
-)
+_IMAGES = ("bitmap", "envmap")
+_LARGEST_MATERIAL = 256
+"""Elements of one BSDF: all of them are compiled into every kernel."""
 
 
-def check_file(path: Path, defines: Mapping[str, str]) -> None:
-    """Refuse a scene file that must not reach Mitsuba, or that lacks a parameter named by ``-D``.
+def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> tuple[Path, ...]:
+    """Refuse a scene that must not reach Mitsuba, or that lacks a parameter named by ``-D``; else list its files.
+
+    The files are the scene, what it includes, its bitmaps, meshes and spectra, each once. They must lie in the scene's
+    folder unless ``outside`` is set.
 
     Raises
     ------
     MitsimError
-        for a file that is missing, no well-formed scene XML, too deeply nested, that loads native code, or holds a
-        number no scene can have; one line with the place and the value.
+        one line ``file:line: name: got VALUE in <tag ...>; what is allowed`` for content, or with the file alone where
+        no line is at fault.
     """
-    root = _parsed(path)
-    if root.tag != "scene":
-        raise MitsimError(f"{path}:1: the root element is <{root.tag}>; a Mitsuba scene starts with <scene>")
-    values = {element.get("name", ""): element.get("value", "") for element in root.iter("default")}
-    for name in defines:
-        if name not in values or name in _RESERVED:
-            raise MitsimError(
-                f"-D {name}={defines[name]}: {path} has no <default name={name!r}>; "
-                f"it knows {', '.join(sorted(values)) or 'none'}"
-            )
-    _check_content(path, root, {**values, **defines}, (path.resolve(),))
+    files = SceneFiles(path, outside)
+    root = read_scene(path, defines, files)
+    known: dict[str, Element] = {}
+    texels = 0
+    elements = [*_elements(root, None)]
+    for element, parent in elements:
+        check_words(element, parent)
+    for element, parent in elements:
+        check_numbers(element, parent)
+        _note(element, known)
+        if element.tag == "string":
+            _check_string(element, parent)
+        if element.tag == "spectrum" and "filename" in element.attributes:
+            for _, value in _spectrum(element, files):
+                if value < 0:
+                    raise element.refusal(element.name, value, "light is at least 0")
+        if is_plugin(element) and element.kind in (*_IMAGES, "ply", "obj"):
+            texels += _check_resource(element, files)
+            if texels > MOST_TEXELS:
+                raise element.refusal("texels", texels, f"all bitmaps together may have {MOST_TEXELS}")
+    _check_references(root, known)
+    for element, _ in elements:
+        if element.kind == "mitsim_lensless":
+            check_camera(element)
+        if is_reflectance(element.name):
+            meant = known[element.attributes["id"]] if element.tag == "ref" else element
+            check_reflectance(element.name, meant, lambda child: _spectrum(child, files))
+    return tuple(files.used)
 
 
-def _parsed(path: Path) -> ElementTree.Element:
-    if not path.is_file():
-        raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
+def _elements(element: Element, parent: Element | None) -> Iterator[tuple[Element, Element | None]]:
+    """Every element with its parent, in the order of the files; what a file includes belongs to who includes it."""
+    yield element, parent
+    for child in element.children:
+        yield from _elements(child, parent if element.tag == "include" else element)
+
+
+def _note(element: Element, known: dict[str, Element]) -> None:
+    """Remember an element's id, or its other name."""
+    name, meant = element.attributes.get("id", ""), element
+    if element.tag == "ref":
+        return
+    if element.tag == "alias":
+        if name not in known:
+            raise element.refusal("alias", repr(name), "give the id of an element above")
+        name, meant = element.attributes["as"], known[name]
+    if name in known:
+        raise element.refusal("id", repr(name), f"it is that of {known[name].path}:{known[name].line} already")
+    if name:
+        known[name] = meant
+
+
+def _check_string(element: Element, parent: Element | None) -> None:
+    """Texts that Mitsuba makes file names of."""
+    name, value = element.name, element.attributes["value"]
+    if name == "filename":
+        if parent is None or parent.kind not in (*_IMAGES, "ply", "obj"):
+            raise element.refusal(name, repr(value), "only bitmap, envmap, ply and obj read a file")
+    elif name == "material":
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", value):
+            raise element.refusal(name, repr(value), "give the name of a material, as Au")
+    elif "/" in value or ".." in value:
+        raise element.refusal(name, repr(value), "only filename may hold a path")
+
+
+def _check_resource(element: Element, files: SceneFiles) -> int:
+    """The file of a bitmap or mesh; number of texels."""
+    named = [child for child in element.children if child.tag == "string" and child.name == "filename"]
+    if len(named) != 1:
+        raise element.refusal("filename", f"{len(named)} of them", f"a {element.kind} reads one file")
+    (place,) = named
+    path = files.resource(place, place.attributes["value"])
     try:
-        _check_depth(path)
-        root: ElementTree.Element = SafeTree.parse(path, forbid_dtd=True).getroot()
-    except ElementTree.ParseError as error:
-        line, column = error.position
-        raise MitsimError(
-            f"{path}:{line}: not well-formed XML (column {column}: {str(error).split(':')[0]}); mend the file"
-        ) from None
-    except DefusedXmlException as error:
-        raise MitsimError(f"{path}: DTDs and entities are not allowed in a scene ({error}); remove them") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise MitsimError(f"{path}: cannot be read ({error}); check the file") from None
-    return root
+        if element.kind in _IMAGES:
+            return check_image(path)
+        (check_ply if element.kind == "ply" else check_obj)(path)
+    except (ValueError, OSError) as error:
+        raise place.refusal("filename", repr(place.attributes["value"]), f"the file {error}") from None
+    return 0
 
 
-def _check_depth(path: Path) -> None:
-    """Refuse deep nesting before anything recursive sees it: it overflows Mitsuba's stack, or takes for ever."""
-    depth = 0
-    for event, element in SafeTree.iterparse(path, events=("start", "end"), forbid_dtd=True):
-        depth += 1 if event == "start" else -1
-        if depth > _DEEPEST:
-            raise MitsimError(f"{path}: elements are nested over {_DEEPEST} deep (<{element.tag}>); flatten the scene")
+def _spectrum(element: Element, files: SceneFiles) -> list[tuple[float, float]]:
+    name = element.attributes["filename"]
+    path = files.included(element, name)
+    try:
+        return read_spectrum(path)
+    except (ValueError, OSError) as error:
+        raise element.refusal("filename", repr(name), f"the file {error}") from None
 
 
-def _check_content(path: Path, root: ElementTree.Element, values: Mapping[str, str], seen: tuple[Path, ...]) -> None:
-    """Native code, numbers, and the same for included files."""
-    # Mitsuba looks for a plugin it does not know in the folder "plugins" beside the scene.
-    for library in sorted((path.parent / "plugins").glob("*")):
-        if library.suffix in _NATIVE:
-            raise MitsimError(f"{path}: {library} would run native code; move it away from the scene")
-    for element in root.iter():
-        if element.tag == "path":
-            raise MitsimError(
-                f"{path}: <path value={element.get('value')!r}> can load native code; remove it and name files "
-                "relative to the scene"
-            )
-        if element.tag == "include":
-            _check_included(path, _substituted(element.get("filename", ""), values), values, seen)
-        if element.tag in _NUMBERS:
-            _check_numbers(path, element, values)
+def _check_references(root: Element, known: Mapping[str, Element]) -> None:
+    """References lead somewhere, never back, and what they unfold to is neither deep nor large."""
+    found: dict[int, tuple[int, int]] = {}
+    open_: set[int] = set()
 
+    def unfold(element: Element, depth: int) -> tuple[int, int]:
+        """Depth below the element, and number of elements, with references followed."""
+        if element.tag == "ref":
+            name = element.attributes["id"]
+            if name not in known:
+                raise element.refusal("ref", repr(name), "no element has this id")
+            if id(known[name]) in open_:
+                raise element.refusal("ref", repr(name), "it comes back to itself; remove it")
+        if id(element) not in found:
+            below = [known[element.attributes["id"]]] if element.tag == "ref" else element.children
+            if depth > 2 * DEEPEST:
+                raise element.refusal("nesting", f"over {DEEPEST} levels", "flatten the scene")
+            open_.add(id(element))
+            parts = [unfold(child, depth + 1) for child in below]
+            open_.discard(id(element))
+            own = 0 if element.tag in ("ref", "include") else 1
+            sides = 2 if element.kind == "twosided" else 1  # each side is a copy
+            deepest = max((part[0] for part in parts), default=0)
+            found[id(element)] = own + deepest, own + sides * sum(part[1] for part in parts)
+        levels, size = found[id(element)]
+        most = _LARGEST_MATERIAL if element.tag == "bsdf" else MOST_ELEMENTS
+        if levels > DEEPEST or size > most:
+            got = f"{levels} levels of {size} elements with references followed"
+            raise element.refusal("nesting", got, f"{DEEPEST} levels and {most} elements are allowed")
+        return levels, size
 
-def _check_included(path: Path, filename: str, values: Mapping[str, str], seen: tuple[Path, ...]) -> None:
-    included = path.parent / filename
-    if included.resolve() in seen:
-        raise MitsimError(f"{path}: <include filename={filename!r}> comes back to itself; remove one of the two")
-    if not included.is_file():
-        raise MitsimError(f"{path}: <include filename={filename!r}>: no such file in {path.parent}; mend the name")
-    root = _parsed(included)
-    own = {element.get("name", ""): element.get("value", "") for element in root.iter("default")}
-    _check_content(included, root, {**own, **values}, (*seen, included.resolve()))
-
-
-def _check_numbers(path: Path, element: ElementTree.Element, values: Mapping[str, str]) -> None:
-    """Numbers are finite, light is not negative, and a reflectance is at most 1."""
-    name = element.get("name", element.tag)
-    for key, text in element.items():
-        if key in ("name", "id", "filename"):
-            continue
-        for number in _numbers(_substituted(text, values)):
-            rule = ""
-            if not math.isfinite(number):
-                rule = "give a finite number"
-            elif number < 0 and element.tag in _LIGHT:
-                rule = "give a number of at least 0"
-            elif number > 1 and element.tag in _LIGHT and name in _REFLECTANCES:
-                rule = "nothing reflects more than 1"
-            if rule:
-                raise MitsimError(f"{path}: {name}: got {number:g} in <{element.tag} {key}={text!r}>; {rule}")
-
-
-def _numbers(text: str) -> Iterator[float]:
-    """The numbers in an attribute: separated by blanks or commas, and after the colon of a wavelength."""
-    for word in re.split(r"[\s,]+", text):
-        try:
-            yield float(word.rpartition(":")[2])
-        except ValueError:
-            continue
-
-
-def _substituted(text: str, values: Mapping[str, str]) -> str:
-    """The text with ``$name`` replaced as Mitsuba does it."""
-    return re.sub(r"\$(\w+)", lambda match: values.get(match[1], match[0]), text)
+    unfold(root, 0)

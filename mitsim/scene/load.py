@@ -25,10 +25,11 @@ class LoadedScene:
     ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
     pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
     other emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions, ``glossy``
-    whether one does in lobes.
+    whether one does in lobes. ``files`` lists all that Mitsuba read, the scene first.
     """
 
     path: Path
+    files: tuple[Path, ...]
     scene: Any
     camera: Any
     projector: Any
@@ -45,8 +46,12 @@ class LoadedScene:
         return self.grid
 
 
-def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_projector: bool = True) -> LoadedScene:
+def load_scene(
+    path: Path, defines: Mapping[str, str] | None = None, needs_projector: bool = True, outside: bool = False
+) -> LoadedScene:
     """Load a scene XML into the current variant; the plugin ``mitsim_lensless`` must be registered.
+
+    Files outside the scene's folder are read only when ``outside`` is set.
 
     Raises
     ------
@@ -54,14 +59,16 @@ def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_proje
         one line that names the file for anything wrong with it.
     """
     defines = dict(defines or {})
-    check_file(path, defines)
+    files = check_file(path, defines, outside)
     try:
         # Without optimize, for that merges rectangles of one material into a mesh that has lost their boxes and names.
         scene = mi.load_file(str(path), parallel=False, optimize=False, **defines)
     except MitsimError:
         raise
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise MitsimError(f"{path}: Mitsuba refuses the scene: {_one_line(error)}") from None
+        line = re.search(r"\(line (\d+), col", str(error))
+        place = f"{path}:{line[1]}" if line and str(path) in str(error) else path
+        raise MitsimError(f"{place}: Mitsuba refuses the scene: {_one_line(error)}") from None
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
@@ -72,14 +79,14 @@ def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_proje
         if scale < 0:
             raise MitsimError(f"{path}: the projector's scale: got {scale:g}; light is at least 0")
     if not needs_projector:
-        return LoadedScene(path, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
+        return LoadedScene(path, files, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
     if len(projectors) != 1:
         raise MitsimError(
             f'{path}: {len(projectors)} emitters of type "projector"; coded illumination needs exactly one'
         )
     grid = locate_projector(str(path), projectors[0], cameras[0])
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
-    return LoadedScene(path, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
+    return LoadedScene(path, files, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
 
 
 def _polished(scene: Any) -> tuple[bool, bool]:

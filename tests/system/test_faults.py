@@ -153,7 +153,7 @@ def test_a_read_only_disk_is_refused_before_work(refused: Callable[..., str], la
 def test_two_runs_on_one_folder(call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path) -> None:
     """The second is refused while the first writes, whatever its options; the first does not notice."""
     run = tmp_path / "run"
-    process = running(0, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS)
+    process = running(20, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS)
     worker = psutil.Process(process.pid).children()[0]
     worker.suspend()
     for options in ((), ("--resume",)):

@@ -119,15 +119,19 @@ def replaced(path: Path, old: str, new: str) -> Path:
         ('value="separable"', 'value="seperable"', ["mask: got 'seperable'", "flatcam", "line 4"]),
         ('"mask_distance" value="2"', '"mask_distance" value="nan"', ["mask_distance: got nan", "finite"]),
         ('"mask_distance" value="2"', '"mask_distance" value="-2"', ["mask_distance: got -2"]),
-        ('"mask_distance" value="2"', '"mask_distance" value="two"', ['"two"', "line 10"]),
-        ('"mask_distance" value="2"', '"mask_distance" value="500"', ["'mask_distance': 500.0"]),
+        ('"mask_distance" value="2"', '"mask_distance" value="two"', [":10: mask_distance: got 'two'", "a number"]),
+        (
+            '"mask_distance" value="2"',
+            '"mask_distance" value="500"',
+            [":10: mask_distance: got 500", "scene_distance, 400 mm"],
+        ),
         ('"mask_order" value="9"', '"mask_order" value="17"', ["mask_order: got 17"]),
         ('"fov" value="20"', '"fov" value="180"', ["fov: got 180"]),
         ('"max_depth"', '"max_dept"', ["max_dept", "line 3"]),
         ('"width" value="64"', '"width" value="32"', ["32x64", "square"]),
         ('rfilter type="box"', 'rfilter type="gaussian"', ["rfilter type='box'"]),
         ("small_projector.png", "nope.png", ["nope.png"]),
-        ('"mitsim_lensless"', '"mitsim_lenless"', ["mitsim_lenless", "not found"]),
+        ('"mitsim_lensless"', '"mitsim_lenless"', [":4: type: got 'mitsim_lenless'", "mean mitsim_lensless"]),
     ],
 )
 def test_a_bad_parameter_is_named(small_scene: Write, old: str, new: str, fragments: list[str]) -> None:

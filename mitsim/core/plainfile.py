@@ -1,0 +1,37 @@
+"""Files that others wrote: a path in, its bytes out, of a plain file no larger than it may be."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from mitsim.core.errors import MitsimError
+
+
+def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
+    """The status of a plain file. MitsimError when it cannot be looked at, or is a folder, pipe or device, from which
+    reading may never end."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise MitsimError(f"{what} {path}: cannot be read ({reason}); check the path") from error
+    if stat.S_ISDIR(status.st_mode):
+        raise MitsimError(f"{what} {path}: cannot be read (Is a directory); check the path")
+    if not stat.S_ISREG(status.st_mode):
+        raise MitsimError(f"{what} {path}: cannot be read (a pipe or device, no plain file); check the path")
+    return status
+
+
+def read_text(path: Path | str, most: int) -> str:
+    """The UTF-8 text of a plain file. MitsimError as ``check_plain``, and for over ``most`` bytes; ValueError when it
+    is no UTF-8."""
+    size = check_plain(path).st_size
+    if size > most:
+        raise MitsimError(f"file {path}: has {size} bytes; at most {most} are allowed")
+    try:
+        with open(path, "rb") as file:
+            return file.read(most).decode("utf-8")
+    except OSError as error:
+        raise MitsimError(f"file {path}: cannot be read ({error.strerror}); check the path") from error

@@ -1,0 +1,214 @@
+"""What the files of a scene claim to hold, read before Mitsuba allocates it: images, meshes, spectra.
+
+Each function raises ValueError with a sentence that completes "the file ...", or OSError.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core import exr
+
+MOST_TEXELS = 1 << 25
+"""An environment map of 8192 x 4096."""
+FARTHEST = 1e7
+"""Largest coordinate [mm], 10 km: single precision resolves 1 mm there."""
+_HEADER = 1 << 16
+_PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float": "f4",
+    "double": "f8",
+    "float32": "f4",
+    "float64": "f8",
+}
+_MOST_TEXT = 64 << 20
+
+
+def check_image(path: Path) -> int:
+    """Number of texels of a PNG, JPEG, OpenEXR, Radiance (.hdr) or PFM image."""
+    with open(path, "rb") as file:
+        start = file.read(_HEADER)
+    if start.startswith(b"\x89PNG\r\n\x1a\n") and start[12:16] == b"IHDR":
+        width, height = struct.unpack(">II", start[16:24])
+    elif start.startswith(exr.MAGIC):
+        header = exr.read_header(path)
+        width, height = header.width, header.height
+    elif start.startswith(b"\xff\xd8\xff"):
+        width, height = _jpeg(path)
+    elif found := re.match(rb"#\?[^\n]*\n(?:[^\n]*\n){0,99}?\n?-Y (\d{1,9}) \+X (\d{1,9})\n", start):
+        height, width = int(found[1]), int(found[2])
+    elif found := re.match(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s+", start):
+        width, height = int(found[1]), int(found[2])
+    else:
+        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
+    if width * height == 0 or width * height > MOST_TEXELS:
+        raise ValueError(f"has {width}x{height} texels; 1 to {MOST_TEXELS} are allowed")
+    return int(width * height)
+
+
+def check_ply(path: Path) -> None:
+    """A PLY mesh of triangles whose corners exist and lie within ``FARTHEST``; Mitsuba reads beyond its arrays else."""
+    with open(path, "rb") as file:
+        start = file.read(_HEADER)
+        found = re.match(rb"ply\r?\n.*?\nend_header\r?\n", start, re.DOTALL)
+        if not found:
+            raise ValueError("is no PLY mesh; its header must end within 64 KiB")
+        file.seek(found.end())
+        body = file.read()
+    order, vertices, faces = _ply_header(found[0])
+    count, corners = (vertices[0], faces[0])
+    if order is None:
+        points, indices = _ply_text(body, vertices, faces)
+    else:
+        points, indices = _ply_binary(body, order, vertices, faces)
+    _check_points(points)
+    if corners and (indices.min() < 0 or indices.max() >= count):
+        named = f"{indices.min()} to {indices.max()}"
+        raise ValueError(f"has faces with vertices {named}, but {count} vertices; mend the mesh")
+
+
+def check_obj(path: Path) -> None:
+    """A Wavefront mesh whose vertices are finite numbers within ``FARTHEST``; Mitsuba itself checks the faces."""
+    if path.stat().st_size > _MOST_TEXT:
+        raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
+    with open(path, "rb") as file:
+        words = [line.split()[1:4] for line in file if line.split()[:1] == [b"v"]]
+    try:
+        points = np.array(words, dtype=np.float64)
+    except ValueError:
+        raise ValueError("holds vertices that are not three numbers; export the mesh again") from None
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError("is no Wavefront mesh: it has no vertices of three numbers")
+    _check_points(points)
+
+
+def read_spectrum(path: Path) -> list[tuple[float, float]]:
+    """Wavelengths [nm] and values of a text file with two numbers a line; ``#`` begins a comment."""
+    if path.stat().st_size > 1 << 20:
+        raise ValueError("is over 1 MiB; a spectrum is smaller")
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        pairs = [tuple(map(float, line.split())) for line in lines if line.strip() and not line.startswith("#")]
+    except ValueError:
+        raise ValueError("is no spectrum; give two numbers a line, wavelength in nm and value") from None
+    if len(pairs) < 2 or any(len(pair) != 2 or not all(map(math.isfinite, pair)) for pair in pairs):
+        raise ValueError("is no spectrum; give two finite numbers a line, wavelength in nm and value")
+    return [(pair[0], pair[1]) for pair in pairs]
+
+
+def _check_points(points: npt.NDArray[np.float64]) -> None:
+    if not np.isfinite(points).all() or np.abs(points).max(initial=0) > FARTHEST:
+        raise ValueError(f"has vertices that are not finite or beyond {FARTHEST:g} mm; mend the mesh")
+
+
+def _jpeg(path: Path) -> tuple[int, int]:
+    """Width and height in the first start-of-frame segment."""
+    data = path.read_bytes()
+    place = 2
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[place + 5 : place + 9])
+            return width, height
+        place += 2 + length
+    raise ValueError("is a damaged JPEG image; save it again")
+
+
+_Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
+"""Coordinates, and the corners of each triangle."""
+_Part = tuple[int, list[tuple[str, str]]]
+"""Number of an element and its properties: name and type; a list has the types of its length and of its items."""
+
+
+def _ply_header(header: bytes) -> tuple[str | None, _Part, _Part]:
+    """Byte order (None: text), vertices and faces as the header says."""
+    order: str | None = ""
+    parts: dict[str, _Part] = {}
+    for line in header.split(b"\n")[1:-2]:
+        # Split as C does: text has further blanks and line ends, which Mitsuba would not take for such.
+        words = [word.decode("ascii", "replace") for word in line.split()]
+        kinds = words[2:4] if words[:2] == ["property", "list"] else words[1:2]
+        match words:
+            case ["comment" | "obj_info", *_] | []:
+                continue
+            case ["format", name, _]:
+                order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}.get(name, "")
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,9}", count) and name not in parts:
+                parts[name] = int(count), []
+            case ["property", *_, name] if parts and len(words) in (3, 5) and {*kinds} <= _PLY_TYPES.keys():
+                parts[[*parts][-1]][1].append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
+            case _:
+                raise ValueError(
+                    f"has a header line that is not understood ({' '.join(words)[:40]!r}); export the mesh again"
+                )
+    if order == "" or [*parts] != ["vertex", "face"]:
+        raise ValueError("has elements other than vertex and face, or no format; export vertices and triangles alone")
+    vertices, faces = parts["vertex"], parts["face"]
+    names = [name for name, _ in (*vertices[1], *faces[1])]
+    lists = [name for name, kind in faces[1] if " " in kind]
+    if len({*names}) != len(names) or names[:3] != ["x", "y", "z"] or any(" " in kind for _, kind in vertices[1]):
+        raise ValueError("has properties other than x, y, z and further numbers for a vertex; export the mesh again")
+    if lists not in (["vertex_index"], ["vertex_indices"]):
+        raise ValueError("has faces without one list vertex_indices; export triangles")
+    return order, vertices, faces
+
+
+def _ply_binary(body: bytes, order: str, vertices: _Part, faces: _Part) -> _Mesh:
+    vertex = np.dtype([(name, order + kind) for name, kind in vertices[1]])
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+    for name, kind in faces[1]:
+        if " " in kind:
+            length, item = kind.split()
+            fields += [("corners", order + length), ("indices", order + item, (3,))]
+        else:
+            fields.append((name, order + kind))
+    face = np.dtype(fields)
+    middle = vertices[0] * vertex.itemsize
+    if middle + faces[0] * face.itemsize > len(body):
+        raise ValueError(
+            f"claims {vertices[0]} vertices and {faces[0]} triangles, more than its bytes hold; export the mesh again"
+        )
+    points = np.frombuffer(body, vertex, vertices[0])
+    triangles = np.frombuffer(body, face, faces[0], offset=middle)
+    if (triangles["corners"] != 3).any():
+        raise ValueError("has faces that are no triangles; export triangles")
+    coordinates = np.stack([points[axis].astype(np.float64) for axis in "xyz"])
+    return coordinates, triangles["indices"].astype(np.int64)
+
+
+def _ply_text(body: bytes, vertices: _Part, faces: _Part) -> _Mesh:
+    if len(body) > _MOST_TEXT:
+        raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary")
+    middle = vertices[0] * len(vertices[1])
+    after = [kind for _, kind in faces[1]]
+    width = len(after) + 3
+    words = body.split()
+    if len(words) < middle + faces[0] * width or " " not in after[0]:
+        raise ValueError(
+            f"claims {vertices[0]} vertices and {faces[0]} triangles, more than its text holds; export the mesh again"
+        )
+    try:
+        points = np.array(words[:middle], dtype=np.float64).reshape(vertices[0], -1)
+        triangles = np.array(words[middle : middle + faces[0] * width]).astype(np.float64).reshape(faces[0], width)
+    except ValueError:
+        raise ValueError("holds words that are no numbers; export the mesh again") from None
+    if (triangles[:, 0] != 3).any() or not np.isfinite(triangles).all():
+        raise ValueError("has faces that are no triangles; export triangles")
+    return points[:, :3].T, triangles[:, 1:4].astype(np.int64)

@@ -1,0 +1,464 @@
+"""Hostile RUN and CAL folders, frames and TOML files: refused in one line, in bounded memory and time.
+
+The good folder is a camera of 8 x 8 pixels with 2 x 2 patterns, made here; each case damages one file of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import struct
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mitsim.core.configuration import read_toml
+from mitsim.core.errors import MitsimError
+from mitsim.core.frames import read_frame, write_frame
+from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run
+from mitsim.sensor.model import load_sensor
+
+LONGEST = 5.0
+ROOM = 3 << 30
+"""Bytes of address space beyond what the process has when a case starts; the frames here need 1 kB."""
+PIXELS, SIDE = 8, 4
+Damage = Callable[[Path], object]
+
+
+def make(folder: Path) -> tuple[Path, Path]:
+    """A good run and a good calibration."""
+    run, calibration = folder / "run", folder / "cal"
+    run.mkdir()
+    calibration.mkdir()
+    rng = np.random.default_rng(4)
+    captures = []
+    for row in range(2):
+        for column in range(2):
+            name = f"frame_{row}{column}.exr"
+            write_frame(run / name, {"DN": rng.integers(100, 4000, (PIXELS, PIXELS), dtype=np.uint32)}, {"index": row})
+            captures.append({"file": name, "row": row, "column": column, "sign": 0})
+    patterns = np.eye(2)[np.arange(SIDE) % 2].tolist()
+    manifest = {
+        "kind": "capture",
+        "status": "complete",
+        "camera": {"name": "bench"},
+        "digital": {"exposure_s": 0.02, "black_level_dn": 40, "gain_dn_per_e": 0.1, "dark_current_e_per_s": 1},
+        "patterns": {"P_L": patterns, "P_R": patterns, "captures": captures},
+    }
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    for name in ("left", "right"):
+        write_frame(calibration / f"{name}.exr", {"factor": rng.random((PIXELS, SIDE), dtype=np.float32)}, {})
+    (calibration / "manifest.json").write_text(
+        json.dumps({"kind": "calibration", "status": "complete", "camera": {"name": "bench"}})
+    )
+    return run, calibration
+
+
+def solved(run: Path, calibration: Path) -> None:
+    """All that `mitsim reconstruct` reads."""
+    measurements, factors = read_run(run), read_calibration(calibration)
+    check_fit(measurements, factors, calibration)
+    load(measurements, factors)
+
+
+@pytest.fixture
+def bounded() -> Iterator[None]:
+    """Address space that ends ``ROOM`` above what is in use: a claim that is believed fails as MemoryError."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def refusal(work: Callable[[], object]) -> str:
+    started = time.perf_counter()
+    with pytest.raises(MitsimError) as caught:
+        work()
+    assert time.perf_counter() - started < LONGEST
+    message = str(caught.value)
+    assert message.isprintable() and len(message) <= 1500
+    return message
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    return make(tmp_path)
+
+
+def test_the_good_folders_are_read(folders: tuple[Path, Path]) -> None:
+    solved(*folders)
+
+
+# ---- manifests -------------------------------------------------------------------------------------------------------
+
+
+def raw(content: str | bytes) -> Damage:
+    return lambda path: path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def put(*keys: str | int, value: object) -> Damage:
+    def change(path: Path) -> None:
+        manifest = item = json.loads(path.read_text())
+        for key in keys[:-1]:
+            item = item[key]
+        item[keys[-1]] = value
+        path.write_text(json.dumps(manifest))
+
+    return change
+
+
+def text(old: str, new: str) -> Damage:
+    def change(path: Path) -> None:
+        content = path.read_text()
+        assert old in content
+        path.write_text(content.replace(old, new, 1))
+
+    return change
+
+
+def pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def sparse(path: Path) -> None:
+    os.truncate(path, 1 << 40)
+
+
+def folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def linked(to: str) -> Damage:
+    def change(path: Path) -> None:
+        path.unlink()
+        path.symlink_to(to)
+
+    return change
+
+
+FILE = ("patterns", "captures", 1, "file")
+P_L = ("patterns", "P_L")
+BOTH = {
+    "empty": (raw(""), "not valid JSON"),
+    "cut short": (raw('{"kind": "capt'), "not valid JSON"),
+    "no UTF-8": (raw(b'{"kind": "\xff\xfe"}'), "not valid JSON"),
+    "UTF-16": (raw('{"kind": 1}'.encode("utf-16")), "not valid JSON"),
+    "zero bytes": (raw(b"\0" * 4096), "not valid JSON"),
+    "deep arrays": (raw("[" * 1_000_000), "nested too deep"),
+    "deep objects": (raw('{"a":' * 500_000), "nested too deep"),
+    "a number of a million digits": (raw("9" * 1_000_000), "not valid JSON"),
+    "an array": (raw("[1, 2]"), "holds a list"),
+    "a number": (raw("1e400"), "holds a float"),
+    "null": (raw("null"), "holds a NoneType"),
+    "huge": (sparse, "at most 16777216"),
+    "a pipe": (pipe, "pipe or device"),
+    "a folder": (folder, "Is a directory"),
+    "a device": (linked("/dev/zero"), "pipe or device"),
+    "a link to itself": (linked("manifest.json"), "cannot be read"),
+    "key twice": (text('"status"', '"status": "complete", "status"'), "'status' is there twice"),
+    "kind of 10 MB": (put("kind", value="k" * 10_000_000), "..."),
+    "kind of several lines": (put("kind", value="a\nb\x1b[31m"), "holds a a b"),
+    "status of several lines": (put("status", value="a\n" * 999), "..."),
+    "camera is a list": (put("camera", value=[1]), "camera: got [1]"),
+    "checksums of numbers": (
+        put("checksums", value={"x": 3}),
+        "checksums: got {'x': 3}, value error, that of 'x' is no text",
+    ),
+    "200000 false checksums": (put("checksums", value=dict.fromkeys(map(str, range(200_000)), 1)), "checksums: got"),
+    "wrong checksum": (put("checksums", value={"left.exr": "0", "frame_01.exr": "0"}), "its checksum differs"),
+    "another camera of 10 MB": (put("camera", value={"name": "x" * 10_000_000}), "name is"),
+    "another camera of several lines": (put("camera", value={"na\nme": "x"}), "calibrate this camera"),
+}
+RUN = {
+    "file above": (put(*FILE, value="../cal/left.exr"), "captures.1.file"),
+    "absolute file": (put(*FILE, value="/etc/passwd"), "captures.1.file"),
+    "file in a folder": (put(*FILE, value="sub/a.exr"), "captures.1.file"),
+    "file with a backslash": (put(*FILE, value="..\\a.exr"), "captures.1.file"),
+    "file with a zero": (put(*FILE, value="a\0.exr"), "captures.1.file"),
+    "file ..": (put(*FILE, value=".."), "leads out of its folder"),
+    "file .": (put(*FILE, value="."), "Is a directory"),
+    "file without name": (put(*FILE, value=""), "captures.1.file"),
+    "file of 5000 letters": (put(*FILE, value="n" * 5000), "captures.1.file"),
+    "file is the manifest": (put(*FILE, value="manifest.json"), "not an OpenEXR file"),
+    "file is a number": (put(*FILE, value=7), "captures.1.file"),
+    "missing file": (put(*FILE, value="none.exr"), "No such file"),
+    "row beyond": (put("patterns", "captures", 1, "row", value=2), "pattern (2, 1)"),
+    "negative row": (put("patterns", "captures", 1, "row", value=-1), "captures.1.row"),
+    "row of 10^30": (
+        put("patterns", "captures", 1, "row", value=10**30),
+        "pattern (1000000000000000000000000000000, 1)",
+    ),
+    "row is true": (put("patterns", "captures", 1, "row", value="true"), "captures.1.row"),
+    "sign 2": (put("patterns", "captures", 1, "sign", value=2), "captures.1.sign"),
+    "pattern twice": (put("patterns", "captures", 1, "column", value=0), "frames of signs [0, 0]"),
+    "no captures": (put("patterns", "captures", value=[]), "4 of 4 patterns"),
+    "captures are a number": (put("patterns", "captures", value=10**9), "captures: got 1000000000"),
+    "10^12 patterns": (
+        lambda path: [put("patterns", side, value=[[0] * 10**6])(path) for side in ("P_L", "P_R")],
+        "P_L.0: got [0, 0, 0, 0, 0, 0, ...], tuple should have at most 4096 items",
+    ),
+    "16 million patterns": (
+        lambda path: [put("patterns", side, value=[[0] * 4096])(path) for side in ("P_L", "P_R")],
+        "16777212 of 16777216 patterns have no frame, first (0, 2)",
+    ),
+    "60000 captures of one pattern": (
+        put("patterns", "captures", value=[{"file": "a", "row": 0, "column": 0, "sign": 0}] * 60_000),
+        "frames of signs",
+    ),
+    "a million captures": (raw('{"patterns": {"captures": [' + "0," * 1_000_000 + "0]}}"), "holds a None"),
+    "a million false captures": (text('"captures": [', '"captures": [' + "0," * 1_000_000), "captures.0: got 0"),
+    "a million false weights": (text('"P_L": [', '"P_L": [' + "{}," * 1_000_000), "P_L.0: got {}"),
+    "huge weight": (put(*P_L, 0, 0, value=1e300), "P_L.0.0: got 1e+300"),
+    "weight beyond floats": (text('"P_L": [[1.0', '"P_L": [[1e400'), "P_L.0.0: got inf"),
+    "weight not a number": (text('"P_L": [[1.0', '"P_L": [[NaN'), "P_L.0.0: got nan"),
+    "weight of text": (put(*P_L, 0, 0, value="x"), "P_L.0.0: got 'x'"),
+    "ragged weights": (put(*P_L, 0, value=[1]), "rows of 1, 2 numbers"),
+    "no weights": (put(*P_L, value=[]), "rows of no numbers"),
+    "deep weights": (put(*P_L, value=[[[[[1]]]]]), "P_L.0.0"),
+    "too many scene pixels": (put(*P_L, value=[[1, 0], [0, 1]] * 4), "8 scene pixels"),
+    "exposure 0": (put("digital", "exposure_s", value=0), "exposure_s: got 0"),
+    "exposure 1e-300": (put("digital", "exposure_s", value=1e-300), "exposure_s: got 1e-300"),
+    "exposure beyond floats": (text('"exposure_s": 0.02', '"exposure_s": 1e999'), "exposure_s: got inf"),
+    "gain not a number": (text('"gain_dn_per_e": 0.1', '"gain_dn_per_e": NaN'), "gain_dn_per_e: got nan"),
+    "negative black level": (put("digital", "black_level_dn", value=-1), "black_level_dn: got -1"),
+    "digital is null": (put("digital", value=None), "digital: got None"),
+}
+CAL = {
+    "board above 1": (put("board_reflectance", value=2), "board_reflectance: got 2"),
+    "centre is text": (put("centre", value="yes"), "centre: got 'yes'"),
+}
+
+
+@pytest.mark.usefixtures("bounded")
+@pytest.mark.parametrize("which", ["run", "cal"])
+@pytest.mark.parametrize("name", BOTH)
+def test_a_hostile_manifest(folders: tuple[Path, Path], name: str, which: str) -> None:
+    damage, words = BOTH[name]
+    damage(folders[which == "cal"] / "manifest.json")
+    assert words in refusal(lambda: solved(*folders))
+
+
+@pytest.mark.usefixtures("bounded")
+@pytest.mark.parametrize("name", RUN)
+def test_a_hostile_run(folders: tuple[Path, Path], name: str) -> None:
+    damage, words = RUN[name]
+    damage(folders[0] / "manifest.json")
+    assert words in refusal(lambda: solved(*folders))
+
+
+@pytest.mark.parametrize("name", CAL)
+def test_a_hostile_calibration(folders: tuple[Path, Path], name: str) -> None:
+    damage, words = CAL[name]
+    damage(folders[1] / "manifest.json")
+    assert words in refusal(lambda: solved(*folders))
+
+
+@pytest.mark.parametrize("name", ["run/frame_01.exr", "cal/left.exr"])
+def test_a_link_out_of_the_folder(folders: tuple[Path, Path], tmp_path: Path, name: str) -> None:
+    """Also to a good frame: a folder that was handed on must not show other files of its reader."""
+    path = tmp_path / name
+    path.rename(tmp_path / "away.exr")
+    path.symlink_to(tmp_path / "away.exr")
+    assert "leads out of its folder" in refusal(lambda: solved(*folders))
+
+
+# ---- frames ----------------------------------------------------------------------------------------------------------
+
+
+def exr_file(window: tuple[int, int, int, int] = (0, 0, 7, 7), **changes: Any) -> bytes:
+    """An OpenEXR file of one float32 channel "DN", written byte by byte; ``changes`` put lies into it.
+
+    After the OpenEXR file layout: magic, version and flags, attributes, chunk table, chunks of one line each.
+    """
+
+    def attribute(name: str, kind: str, value: bytes, length: int | None = None) -> bytes:
+        size = struct.pack("<i", len(value) if length is None else length)
+        return name.encode() + b"\0" + kind.encode() + b"\0" + size + value
+
+    box = struct.pack("<4i", *window)
+    channel = changes.get(
+        "channel", b"DN\0" + struct.pack("<iiii", changes.get("pixel", 2), 0, *changes.get("sampling", (1, 1)))
+    )
+    header = struct.pack("<II", 20000630, changes.get("flags", 2))
+    header += attribute("channels", "chlist", channel * changes.get("times", 1) + b"\0", changes.get("length"))
+    header += attribute("compression", "compression", bytes([changes.get("compression", 0)]))
+    header += attribute("dataWindow", changes.get("box", "box2i"), box) + attribute("displayWindow", "box2i", box)
+    header += attribute("lineOrder", "lineOrder", b"\0") + attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
+    header += attribute("screenWindowCenter", "v2f", bytes(8)) + attribute(
+        "screenWindowWidth", "float", struct.pack("<f", 1)
+    )
+    header += changes.get("more", b"") + b"\0"
+    lines, line = changes.get("lines", 8), struct.pack("<8f", *range(8))
+    start = len(header) + 8 * lines + changes.get("shift", 0)
+    table = b"".join(struct.pack("<Q", start + i * (8 + len(line))) for i in range(lines))
+    chunks = b"".join(struct.pack("<ii", i, changes.get("size", len(line))) + line for i in range(lines))
+    return header + table + chunks
+
+
+def text_attribute(name: str, value: bytes) -> bytes:
+    return f"{name}\0string\0".encode() + struct.pack("<i", len(value)) + value
+
+
+FRAMES = {
+    "empty": (b"", "not an OpenEXR file"),
+    "text": (b"hello", "not an OpenEXR file"),
+    "magic alone": (exr_file()[:4], "not an OpenEXR file"),
+    "cut in the header": (exr_file()[:100], "more than the header holds"),
+    "cut in the table": (exr_file()[:-350], "more than its"),
+    "cut in the last line": (exr_file()[:-1], "more than its"),
+    "2^31 pixels": (exr_file((0, 0, 65535, 32767)), "65536x32768"),
+    "2^62 pixels": (exr_file((-(2**31), -(2**31), 2**31 - 1, 2**31 - 1)), "4294967296"),
+    "2^31 pixels, compressed": (exr_file((0, 0, 16383, 16383), compression=3), "16384x16384"),
+    "window turned round": (exr_file((7, 7, 0, 0)), "-6x-6"),
+    "window of another type": (exr_file(box="box2f"), "dataWindow"),
+    "tiled": (exr_file(flags=2 | 0x200), "tiled"),
+    "deep": (exr_file(flags=2 | 0x800), "deep"),
+    "of several parts": (exr_file(flags=2 | 0x1000), "several parts"),
+    "version 77": (exr_file(flags=77), "version 77"),
+    "compression 99": (exr_file(compression=99), "compression 99"),
+    "pixels of type 9": (exr_file(pixel=9), "type 9"),
+    "sampling 0": (exr_file(sampling=(0, 0)), "sampling 0x0"),
+    "sampling 2": (exr_file(sampling=(2, 2)), "sampling 2x2"),
+    "no channels": (exr_file(channel=b""), "no channels"),
+    "1000 channels": (exr_file(times=1000), "longer than 64"),
+    "attribute of -1 bytes": (exr_file(length=-1), "claims -1 bytes"),
+    "attribute of 2 GB": (exr_file(length=2**31 - 1), "more than the header holds"),
+    "attribute twice": (exr_file(more=text_attribute("a", b"1") * 2), "twice"),
+    "header without end": (exr_file()[:60] + b"x" * 5000, "cut short"),
+    "chunks far away": (exr_file(shift=2**40), "table of offsets"),
+    "chunks in the header": (exr_file(shift=-300), "table of offsets"),
+    "chunks of -1 bytes": (exr_file(size=-1), "damaged"),
+    "chunks of 2 GB": (exr_file(size=2**31 - 1), "damaged"),
+    "metadata that is no JSON": (exr_file(more=text_attribute("mitsim.run", b"{")), "damaged"),
+    "metadata deeply nested": (exr_file(more=text_attribute("mitsim.run", b"[" * 100_000)), "nested too deep"),
+    "metadata that is a list": (exr_file(more=text_attribute("mitsim.run", b"[1]")), "no text or number"),
+    "metadata that is no text": (exr_file(more=b"mitsim.run\0int\0\x04\0\0\0\1\0\0\0"), "damaged"),
+    "metadata of no UTF-8": (exr_file(more=text_attribute("mitsim.run", b"\xff\xfe")), "damaged"),
+    "zeros after the magic": (exr_file()[:8] + bytes(4096), "dataWindow"),
+}
+
+
+def test_the_file_written_by_hand_is_good(tmp_path: Path) -> None:
+    """Without its lie, each file below is a frame: what is refused is the lie."""
+    (tmp_path / "a.exr").write_bytes(exr_file(more=text_attribute("mitsim.run", b'"x"')))
+    channels, metadata = read_frame(tmp_path / "a.exr")
+    assert np.array_equal(channels["DN"], np.tile(np.arange(8, dtype=np.float32), (8, 1))) and metadata == {"run": "x"}
+
+
+@pytest.mark.usefixtures("bounded")
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_hostile_frame(folders: tuple[Path, Path], capfd: pytest.CaptureFixture[str], name: str) -> None:
+    """Refused with the file's name; OpenEXR says nothing beside."""
+    content, words = FRAMES[name]
+    path = folders[0] / "frame_01.exr"
+    path.write_bytes(content)
+    message = refusal(lambda: solved(*folders))
+    assert str(path) in message and words in message
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("parts", "header", "words"),
+    [(1, {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}, "tiled"), (2, {}, "several parts")],
+    ids=["tiled", "parts"],
+)
+def test_frames_of_another_make(folders: tuple[Path, Path], parts: int, header: dict[str, Any], words: str) -> None:
+    """The same two refusals for files that OpenEXR itself wrote."""
+    path = folders[0] / "frame_01.exr"
+    pixels = {"DN": np.ones((PIXELS, PIXELS), np.float32)}
+    OpenEXR.File([OpenEXR.Part(dict(header), pixels, name=f"p{i}") for i in range(parts)]).write(str(path))
+    assert words in refusal(lambda: solved(*folders))
+
+
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"])
+def test_compressed_frames_of_other_programs_are_read(tmp_path: Path, compression: str) -> None:
+    """A constant picture of 1024 x 1024 shrinks most: the guard against bombs must let it pass."""
+    pixels = {"DN": np.full((1024, 1024), 7, np.float32)}
+    header = {"type": OpenEXR.scanlineimage, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    OpenEXR.File(header, pixels).write(str(tmp_path / "a.exr"))
+    assert np.allclose(read_frame(tmp_path / "a.exr")[0]["DN"], 7)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_frame_that_is_not_finite(folders: tuple[Path, Path], value: float) -> None:
+    pixels = np.ones((PIXELS, PIXELS), np.float32)
+    pixels[3, 4] = value
+    write_frame(folders[0] / "frame_01.exr", {"DN": pixels}, {})
+    assert "1 values are not finite" in refusal(lambda: solved(*folders))
+
+
+@pytest.mark.parametrize("damage", [pipe, folder, linked("/dev/zero")], ids=["pipe", "folder", "device"])
+def test_a_frame_that_is_no_file(folders: tuple[Path, Path], damage: Damage) -> None:
+    damage(folders[0] / "frame_01.exr")
+    assert "frame_01.exr" in refusal(lambda: solved(*folders))
+    with pytest.raises(MitsimError):
+        read_frame(folders[0] / "frame_01.exr")
+
+
+def test_a_frame_of_other_channels_or_size(folders: tuple[Path, Path]) -> None:
+    path = folders[0] / "frame_01.exr"
+    write_frame(path, {"other\nname": np.ones((PIXELS, PIXELS), np.float32)}, {})
+    assert "DN is needed" in refusal(lambda: solved(*folders))
+    write_frame(path, {"DN": np.ones((PIXELS, PIXELS + 1), np.float32)}, {})
+    assert "8x9" in refusal(lambda: solved(*folders))
+
+
+# ---- TOML ------------------------------------------------------------------------------------------------------------
+
+TOML = {
+    "deep arrays": ("a = " + "[" * 50_000, "nested too deep"),
+    "deep tables": ("a = " + "{a=" * 20_000, "nested too deep"),
+    "a name of 20000 parts": ("a." * 20_000 + "a = 1", "over 200 dots"),
+    "key twice": ("a = 1\na = 2", "not valid TOML"),
+    "2 MiB": ("#" * (2 << 20), "at most 65536"),
+    "no UTF-8": (b"\xff\xfe", "not valid TOML"),
+    "zero bytes": (b"\0" * 99, "not valid TOML"),
+    "a number of 10000 digits": ("bits = " + "9" * 10_000, "TOML"),
+    "a number of 60000 hexadecimal digits": ("bits = 0x" + "f" * 60_000, "name"),
+    "bits of 10^400": ("bits = 1" + "0" * 400, "name"),
+    "a name of 60000 letters": ("name = '" + "x" * 60_000 + "'", "pixel_pitch_um"),
+    "a field of 60000 letters": ("x" * 60_000 + " = 1", "name"),
+}
+
+
+@pytest.mark.usefixtures("bounded")
+@pytest.mark.parametrize("name", TOML)
+def test_a_hostile_camera(tmp_path: Path, name: str) -> None:
+    content, words = TOML[name]
+    path = tmp_path / "camera.toml"
+    raw(content)(path)
+    message = refusal(lambda: load_sensor(path))
+    assert str(path) in message and words in message
+
+
+@pytest.mark.parametrize("value", ["0x" + "f" * 50_000, "1e400", "nan", "'" + "x" * 50_000 + "'", "[[[[[[[[1]]]]]]]]"])
+def test_a_camera_with_one_hostile_value(tmp_path: Path, lab_camera: str, value: str) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_text(lab_camera.replace("bits = 12", f"bits = {value}"))
+    assert "bits: got" in refusal(lambda: load_sensor(path))
+
+
+@pytest.fixture
+def lab_camera() -> str:
+    from mitsim.core.configuration import shipped
+
+    text = shipped("calibration", "imx249.toml").read_text()
+    assert "bits = 12" in text
+    return text
+
+
+@pytest.mark.parametrize("damage", [pipe, folder, sparse], ids=["pipe", "folder", "huge"])
+def test_a_camera_that_is_no_file(tmp_path: Path, damage: Damage) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_text("")
+    damage(path)
+    assert str(path) in refusal(lambda: read_toml(path))
