@@ -22,6 +22,9 @@ FloatArray = npt.NDArray[np.float64]
 SEPARABLE_RESIDUAL = 0.05
 """Separability residual above which the status warns: stray light and falloff stay below a few percent."""
 
+LARGEST_ERROR = 0.1
+"""Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -42,8 +45,10 @@ class Calibration:
         root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
     predicted_error
         relative error of (left, right), in the Frobenius norm, that independent noise of that size leaves.
+    rank
+        of (left, right): singular values that are more than rounding, and than that noise alone would make.
     ok, status
-        False when the responses cannot be trusted, and one sentence.
+        False when the responses cannot be trusted; a sentence, and one with error, rank and condition.
     """
 
     left: FloatArray
@@ -53,6 +58,7 @@ class Calibration:
     condition: float
     noise: float
     predicted_error: tuple[float, float]
+    rank: tuple[int, int]
     ok: bool
     status: str
 
@@ -145,11 +151,16 @@ def _calibration(
     noise = float(np.sqrt((left.misfit + right.misfit) / spare))
     unexplained = float(np.sqrt(max(left.misfit + right.misfit - spare * stated_noise**2, 0.0) / energy))
     condition = max(_squared_condition(phi[0]), _squared_condition(phi[1]))
-    predicted = tuple(
-        predicted_error(factor, noise, float(np.linalg.norm(other)), count)
-        for factor, other in ((phi[0], v), (phi[1], a))
+    predicted, rank = [], []
+    for factor, other in ((phi[0], v), (phi[1], a)):
+        predicted.append(predicted_error(factor, noise, float(np.linalg.norm(other)), count))
+        rank.append(_rank(factor, predicted[-1]))
+    ok, status = _verdict(unexplained, max(predicted), phi[0].shape[1] - rank[0], phi[1].shape[1] - rank[1])
+    n = phi[0].shape[1], phi[1].shape[1]
+    extent = (
+        f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
+        f"rank {rank[0]} of {n[0]} and {rank[1]} of {n[1]}, condition {condition:.1e}."
     )
-    ok, status = _verdict(unexplained, condition)
     return Calibration(
         left=phi[0],
         right=phi[1],
@@ -158,8 +169,9 @@ def _calibration(
         condition=condition,
         noise=noise,
         predicted_error=(predicted[0], predicted[1]),
+        rank=(rank[0], rank[1]),
         ok=ok,
-        status=status,
+        status=f"{status} {extent}",
     )
 
 
@@ -174,23 +186,46 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     return float(deviation * np.sqrt(factor.size) / np.linalg.norm(factor))
 
 
-def _verdict(residual: float, condition: float) -> tuple[bool, str]:
+def _verdict(residual: float, error: float, lost_rows: int, lost_columns: int) -> tuple[bool, str]:
     if residual > SEPARABLE_RESIDUAL:
         return False, (
             f"Responses are not separable: {residual:.1%} of them is left over; for a FlatCam mask centre "
             "them, otherwise look for ambient light or a rotated part, or raise the exposure."
         )
-    if not np.isfinite(condition):
+    if error > LARGEST_ERROR:
         return False, (
-            "Factors are rank deficient: some scene rows or columns look alike to the sensor; use "
-            "fewer scene pixels or a larger distance from sensor to mask."
+            f"Factors are mostly noise: an error of {error:.0%} is expected of them, allowed are {LARGEST_ERROR:.0%}; "
+            "raise the exposure or average captures."
+        )
+    if lost_rows or lost_columns:
+        return False, (
+            f"Factors are rank deficient: {lost_rows} directions of scene rows and {lost_columns} of columns are not "
+            "above noise and rounding; use fewer scene pixels, a larger distance from sensor to mask or more exposure."
         )
     return True, "Calibrated: responses are separable."
 
 
+def _rank(phi: FloatArray, error: float) -> int:
+    """Singular values of a factor (m, n) beyond rounding and what its noise, ``error`` of ||phi||, makes of zero.
+
+    Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
+    norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
+    """
+    singular, rounding = _singular(phi)
+    deviation = error * np.linalg.norm(phi) / np.sqrt(phi.size)
+    rows = phi.shape[0]
+    noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
+    return int(np.count_nonzero(singular > max(float(noise), rounding)))
+
+
+def _singular(phi: FloatArray) -> tuple[FloatArray, float]:
+    """Singular values, and what of them is rounding, as numpy.linalg.matrix_rank takes it."""
+    singular = np.asarray(np.linalg.svd(phi, compute_uv=False))
+    return singular, float(singular[0] * max(phi.shape) * np.finfo(np.float64).eps)
+
+
 def _squared_condition(phi: FloatArray) -> float:
-    singular = np.linalg.svd(phi, compute_uv=False)
-    cut = singular[0] * max(phi.shape) * np.finfo(np.float64).eps
+    singular, cut = _singular(phi)
     if phi.shape[0] < phi.shape[1] or singular[-1] <= cut:
         return float("inf")
     return float((singular[0] / singular[-1]) ** 2)

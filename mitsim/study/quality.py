@@ -14,7 +14,7 @@ from matplotlib import image as matplotlib_image
 from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
 from mitsim.core.manifest import output_folder, write_json
-from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run, solve, verify
+from mitsim.reconstruct.run import check_fit, inherited, load, read_calibration, read_run, solve, verify
 from mitsim.reconstruct.solver import Solution
 from mitsim.study.metrics import TRUTH_FILE, psnr, read_truth, ssim
 
@@ -69,6 +69,7 @@ def reconstruct(
         added = time.perf_counter()
         solution = solve(prepared, frames, lam, method)
         solved = time.perf_counter()
+        flags = inherited(measurements, factors)
         result = ReconstructionResult(
             image=solution.image,
             psnr=psnr(solution.image, truth) if truth is not None else None,
@@ -77,8 +78,8 @@ def reconstruct(
             rank=prepared.rank,
             condition=prepared.condition,
             residual=solution.residual,
-            ok=solution.ok,
-            status=solution.status,
+            ok=solution.ok and not flags,
+            status=" ".join((solution.status, *flags)),
             seconds={"read": read - started, "accumulate": added - read, "solve": solved - added},
             output=str(folder),
         )
