@@ -42,9 +42,9 @@ def frames_of(left: np.ndarray, right: np.ndarray, P_L: np.ndarray, P_R: np.ndar
     return {(i, j): left @ (np.outer(p, q) * image) @ right.T for i, p in enumerate(P_L.T) for j, q in enumerate(P_R.T)}
 
 
-def solved(left, right, P_L, P_R, frames: Frames, relative: float, method: str = "svd") -> Solution:
-    """The solver's answer at a relative lambda."""
-    prepared = prepare(left, right, P_L, P_R, method=method)
+def solved(left, right, P_L, P_R, frames: Frames, relative: float, **options: str) -> Solution:
+    """The solver's answer at a relative lambda, by default in its default form."""
+    prepared = prepare(left, right, P_L, P_R, **options)
     sums = prepared.accumulator()
     for key, frame in frames.items():
         sums.add(frame, *key)
@@ -101,7 +101,7 @@ def digits_table() -> list[tuple[float, float, float, float]]:
     exact = Exact(left, right, one, one, frames)
     rows = []
     for relative in (*LAMBDAS, 0.0):
-        found = [solved(left, right, one, one, frames, relative, method) for method in ("svd", "gram")]
+        found = [solved(left, right, one, one, frames, relative, **form) for form in ({}, {"method": "gram"})]
         answer = exact.image(found[0].lam)
         plain = plain_gram(left, right, frames[0, 0], found[0].lam)
         rows.append(
