@@ -19,8 +19,18 @@ from mitsim.core.errors import MitsimError
 
 FloatArray = npt.NDArray[np.float64]
 
-SEPARABLE_RESIDUAL = 0.05
-"""Separability residual above which the status warns: stray light and falloff stay below a few percent."""
+SEPARABLE_RESIDUAL = 0.01
+"""Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform
+light. Falloff and diffraction leave less than 1e-3."""
+
+UNKNOWN_NOISE = 0.05
+"""The same where the sensor's noise was not stated, so that a good session's own few percent do not count."""
+
+NOISE_MODEL = 0.2
+"""Part of the stated noise that may be left unexplained: an error of 4 % in its variance."""
+
+LARGEST_ERROR = 0.1
+"""Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +52,10 @@ class Calibration:
         root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
     predicted_error
         relative error of (left, right), in the Frobenius norm, that independent noise of that size leaves.
+    rank
+        of (left, right): singular values that are more than rounding, and than that noise alone would make.
     ok, status
-        False when the responses cannot be trusted, and one sentence.
+        False when the responses cannot be trusted; a sentence, and one with error, rank and condition.
     """
 
     left: FloatArray
@@ -53,6 +65,7 @@ class Calibration:
     condition: float
     noise: float
     predicted_error: tuple[float, float]
+    rank: tuple[int, int]
     ok: bool
     status: str
 
@@ -72,7 +85,7 @@ def estimate_factors(
     H: npt.ArrayLike,
     centre: bool = False,
     uniform: npt.ArrayLike | None = None,
-    noise: float = 0.0,
+    noise: float | None = None,
 ) -> Calibration:
     """Factors of a separable camera from its responses to striped light.
 
@@ -91,8 +104,8 @@ def estimate_factors(
         over pairs of positive + negative captures). Default: the mean of ``horizontal[0]`` and
         ``vertical[0]``.
     noise
-        root mean square sensor noise of a response [frame unit], if known: few photons alone then do not make
-        the responses look inseparable.
+        root mean square sensor noise of a response [frame unit]; None: unknown. Where it is known, few photons alone
+        do not make the responses look inseparable, and a small keystone is not taken for noise.
 
     Raises
     ------
@@ -134,7 +147,7 @@ def _split(
 
 
 def _calibration(
-    left: _Split, right: _Split, a: FloatArray, v: FloatArray, signs: FloatArray, stated_noise: float
+    left: _Split, right: _Split, a: FloatArray, v: FloatArray, signs: FloatArray, stated_noise: float | None
 ) -> Calibration:
     count = signs.shape[1]
     phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
@@ -143,13 +156,22 @@ def _calibration(
     # Each response of m m' numbers spends one fitted number a sensor row (or column).
     spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
     noise = float(np.sqrt((left.misfit + right.misfit) / spare))
-    unexplained = float(np.sqrt(max(left.misfit + right.misfit - spare * stated_noise**2, 0.0) / energy))
+    expected = spare * (stated_noise or 0.0) ** 2 / energy
+    unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
+    allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
     condition = max(_squared_condition(phi[0]), _squared_condition(phi[1]))
-    predicted = tuple(
-        predicted_error(factor, noise, float(np.linalg.norm(other)), count)
-        for factor, other in ((phi[0], v), (phi[1], a))
+    predicted, rank = [], []
+    for factor, other in ((phi[0], v), (phi[1], a)):
+        predicted.append(predicted_error(factor, noise, float(np.linalg.norm(other)), count))
+        rank.append(_rank(factor, predicted[-1]))
+    ok, status = _verdict(
+        unexplained > allowed, unexplained, max(predicted), phi[0].shape[1] - rank[0], phi[1].shape[1] - rank[1]
     )
-    ok, status = _verdict(unexplained, condition)
+    n = phi[0].shape[1], phi[1].shape[1]
+    extent = (
+        f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
+        f"rank {rank[0]} of {n[0]} and {rank[1]} of {n[1]}, condition {condition:.1e}."
+    )
     return Calibration(
         left=phi[0],
         right=phi[1],
@@ -158,8 +180,9 @@ def _calibration(
         condition=condition,
         noise=noise,
         predicted_error=(predicted[0], predicted[1]),
+        rank=(rank[0], rank[1]),
         ok=ok,
-        status=status,
+        status=f"{status} {extent}",
     )
 
 
@@ -174,23 +197,46 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     return float(deviation * np.sqrt(factor.size) / np.linalg.norm(factor))
 
 
-def _verdict(residual: float, condition: float) -> tuple[bool, str]:
-    if residual > SEPARABLE_RESIDUAL:
+def _verdict(inseparable: bool, residual: float, error: float, lost_rows: int, lost_columns: int) -> tuple[bool, str]:
+    if inseparable:
         return False, (
             f"Responses are not separable: {residual:.1%} of them is left over; for a FlatCam mask centre "
             "them, otherwise look for ambient light or a rotated part, or raise the exposure."
         )
-    if not np.isfinite(condition):
+    if error > LARGEST_ERROR:
         return False, (
-            "Factors are rank deficient: some scene rows or columns look alike to the sensor; use "
-            "fewer scene pixels or a larger distance from sensor to mask."
+            f"Factors are mostly noise: an error of {error:.0%} is expected of them, allowed are {LARGEST_ERROR:.0%}; "
+            "raise the exposure or average captures."
+        )
+    if lost_rows or lost_columns:
+        return False, (
+            f"Factors are rank deficient: {lost_rows} directions of scene rows and {lost_columns} of columns are not "
+            "above noise and rounding; use fewer scene pixels, a larger distance from sensor to mask or more exposure."
         )
     return True, "Calibrated: responses are separable."
 
 
+def _rank(phi: FloatArray, error: float) -> int:
+    """Singular values of a factor (m, n) beyond rounding and what its noise, ``error`` of ||phi||, makes of zero.
+
+    Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
+    norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
+    """
+    singular, rounding = _singular(phi)
+    deviation = error * np.linalg.norm(phi) / np.sqrt(phi.size)
+    rows = phi.shape[0]
+    noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
+    return int(np.count_nonzero(singular > max(float(noise), rounding)))
+
+
+def _singular(phi: FloatArray) -> tuple[FloatArray, float]:
+    """Singular values, and what of them is rounding, as numpy.linalg.matrix_rank takes it."""
+    singular = np.asarray(np.linalg.svd(phi, compute_uv=False))
+    return singular, float(singular[0] * max(phi.shape) * np.finfo(np.float64).eps)
+
+
 def _squared_condition(phi: FloatArray) -> float:
-    singular = np.linalg.svd(phi, compute_uv=False)
-    cut = singular[0] * max(phi.shape) * np.finfo(np.float64).eps
+    singular, cut = _singular(phi)
     if phi.shape[0] < phi.shape[1] or singular[-1] <= cut:
         return float("inf")
     return float((singular[0] / singular[-1]) ** 2)

@@ -32,7 +32,10 @@ _LINES = 4
 
 
 class Session:
-    """One calibration session: the board's light, the exposure, and noisy or noise-free responses."""
+    """One calibration session: the board's light, the exposure, and noisy or noise-free responses.
+
+    ``saturated`` counts the noisy frames so far that have pixels at the full well or the ADC's end.
+    """
 
     def __init__(
         self,
@@ -48,6 +51,7 @@ class Session:
         self.bench, self.recipe, self.seed, self.clock, self.progress = bench, recipe, seed, clock, progress
         self.board = bench.with_board(recipe.board_reflectance)
         self.centre = bench.geometry.mask == "flatcam"
+        self.saturated = 0
         self.signs = _signs(bench.n)
         n, count = self.signs.shape
         positive = (1.0 + self.signs.T) / 2
@@ -128,11 +132,10 @@ class Session:
         exposer = Exposer(self.bench, self.exposure_s, self.seed, speckle_of(self.bench, self.plan))
         numbered = enumerate(self._expected(side, self.weights))
 
-        def shoot(item: tuple[int, Frame]) -> FloatArray:
+        def shoot(item: tuple[int, Frame]) -> tuple[FloatArray, bool]:
             index, frame = item
-            return exposer.rate(
-                exposer.digital(exposer.lit(frame, "calibration", side, index), "calibration", side, index)
-            )
+            digital = exposer.digital(exposer.lit(frame, "calibration", side, index), "calibration", side, index)
+            return exposer.rate(digital), exposer.saturated(digital)
 
         done = 0
         while True:
@@ -141,10 +144,12 @@ class Session:
             if not chunk:
                 return
             with self.clock.stage("sensor"):
-                rates = in_threads(shoot, chunk)
+                shot = in_threads(shoot, chunk)
             done += len(chunk)
             self.progress(f"{side} stripes", done / len(self.weights))
-            yield from rates
+            for rate, saturated in shot:
+                self.saturated += saturated
+                yield rate
 
 
 def _lines(n: int) -> tuple[Labels, FloatArray]:

@@ -10,6 +10,9 @@ import numpy.typing as npt
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import FloatArray, Side, Slab
 
+_LARGEST = 1e100
+"""Largest norm of a frame, and one over the smallest: its square, the energy, is then told from 0 and infinity."""
+
 
 class Accumulator:
     """Sum over frames of what the solver needs: W, the frames' energy, and which frames came.
@@ -48,8 +51,9 @@ class Accumulator:
         """Add the frame (m, m') taken under pattern P_L[:, row] P_R[:, column]^T.
 
         Any real dtype is taken; sums are float64. For a signed pattern the frame is the difference of its
-        two captures. MitsimError for another shape, a value that is not finite, a pattern index out of
-        range, or a pattern added twice (average repeated captures first).
+        two captures. MitsimError for another shape, a value that is not finite, numbers whose squares leave
+        double precision, a pattern index out of range, or a pattern added twice (average repeated captures
+        first).
         """
         self._check_index(row, column)
         values = self._checked(frame, row, column)
@@ -57,11 +61,8 @@ class Accumulator:
             values = centred(values)
         flat = values.ravel()
         energy = float(np.dot(flat, flat))
-        if not np.isfinite(energy):
-            bad = int(np.count_nonzero(~np.isfinite(values)))
-            raise MitsimError(
-                f"frame of pattern ({row}, {column}) has {bad} values that are not finite; capture it again"
-            )
+        if not 1 / _LARGEST**2 <= energy <= _LARGEST**2 and (energy or values.any()):
+            raise MitsimError(_out_of_range(f"frame of pattern ({row}, {column})", values))
         left, right = self._left.slabs[row], self._right.slabs[column]
         where: Any = (left.columns, right.columns)
         if isinstance(left.columns, np.ndarray) and isinstance(right.columns, np.ndarray):
@@ -97,6 +98,17 @@ def centred_columns(matrix: FloatArray) -> FloatArray:
 def centred(frame: FloatArray) -> FloatArray:
     """C Y C with C = I - 1 1^T / m: row and column means taken out, as FlatCam's constant term demands."""
     return centred_columns(frame - frame.mean(axis=1, keepdims=True))
+
+
+def _out_of_range(name: str, values: FloatArray) -> str:
+    """Why a frame whose energy is not a usable number is refused."""
+    bad = int(np.count_nonzero(~np.isfinite(values)))
+    if bad:
+        return f"{name} has {bad} values that are not finite; capture it again"
+    return (
+        f"{name} has numbers up to {np.abs(values).max():.1e}; "
+        f"allowed are 0 and {1 / _LARGEST:g} to {_LARGEST:g}, choose another unit"
+    )
 
 
 def _project(frame: FloatArray, left: Slab, right: Slab) -> FloatArray:

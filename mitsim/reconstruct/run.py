@@ -86,6 +86,7 @@ class RunManifest(BaseModel):
     digital: Digital = Field(description="how frames are read")
     patterns: Patterns = Field(description="what was projected")
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
+    warnings: tuple[str, ...] = Field(default=(), description="why the capture was flagged")
 
 
 class CalibrationManifest(BaseModel):
@@ -99,6 +100,7 @@ class CalibrationManifest(BaseModel):
         default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; None: unknown"
     )
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
+    warnings: tuple[str, ...] = Field(default=(), description="why the calibration was flagged")
 
 
 @dataclass(frozen=True)
@@ -192,6 +194,15 @@ def check_fit(run: Measurements, factors: Factors, calibration: Path | str) -> N
                 f"{run.folder}/manifest.json: patterns.{side} has {len(pattern)} scene pixels, but calibration "
                 f"{calibration} has {factor.shape[1]}; calibrate with this projector"
             )
+
+
+def inherited(run: Measurements, factors: Factors) -> tuple[str, ...]:
+    """Sentences on why the run or the calibration was flagged: an image made of them is flagged too."""
+    return tuple(
+        f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
+        for what, manifest in (("capture", run.manifest), ("calibration", factors.manifest))
+        for warning in manifest.warnings
+    )
 
 
 def load(run: Measurements, factors: Factors) -> tuple[Prepared, Accumulator]:

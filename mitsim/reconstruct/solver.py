@@ -13,6 +13,11 @@ solution is X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. Its roun
 sqrt(lambda_rel), with lambda_rel = lambda / (max s_L^2 max s_R^2); with the paper's Q = sum (Phi_L^T Y
 Phi_R) o P in place of W it is eps / lambda_rel (docs/decisions/0001-projected-accumulation.md).
 ``method="gram"`` keeps that form for comparison.
+
+Every solution says how much rounding may have moved it: ten units of eps, magnified by sigma_max max_ij
+sigma_ij / (sigma_ij^2 + lambda) <= 1 / (2 sqrt(lambda_rel)); for ``gram``, whose data carry sigma_max^2 eps,
+by sigma_max^2 / min_ij (sigma_ij^2 + lambda). That is relative to the image, for frames that the model
+explains; what it does not explain is magnified as noise, and by more.
 """
 
 from __future__ import annotations
@@ -37,6 +42,13 @@ from mitsim.reconstruct.factors import (
 )
 from mitsim.reconstruct.regularisation import Spectrum, automatic_lambda
 
+ROUNDING_LIMIT = 0.01
+"""Rounding above this part of the image flags a solution: two digits are the least that anyone can see or use."""
+_ROUNDING_UNITS = 10 * float(np.finfo(np.float64).eps)
+_SMALLEST, _LARGEST = 1e-30, 1e30
+"""Largest number of a factor or pattern: sigma^2, a product of eight of them, then stays far from 1e-308 and 1e308."""
+_UNSEEN = 1e-60
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -55,10 +67,13 @@ class Solution:
         the larger cond(A) of the two sides; inf when rank deficient.
     residual
         ||Y - model|| / ||Y|| over all frames; rounding hides what is below about 1e-8.
+    rounding
+        what rounding may have changed, ||error|| / ||image||; see above.
     ok
-        False when the image lacks something that no lambda explains; ``status`` says what and what to do.
+        False when the image lacks something that no lambda explains, or rounding may have changed more than
+        ROUNDING_LIMIT of it; ``status`` says what and what to do.
     status
-        one sentence.
+        a sentence, and one with rank, condition and rounding.
     """
 
     image: FloatArray
@@ -68,6 +83,7 @@ class Solution:
     unknowns: int
     condition: float
     residual: float
+    rounding: float
     ok: bool
     status: str
 
@@ -95,6 +111,11 @@ class Prepared:
     def unknowns(self) -> int:
         """Number of scene pixels."""
         return self.left.scene_size * self.right.scene_size
+
+    @property
+    def extent(self) -> str:
+        """Rank and condition as every status ends with them."""
+        return f"Rank {self.rank} of {self.unknowns}, condition {self.condition:.1e}"
 
     def accumulator(self) -> Accumulator:
         """An empty sum to add frames to."""
@@ -148,7 +169,8 @@ class Prepared:
             sigma * spectrum.projected, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0
         )
         residual = spectrum.residual_energy(lam)
-        ok, status = self._verdict(lam)
+        rounding = self._rounding(spectrum, lam)
+        ok, status = self._verdict(lam, rounding, spectrum.scale)
         return Solution(
             image=self.image(filtered),
             lam=lam,
@@ -157,11 +179,20 @@ class Prepared:
             unknowns=self.unknowns,
             condition=self.condition,
             residual=float(np.sqrt(residual / spectrum.energy)) if spectrum.energy > 0 else 0.0,
+            rounding=rounding,
             ok=ok,
-            status=status,
+            status=f"{status} {self.extent}, rounding below {rounding:.0e}.",
         )
 
-    def _verdict(self, lam: float) -> tuple[bool, str]:
+    def _rounding(self, spectrum: Spectrum, lam: float) -> float:
+        """Bound on ||error|| / ||image|| by rounding; the module's text says where it comes from."""
+        sigma = spectrum.sigma[spectrum.sigma > 0]
+        power = np.square(sigma) + lam
+        top = float(sigma.max())
+        magnified = top * (sigma / power).max() if self.method == "svd" else top**2 / power.min()
+        return _ROUNDING_UNITS * max(float(magnified), 1.0)
+
+    def _verdict(self, lam: float, rounding: float, scale: float) -> tuple[bool, str]:
         """Whether the image is complete, and the sentence that says why not and what to do."""
         for name, side in (("row", self.left), ("column", self.right)):
             if side.data_rows < side.scene_size:
@@ -174,6 +205,13 @@ class Prepared:
             return False, (
                 f"Rank deficient: {lost} of {self.unknowns} directions are not measured and left at zero "
                 "by the pseudo-inverse; use more patterns, or lambda above 0."
+            )
+        if rounding > ROUNDING_LIMIT:
+            least = _ROUNDING_UNITS / ROUNDING_LIMIT
+            least = scale * (least if self.method == "gram" else (least / 2) ** 2)
+            return False, (
+                f"Ill-conditioned: rounding may change more than {ROUNDING_LIMIT:.0%} of the image; "
+                f"raise lambda above {least:.1e}, or use more patterns."
             )
         if lost:
             return True, (
@@ -213,7 +251,8 @@ def prepare(
     Raises
     ------
     MitsimError
-        for shapes that do not fit, values that are not finite, patterns that light nothing, unknown choices.
+        for shapes that do not fit, values that are not finite, too large or too small to be squared, patterns
+        that light nothing that the factor sees, unknown choices.
     """
     check_choices(method, structure)
     factors = [_matrix("left factor", left), _matrix("right factor", right)]
@@ -224,11 +263,13 @@ def prepare(
                 f"{name} factor of shape {factor.shape} has {factor.shape[1]} scene pixels "
                 f"but its patterns have {pattern.shape[0]}; both need the same number"
             )
-        if not (factor.any() and pattern.any()):
-            raise MitsimError(f"{name} factor or its patterns are all zero; there is nothing to solve for")
     same = np.array_equal(factors[0], factors[1]) and np.array_equal(patterns[0], patterns[1])
     if centre:
-        factors = [centred_columns(factor) for factor in factors]
+        factors = [_centred(factor) for factor in factors]
+    for name, factor, pattern in zip(("left", "right"), factors, patterns, strict=True):
+        if not (factor.any() and pattern.any()):
+            what = " once centred" if centre else ""
+            raise MitsimError(f"{name} factor{what} or its patterns are all zero; there is nothing to solve for")
     groups = [group_pixels(patterns[0], structure)]
     groups.append(groups[0] if np.array_equal(patterns[0], patterns[1]) else group_pixels(patterns[1], structure))
 
@@ -238,7 +279,18 @@ def prepare(
     # Products this small gain little from threads of BLAS, and lose a hundredfold when the cores are busy.
     with single_threaded_blas():
         first = side(0)
-        return Prepared(first, first if same else side(1), method, centre)
+        sides = first, first if same else side(1)
+    for name, found in zip(("left", "right"), sides, strict=True):
+        if found.singular.max() < _UNSEEN:
+            raise MitsimError(f"patterns light no scene pixel that the {name} factor sees; light those that it sees")
+    return Prepared(*sides, method, centre)
+
+
+def _centred(factor: FloatArray) -> FloatArray:
+    """The factor without the means of its columns; a column of equal numbers leaves exact zeros, not rounding."""
+    centred = centred_columns(factor)
+    dust = len(factor) * np.finfo(np.float64).eps * np.abs(factor).max(axis=0)
+    return np.where(np.abs(centred).max(axis=0) > dust, centred, 0.0)
 
 
 def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
@@ -247,4 +299,9 @@ def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
         raise MitsimError(f"{name} have shape {values.shape}; give a 2-D array")
     if not np.isfinite(values).all():
         raise MitsimError(f"{name} hold {np.count_nonzero(~np.isfinite(values))} values that are not finite")
+    largest = np.abs(values).max()
+    if largest and not _SMALLEST <= largest <= _LARGEST:
+        raise MitsimError(
+            f"{name} hold numbers up to {largest:.1e}; allowed are {_SMALLEST:g} to {_LARGEST:g}, choose another unit"
+        )
     return values

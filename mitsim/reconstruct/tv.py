@@ -27,8 +27,8 @@ AUTO_WEIGHT = 0.12
 
 @dataclass(frozen=True, eq=False)
 class TVSolution:
-    """Image (n, n') of :func:`solve_tv`, the weight used, iterations spent, the last relative change and a
-    sentence.
+    """Image (n, n') of :func:`solve_tv`, the weight used, iterations spent, the last relative change, and a
+    sentence on convergence with one on rank and condition.
     """
 
     image: FloatArray
@@ -121,6 +121,12 @@ def _solution(
     outside = max(spectrum.energy - float(np.sum(np.square(spectrum.projected))), 0.0)
     misfit = outside + float(np.sum(np.square(spectrum.projected - modelled)))
     status = f"Solved: total variation converged in {iterations} iterations."
+    lost = prepared.unknowns - prepared.rank
+    if lost:
+        status = (
+            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured and "
+            "follow from total variation alone; use more patterns."
+        )
     if not converged:
         status = (
             f"Not converged: after {iterations} iterations the image still changes by {change:.1e} a step; "
@@ -133,5 +139,5 @@ def _solution(
         change=change,
         residual=float(np.sqrt(misfit / spectrum.energy)) if spectrum.energy > 0 else 0.0,
         ok=converged,
-        status=status,
+        status=f"{status} {prepared.extent}.",
     )

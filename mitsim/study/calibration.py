@@ -71,6 +71,11 @@ def calibrate(
         with clock.stage("noise-free check"):
             clean = estimate_factors(*session.noise_free(), session.signs, centre=session.centre)
         warnings = session.plan.warnings + (() if noisy.ok else (noisy.status,))
+        if session.saturated:
+            warnings += (
+                f"{session.saturated} of {session.captures} frames have pixels at the full well or the ADC's end, "
+                "so responses are not linear; lower the recipe's exposure_fraction",
+            )
         # (left, right) and (-left, -right) are one camera; centred factors have no sum that would tell which it is.
         sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
         error = float(
@@ -107,6 +112,8 @@ def calibrate(
                 "digital": digital_block(bench, session.exposure_s),
                 "checksums": {name: checksum(folder / name) for name in ("left.exr", "right.exr")},
                 "result": {key: value for key, value in vars(result).items() if key != "output"},
+                "warnings": warnings,
+                "estimate": noisy.status,
                 "versions": versions(),
             },
         )

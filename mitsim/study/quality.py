@@ -15,7 +15,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.frames import write_frame
 from mitsim.core.manifest import write_json
 from mitsim.core.output import output_folder, whole_file
-from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run, solve, verify
+from mitsim.reconstruct.run import check_fit, inherited, load, read_calibration, read_run, solve, verify
 from mitsim.reconstruct.solver import Solution
 from mitsim.study.metrics import TRUTH_FILE, psnr, read_truth, ssim
 
@@ -70,6 +70,7 @@ def reconstruct(
         added = time.perf_counter()
         solution = solve(prepared, frames, lam, method)
         solved = time.perf_counter()
+        flags = inherited(measurements, factors)
         result = ReconstructionResult(
             image=solution.image,
             psnr=psnr(solution.image, truth) if truth is not None else None,
@@ -78,8 +79,8 @@ def reconstruct(
             rank=prepared.rank,
             condition=prepared.condition,
             residual=solution.residual,
-            ok=solution.ok,
-            status=solution.status,
+            ok=solution.ok and not flags,
+            status=" ".join((solution.status, *flags)),
             seconds={"read": read - started, "accumulate": added - read, "solve": solved - added},
             output=str(folder),
         )

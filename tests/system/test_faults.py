@@ -156,9 +156,9 @@ def test_two_runs_on_one_folder(call: Callable[..., Any], lab: Any, tmp_path: Pa
     process = running(20, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS)
     worker = psutil.Process(process.pid).children()[0]
     worker.suspend()
-    for options in ((), ("--resume",)):
+    for options, words in ((), "the folder holds files already"), (("--resume",), "another mitsim is writing there"):
         line = call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS, *options).refusal
-        assert line.startswith(f"output {run}: another mitsim is writing there")
+        assert line.startswith(f"output {run}: {words}")
     worker.resume()
     assert ended(process).returncode == 0
     assert_equal_runs(run, whole)

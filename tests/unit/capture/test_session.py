@@ -121,6 +121,8 @@ def test_the_folder(session: Callable[..., Done]) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["kind"] == "calibration" and manifest["centre"] is False
     assert manifest["camera"] == json.loads(json.dumps(bench.identity()))
+    assert manifest["estimate"] == calibration.status and manifest["warnings"] == list(result.warnings)
+    assert not any("full well" in warning for warning in result.warnings)
     for name, factor in (("left", calibration.left), ("right", calibration.right)):
         channels, metadata = read_frame(folder / f"{name}.exr")
         assert np.array_equal(channels["factor"], factor.astype(np.float32))

@@ -1,0 +1,322 @@
+"""Calibrations that went wrong say so, and their images carry it: few photons, full wells, keystone, twins.
+
+The camera is numpy: geometric shadows of the anchor geometry on 64 pixels, a 16 x 16 projector, +-1 stripes as two
+captures each, Poisson noise and a full well. Nothing of mitsim's renderer or sensor is in it, except in the one session
+that is rendered to see its own full frames counted.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import hadamard
+
+from mitsim.calibrate.hadamard import LARGEST_ERROR, UNKNOWN_NOISE, Calibration, estimate_factors
+from mitsim.core.errors import MitsimError
+from mitsim.core.frames import write_frame
+from mitsim.optics.mask import mls_mask
+from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.study.quality import ReconstructionResult, reconstruct
+
+N, PIXELS = 16, 64
+H = hadamard(N).astype(float)
+
+
+def shadow(distance_mm: float = 2.0, width_mm: float = 120.0, pixels: int = PIXELS, n: int = N) -> np.ndarray:
+    """(pixels, n) geometric shadow of the anchor geometry with a scene of this width."""
+    sensor, scene = centred_edges(pixels, 512 * 0.01172 / pixels), centred_edges(n, width_mm / n)
+    return scene_factor(mls_mask().terms[0][1], 0.06, sensor, scene, distance_mm, 400.0)
+
+
+class Camera:
+    """A board seen through a mask: ``left`` (m, n), or (n, m, n) with one for every column of the projector."""
+
+    def __init__(self, left: np.ndarray, right: np.ndarray) -> None:
+        self.left, self.right = left, right
+
+    @classmethod
+    def keystoned(cls, share: float) -> Camera:
+        """A turned projector: rows are spread by up to +-share/2 more at the left and right ends of its picture."""
+        spread = 1 + share * (np.arange(N) - (N - 1) / 2) / (N - 1)
+        return cls(np.stack([shadow(width_mm=120 * wide) for wide in spread]), shadow())
+
+    def frame(self, light: np.ndarray) -> np.ndarray:
+        if self.left.ndim == 2:
+            return self.left @ light @ self.right.T
+        columns = zip(self.left, light.T, self.right.T, strict=True)
+        return sum(np.outer(left @ column, right) for left, column, right in columns)
+
+    @property
+    def peak(self) -> float:
+        return float(self.frame(np.ones((N, N))).max())
+
+    def calibrate(
+        self, electrons: float | None = None, full_well: float = np.inf, seed: int = 0, stated: bool = True
+    ) -> Calibration:
+        """A session whose brightest pixel holds ``electrons`` (None: no noise); ``full_well`` in the same share."""
+        rng = np.random.default_rng(seed)
+        gain = electrons / self.peak if electrons else 1.0
+
+        def shot(light: np.ndarray) -> np.ndarray:
+            expected = gain * self.frame(light)
+            counts = rng.poisson(expected) if electrons else expected
+            return np.minimum(counts, full_well * gain * self.peak) / gain
+
+        def signed(pattern: np.ndarray) -> np.ndarray:
+            return shot((1 + pattern) / 2) - shot((1 - pattern) / 2)
+
+        one = np.ones(N)
+        noise = float(np.sqrt(self.frame(np.ones((N, N))).mean() / gain)) if electrons else 0.0
+        return estimate_factors(
+            [signed(np.outer(h, one)) for h in H.T],
+            [signed(np.outer(one, h)) for h in H.T],
+            H,
+            noise=noise if stated else None,
+        )
+
+
+def error_of(found: Calibration, left: np.ndarray, right: np.ndarray) -> float:
+    """Larger relative error of the two factors, scales balanced as the estimate's."""
+    scale = np.sqrt(np.linalg.norm(right.sum(axis=1)) / np.linalg.norm(left.sum(axis=1)))
+    pairs = (found.left, left * scale), (found.right, right / scale)
+    return max(float(np.linalg.norm(one - two) / np.linalg.norm(two)) for one, two in pairs)
+
+
+# ---- the estimate ----------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(power=st.floats(-3, 8), seed=st.integers(0, 999))
+def test_few_photons(power: float, seed: int) -> None:
+    """0.001 to 1e8 electrons in the brightest pixel: finite or refused; ok only where the factors are good.
+
+    2048 numbers tell the size of their noise to 2 %, but it is larger where light is, so 30 % is allowed between the
+    error and its prediction. Where nothing arrives at all, the uniform response is zero and that is refused.
+    """
+    factor = shadow()
+    camera = Camera(factor, factor)
+    try:
+        found = camera.calibrate(10.0**power, seed=seed)
+    except MitsimError as refusal:
+        assert power < 0 and "zero everywhere" in str(refusal)
+        return
+    error = error_of(found, factor, factor)
+    assert np.isfinite([*found.left.ravel(), *found.right.ravel(), found.separability_residual]).all()
+    if found.ok:
+        assert error < 1.3 * LARGEST_ERROR and found.rank == (N, N)
+    if error < 0.5:
+        assert error == pytest.approx(max(found.predicted_error), rel=0.3)
+    if power < 1:
+        assert not found.ok and error > LARGEST_ERROR
+    if power > 7:
+        assert found.ok
+    assert found.status.endswith(
+        f"Factor error {found.predicted_error[0]:.1e} and {found.predicted_error[1]:.1e}, "
+        f"rank {found.rank[0]} of {N} and {found.rank[1]} of {N}, condition {found.condition:.1e}."
+    )
+
+
+def test_unstated_noise_shows_in_the_residual() -> None:
+    """Without the sensor's noise the residual alone must tell: it grows as exposure falls, and flags."""
+    camera = Camera(shadow(), shadow())
+    found = [camera.calibrate(10.0**power, stated=False) for power in (8, 6, 4, 2, 0)]
+    residuals = [calibration.separability_residual for calibration in found]
+    assert (np.diff(residuals) > 0).all() and residuals[0] < 1e-2
+    assert [calibration.ok for calibration in found] == [residual < UNKNOWN_NOISE for residual in residuals]
+    assert all(calibration.unexplained == calibration.separability_residual for calibration in found)
+
+
+def test_full_wells_show_in_the_residual() -> None:
+    """A full well at 1.2 to 0.3 of the brightest pixel: clipped light is not separable.
+
+    At 0.95 only the uniform frame is cut and the residual is small: it is the session that counts such frames (below).
+    From 0.7 of the peak on the residual itself flags.
+    """
+    camera = Camera(shadow(), shadow())
+    found = [camera.calibrate(full_well=share) for share in (1.2, 0.95, 0.7, 0.5, 0.4, 0.3)]
+    residuals = [calibration.separability_residual for calibration in found]
+    assert residuals[0] < 1e-14 and (np.diff(residuals) > 0).all()
+    assert [calibration.ok for calibration in found[:2]] == [True, True]
+    for calibration in found[2:]:
+        assert not calibration.ok and calibration.status.startswith("Responses are not separable")
+
+
+def test_keystone_shows_in_the_residual() -> None:
+    """A projector turned ever further: residual zero without, proportional to the turn while it is small, then flagged.
+
+    With noise the residual is larger, and what noise does not explain is the same: it is found at 1e5 electrons too.
+    """
+    shares = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 0.3)
+    found = [Camera.keystoned(share).calibrate() for share in shares]
+    residuals = [calibration.separability_residual for calibration in found]
+    assert residuals[0] < 1e-14 and found[0].ok
+    assert residuals[2] == pytest.approx(10 * residuals[1], rel=0.05)
+    assert (np.diff(residuals) > 0).all()
+    assert [calibration.ok for calibration in found] == [True] * 4 + [False] * 2
+    assert "not separable: 1.5%" in found[4].status and "rotated part" in found[4].status
+    noisy = Camera.keystoned(0.1).calibrate(1e5)
+    assert noisy.unexplained == pytest.approx(residuals[4], rel=0.2) and not noisy.ok
+    assert noisy.separability_residual > 1.2 * noisy.unexplained
+    assert Camera.keystoned(0.0).calibrate(1e5).unexplained < 0.5 * noisy.unexplained
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(twins=st.sets(st.integers(1, 6), max_size=4), dark=st.booleans(), noisy=st.booleans(), seed=st.integers(0, 99))
+def test_rank_deficient_factors(twins: set[int], dark: bool, noisy: bool, seed: int) -> None:
+    """Equal and dark columns are counted, with noise (which makes every matrix invertible) as without."""
+    left, right = shadow(), shadow()
+    for column in twins:
+        left[:, column] = left[:, 0]
+    right[:, 3] *= not dark
+    found = Camera(left, right).calibrate(1e9 if noisy else None, seed=seed)
+    assert found.rank == (N - len(twins), N - dark)
+    assert found.ok == (not twins and not dark)
+    if not found.ok:
+        assert found.status.startswith(
+            f"Factors are rank deficient: {len(twins)} directions of scene rows and {dark:d}"
+        )
+    assert np.isfinite(found.condition) == (noisy or found.ok)
+
+
+def test_a_mask_that_is_too_close() -> None:
+    """20 um to 2 mm: a close mask cannot tell scene rows apart, and the status says how many it can."""
+    found = [Camera(*[shadow(distance)] * 2).calibrate(1e9) for distance in (0.02, 0.1, 0.5, 2.0)]
+    ranks = [calibration.rank[0] for calibration in found]
+    assert ranks == sorted(ranks) and ranks[0] < N and ranks[-1] == N
+    assert [calibration.ok for calibration in found] == [rank == N for rank in ranks]
+
+
+# ---- the folders -----------------------------------------------------------------------------------------------------
+
+DIGITAL = {"exposure_s": 1.0, "black_level_dn": 0, "gain_dn_per_e": 1.0, "dark_current_e_per_s": 0}
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Callable[..., tuple[Path, Path]]:
+    """Writes a RUN of one frame and a CAL by hand; ``factor`` replaces the right one, the rest goes into manifests."""
+
+    def write(
+        factor: np.ndarray | None = None, capture: tuple[str, ...] = (), calibration: tuple[str, ...] = ()
+    ) -> tuple[Path, Path]:
+        run, cal = tmp_path / "run", tmp_path / "cal"
+        left = 100 * shadow(n=8)
+        scene = np.random.default_rng(0).random((8, 8))
+        for folder in (run, cal):
+            folder.mkdir()
+        write_frame(run / "a.exr", {"DN": (left @ scene @ left.T).astype(np.float32)}, {})
+        for name, values in (("left", left), ("right", left if factor is None else factor)):
+            write_frame(cal / f"{name}.exr", {"factor": values.astype(np.float32)}, {})
+        common = {"status": "complete", "camera": {"name": "bench 4"}}
+        shots = [{"file": "a.exr", "row": 0, "column": 0, "sign": 0}]
+        patterns = {"P_L": [[1]] * 8, "P_R": [[1]] * 8, "captures": shots}
+        for folder, manifest in (
+            (run, {"kind": "capture", "digital": DIGITAL, "patterns": patterns, "warnings": capture}),
+            (cal, {"kind": "calibration", "warnings": calibration}),
+        ):
+            (folder / "manifest.json").write_text(json.dumps(common | manifest))
+        return run, cal
+
+    return write
+
+
+def image_of(run: Path, cal: Path) -> ReconstructionResult:
+    return reconstruct(run, cal, run / "image", 0.0)
+
+
+def test_flags_of_folders_reach_the_image(bench: Callable[..., tuple[Path, Path]]) -> None:
+    """A capture or calibration that was flagged flags its image, in the status and in result.json."""
+    run, cal = bench(capture=("3 frames have pixels at the full well",), calibration=("Factors are noise.", "b"))
+    found = image_of(run, cal)
+    assert not found.ok and found.rank == 64
+    for sentence in (
+        "The capture was flagged: 3 frames have pixels at the full well.",
+        "The calibration was flagged: Factors are noise.",
+        "The calibration was flagged: b.",
+    ):
+        assert sentence in found.status
+    assert found.status.startswith("Solved: ") and "Rank 64 of 64" in found.status
+    assert json.loads((run / "image" / "result.json").read_text())["status"] == found.status
+
+
+def test_folders_without_flags(bench: Callable[..., tuple[Path, Path]]) -> None:
+    found = image_of(*bench())
+    assert found.ok and "flagged" not in found.status
+
+
+def test_the_command_ends_with_1(
+    bench: Callable[..., tuple[Path, Path]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mitsim import cli
+
+    run, cal = bench(calibration=("12 of 64 frames have pixels at the full well",))
+    monkeypatch.setattr(sys, "argv", ["mitsim", "reconstruct", str(run), "--calibration", str(cal), "--json"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    out, err = capsys.readouterr()
+    status = json.loads(out)["status"]
+    assert stop.value.code == 1 and "The calibration was flagged: 12 of 64 frames" in status and status in err
+    assert (run / "reconstruction" / "image.exr").is_file(), "the image is kept"
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (np.full((64, 8), 1e35), "1.0e\\+35; allowed are"),
+        (np.full((64, 8), 1e-35), "1.0e-35; allowed are"),
+        (np.zeros((64, 8)), "all zero"),
+        (np.full((64, 8), np.nan), "not finite"),
+        (np.full((64, 8), np.inf), "not finite"),
+        (np.ones((63, 8)), "calibration's are 64x63"),
+        (np.ones((64, 7)), "has 8 scene pixels"),
+    ],
+    ids=["huge", "tiny", "zero", "nan", "infinite", "short", "narrow"],
+)
+def test_absurd_factors_are_refused(bench: Callable[..., tuple[Path, Path]], factor: np.ndarray, words: str) -> None:
+    """In one line, and no folder is left behind."""
+    run, cal = bench(factor)
+    with pytest.raises(MitsimError, match=words) as caught:
+        image_of(run, cal)
+    assert "\n" not in str(caught.value) and not (run / "image").exists()
+
+
+def test_twin_columns_are_flagged_by_the_solver(bench: Callable[..., tuple[Path, Path]]) -> None:
+    """A rank-deficient factor from elsewhere, without a word in its manifest: the solver finds it."""
+    factor = 100 * shadow(n=8)
+    factor[:, 1] = factor[:, 0]
+    found = image_of(*bench(factor))
+    assert not found.ok and found.rank == 56 and found.status.startswith("Rank deficient: 8 of 64")
+
+
+def test_a_saturated_session_is_flagged(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rendered: an ADC of 8 bits ends at 6 % of the full well; the folder says how many frames reached it.
+
+    (That no frame is counted without cause: tests/unit/capture/test_session.py::test_the_folder.)
+    """
+    from mitsim.capture.bench import open_bench
+    from mitsim.capture.light import make_plan
+    from mitsim.scene.evidence import PHYSICAL
+    from mitsim.study.calibration import calibrate
+
+    def simple_plan(*arguments: object) -> object:
+        return make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
+
+    monkeypatch.setattr("mitsim.capture.session.make_plan", simple_plan)
+    camera = tmp_path / "camera.toml"
+    camera.write_text(
+        'name = "short"\npixel_pitch_um = 5.86\nbinning = 2\nfull_well_e = 32360.0\nread_noise_e = 6.7\n'
+        'quantum_efficiency = 0.75\ngain_dn_per_e = 0.125\nbits = 8\nsource = "made for a test"\n'
+    )
+    result, found = calibrate(open_bench(small_scene(n=8), variant, camera=camera), tmp_path / "cal", 2e-2)
+    [told] = [warning for warning in result.warnings if "full well or the ADC's end" in warning]
+    assert told.startswith("30 of 32 frames") and not found.ok
+    manifest = json.loads((tmp_path / "cal" / "manifest.json").read_text())
+    assert tuple(manifest["warnings"]) == result.warnings and manifest["estimate"] == found.status
