@@ -23,11 +23,13 @@ def enter_worker() -> None:
 
     A worker that a signal ended gives 128 + its number, as in a shell. SIGINT, SIGTERM, SIGHUP and SIGQUIT to the
     parent reach the worker, where they raise KeyboardInterrupt (see :func:`stop_signal`); a second one kills it. When
-    the parent is killed, so is the worker. To be called once, before threads are started; without ``os.fork`` the
-    process stays one.
+    the parent is killed, so is the worker. To be called once, before threads are started: RuntimeError when Dr.Jit is
+    there already, whose threads a fork leaves behind. Without ``os.fork`` the process stays one.
     """
     if not hasattr(os, "fork"):
         return
+    if "drjit" in sys.modules:
+        raise RuntimeError("enter_worker: Dr.Jit is imported already, and its threads do not survive a fork")
     reading, writing = os.pipe()
     sys.stdout.flush()
     sys.stderr.flush()

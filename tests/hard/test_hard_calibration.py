@@ -258,7 +258,7 @@ def test_the_command_ends_with_1(
     run, cal = bench(calibration=("12 of 64 frames have pixels at the full well",))
     monkeypatch.setattr(sys, "argv", ["mitsim", "reconstruct", str(run), "--calibration", str(cal), "--json"])
     with pytest.raises(SystemExit) as stop:
-        cli.main()
+        cli.run()
     out, err = capsys.readouterr()
     status = json.loads(out)["status"]
     assert stop.value.code == 1 and "The calibration was flagged: 12 of 64 frames" in status and status in err

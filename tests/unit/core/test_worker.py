@@ -112,3 +112,11 @@ def test_signals_that_are_ignored_stay_ignored() -> None:
     process.send_signal(signal.SIGHUP)
     out, err = process.communicate(timeout=20)
     assert (out, err, process.returncode) == ("done\n", "", 0)
+
+
+def test_a_process_with_threads_of_drjit_is_not_split() -> None:
+    done = start("").communicate()
+    assert done == ("", "")
+    program = "import sys\nsys.modules['drjit'] = sys\nfrom mitsim.core.worker import enter_worker\nenter_worker()"
+    late = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert late.returncode == 1 and "do not survive a fork" in late.stderr
