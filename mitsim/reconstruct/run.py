@@ -19,12 +19,15 @@ from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.frames import checksum, read_frame
 from mitsim.core.manifest import read_json
+from mitsim.core.resources import Cost, Limits
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 
 FloatArray = npt.NDArray[np.float64]
 _MOST_PIXELS = 4096
+_BYTES_A_NUMBER = 32.0
+"""Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
 # Bounds far from any camera, within which products of these numbers stay finite.
 Weight = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Row = Annotated[tuple[Weight, ...], Field(max_length=_MOST_PIXELS), FailFast()]
@@ -206,7 +209,10 @@ def inherited(run: Measurements, factors: Factors) -> tuple[str, ...]:
 
 
 def load(run: Measurements, factors: Factors) -> tuple[Prepared, Accumulator]:
-    """Factorise the model and add every frame of the run."""
+    """Factorise the model and add every frame of the run. MitsimError when that takes more memory than is free."""
+    sides = (factors.left, run.left), (factors.right, run.right)
+    numbers = sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides)
+    Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{run.folder}: factorising its patterns", Limits())
     prepared = prepare(factors.left, factors.right, run.left, run.right, centre=factors.manifest.centre)
     frames = prepared.accumulator()
     for measurement, row, column in run.frames((len(factors.left), len(factors.right))):
