@@ -45,7 +45,7 @@ def check_image(path: Path) -> int:
     """Number of texels of a PNG, JPEG, OpenEXR, Radiance (.hdr) or PFM image."""
     with open(path, "rb") as file:
         start = file.read(_HEADER)
-    if start.startswith(b"\x89PNG\r\n\x1a\n") and start[12:16] == b"IHDR":
+    if start.startswith(b"\x89PNG\r\n\x1a\n") and start[12:16] == b"IHDR" and len(start) >= 24:
         width, height = struct.unpack(">II", start[16:24])
     elif start.startswith(exr.MAGIC):
         header = exr.read_header(path)

@@ -114,7 +114,7 @@ def _window_corners(
     sample, _ = projector.sample_direction(interaction, mi.Point2f(0.5))
     uv = np.array(sample.uv, dtype=np.float64).T
     uv = uv.T if uv.shape[0] == 2 and uv.shape[1] == len(probes) else uv
-    homography = _homography(uv, probes)
+    homography = _homography(uv, probes) if np.isfinite(uv).all() else np.full((3, 3), np.nan)
     rows = (first[0] + n * np.array([0, 0, 1, 1])) / canvas[0]
     columns = (first[1] + n * np.array([0, 1, 0, 1])) / canvas[1]
     mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T

@@ -41,7 +41,7 @@ PLUGINS = {
     "twosided circular",
     "emitter": "area constant directional directionalarea envmap mitsim_projector point projector spot",
     "film": "hdrfilm specfilm",
-    "integrator": "direct path volpath volpathmis",
+    "integrator": "direct path ptracer volpath volpathmis",
     "medium": "homogeneous",
     "phase": "blendphase hg isotropic rayleigh",
     "rfilter": "box catmullrom gaussian lanczos mitchell tent",

@@ -313,6 +313,7 @@ FRAMES = {
     "text": (b"hello", "not an OpenEXR file"),
     "magic alone": (exr_file()[:4], "not an OpenEXR file"),
     "cut in the header": (exr_file()[:100], "more than the header holds"),
+    "cut in the length of an attribute": (exr_file()[: exr_file().index(b"chlist") + 9], "cut short"),
     "cut in the table": (exr_file()[:-350], "more than its"),
     "cut in the last line": (exr_file()[:-1], "more than its"),
     "2^31 pixels": (exr_file((0, 0, 65535, 32767)), "65536x32768"),

@@ -166,3 +166,46 @@ def test_corners_are_found_among_other_numbers(tmp_path: Path, order: str, name:
 def test_an_obj_without_faces_is_left_to_mitsuba(tmp_path: Path) -> None:
     file("m.obj", OBJ[: OBJ.index("f ")])(tmp_path)
     assert check_file(prepared(tmp_path, mesh("m.obj", "obj")), {})
+
+
+@pytest.mark.parametrize("verb", ["plan", "capture", "calibrate", "study", "render"])
+def test_every_verb_passes_the_permission_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str, verb: str
+) -> None:
+    """With ``--allow-outside-files`` the scene is opened with its outside picture, without it is refused."""
+    from mitsim import cli
+    from mitsim.scene import load
+
+    class Opened(Exception):
+        pass
+
+    def stop(*_: object, **__: object) -> None:
+        raise Opened
+
+    monkeypatch.setattr(load.mi, "load_file", stop)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out.png").write_bytes(png(2, 2))
+    (tmp_path / "scene").mkdir()
+    scene = str(prepared(tmp_path / "scene", picture("../out.png")))
+    arguments = {
+        "plan": ["plan", scene],
+        "capture": ["capture", scene, "-o", "new", "--patterns", "uniform"],
+        "calibrate": ["calibrate", scene, "-o", "new"],
+        "study": ["study", "accuracy", scene, "-o", "new"],
+        "render": ["render", scene, "-o", "new.exr"],
+    }[verb]
+    with pytest.raises(MitsimError, match="--allow-outside-files"):
+        cli.app(arguments, standalone_mode=False)
+    with pytest.raises(Opened):
+        cli.app([*arguments, "--allow-outside-files"], standalone_mode=False)
+
+
+def test_a_loaded_scene_knows_its_files(tmp_path: Path, variant: str) -> None:
+    """Also where Mitsuba really reads a picture outside: the list is what it read."""
+    from mitsim.scene.load import load_scene
+
+    (tmp_path / "out.png").write_bytes(png(2, 2))
+    (tmp_path / "scene").mkdir()
+    path = prepared(tmp_path / "scene", picture("../out.png"))
+    loaded = load_scene(path, outside=True)
+    assert [item.name for item in loaded.files] == ["scene.xml", "projector.png", "out.png"]

@@ -1,0 +1,329 @@
+"""Mutations of good files from a seed, and what is done with each; run as a program, it works in a process of its own.
+
+``python -m tests.hard.fuzz KIND FIRST COUNT SECONDS`` prints each seed before its file is touched, so that the parent
+knows which one a crash belongs to, and at the end how many were taken and refused.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.frames import read_frame, write_frame
+from mitsim.reconstruct.run import read_run
+from mitsim.scene.check import check_file
+from mitsim.scene.vocabulary import PLUGINS
+from tests.hard.hostile import GOOD, MESH, OBJ, beside, file
+
+LONGEST = 5.0
+_ROOM = 6 << 30
+_MORE = """
+    <default name="size" value="5"/>
+    <texture type="checkerboard" id="squares"><rgb name="color0" value="0.1, 0.2, 0.3"/>
+        <transform name="to_uv"><scale x="3" y="4"/></transform></texture>
+    <bsdf type="twosided" id="two"><bsdf type="roughconductor"><float name="alpha" value="0.1"/>
+        <string name="material" value="Au"/></bsdf></bsdf>
+    <bsdf type="dielectric" id="glass"><float name="int_ior" value="1.5"/></bsdf>
+    <bsdf type="blendbsdf" id="blend"><float name="weight" value="0.3"/><ref id="paper"/><ref id="two"/></bsdf>
+    <bsdf type="principled" id="paint"><rgb name="base_color" value="0.5"/><float name="roughness" value="0.3"/></bsdf>
+    <bsdf type="mitsim_grating" id="grating"><float name="pitch" value="1600"/>
+        <string name="efficiencies" value="0.3, 0.15"/></bsdf>
+    <bsdf type="plastic" id="coated"><ref name="diffuse_reflectance" id="squares"/></bsdf>
+    <bsdf type="bumpmap" id="bumps"><texture type="bitmap"><string name="filename" value="projector.png"/>
+        <boolean name="raw" value="true"/></texture><ref id="paper"/></bsdf>
+    <shape type="sphere"><point name="center" x="5" y="5" z="300"/><float name="radius" value="$size"/>
+        <ref id="two"/></shape>
+    <shape type="cylinder"><point name="p0" value="0, 0, 300"/><point name="p1" value="9, 0, 300"/>
+        <float name="radius" value="3"/><ref id="glass"/></shape>
+    <shape type="disk"><transform name="to_world"><lookat origin="0, 0, 350" target="0, 0, 0" up="0, 1, 0"/>
+        </transform><ref id="grating"/></shape>
+    <shape type="cube"><transform name="to_world"><rotate x="1" y="1" angle="30"/><scale value="7"/>
+        <translate value="9, 9, 350"/></transform><ref id="blend"/></shape>
+    <shape type="ply"><string name="filename" value="mesh.ply"/><ref id="coated"/></shape>
+    <shape type="obj"><string name="filename" value="mesh.obj"/><ref id="bumps"/></shape>
+    <shape type="shapegroup" id="group"><shape type="sphere"/><shape type="rectangle"/></shape>
+    <shape type="instance"><ref id="group"/><transform name="to_world"><translate z="380"/></transform></shape>
+    <shape type="rectangle"><transform name="to_world"><translate z="390"/></transform>
+        <emitter type="area"><spectrum name="radiance" value="400:1, 700:2"/></emitter></shape>
+    <emitter type="constant"><rgb name="radiance" value="0.1"/></emitter>
+    <emitter type="point"><point name="position" x="0" y="9" z="9"/><rgb name="intensity" value="2"/></emitter>
+    <emitter type="spot"><float name="cutoff_angle" value="20"/><rgb name="intensity" value="2"/></emitter>
+    <medium type="homogeneous" id="fog"><rgb name="albedo" value="0.9"/><float name="scale" value="0.001"/>
+        <phase type="hg"><float name="g" value="0.3"/></phase></medium>
+    <shape type="sphere"><ref name="interior" id="fog"/><bsdf type="null"/></shape>
+    <alias id="paper" as="card"/><include filename="part.xml"/>
+"""
+RICH = GOOD.replace("<!--here-->", _MORE)
+PART = '<scene version="3.0.0"><shape type="sphere"><ref id="own"/></shape><bsdf type="diffuse" id="own"/></scene>'
+_VALUES = (
+    *(
+        "",
+        "0",
+        "-0",
+        "1",
+        "-1",
+        "2",
+        "1e9",
+        "-1e9",
+        "1e-9",
+        "1e38",
+        "1e39",
+        "-1e308",
+        "1e-45",
+        "nan",
+        "inf",
+        "-inf",
+        "0x10",
+    ),
+    *(
+        "1,2",
+        "1 2 3",
+        "1,2,3,4",
+        "0 0 0",
+        "true",
+        "false",
+        "$size",
+        "$",
+        "$$",
+        "\\$",
+        "..",
+        "/dev/zero",
+        "projector.png",
+    ),
+    *(
+        "mesh.ply",
+        "part.xml",
+        "scene.xml",
+        "diffuse",
+        "twosided",
+        "mask",
+        "sphere",
+        "bitmap",
+        "path",
+        "volpath",
+        "null",
+    ),
+    *("two", "paper", "group", "squares", "reflectance", "radius", "to_world", "filename", "x" * 3000, "é", "&#10;"),
+    *(
+        "999999999",
+        "-999999999",
+        "400:1",
+        "400:1,500:2",
+        "instance",
+        "shapegroup",
+        "merge",
+        "normalmap",
+        "hair",
+        "conductor",
+    ),
+    *("envmap", "directional", "rawconstant", "blackbody", "mesh_attribute", "principledthin", "pplastic", "measured"),
+)
+_WORDS = tuple(
+    f"<{word}" for word in ("shape", "bsdf", "texture", "ref", "float", "scene", "path", "include", "!--", "![CDATA[")
+)
+
+
+def bytes_changed(content: bytes, chance: random.Random) -> bytes:
+    """Some bytes flipped, cut out, doubled or put in."""
+    data = bytearray(content)
+    for _ in range(chance.choice((1, 1, 2, 4, 16))):
+        at, length = chance.randrange(len(data) + 1), chance.choice((1, 1, 2, 8, 64))
+        kind = chance.randrange(4)
+        if kind == 0:
+            data[at : at + 1] = bytes([chance.choice((0, 1, 34, 60, 127, 128, 255, chance.randrange(256)))])
+        elif kind == 1:
+            del data[at : at + length]
+        elif kind == 2:
+            data[at:at] = data[at : at + length] * chance.choice((1, 2, 100))
+        else:
+            data[at:at] = chance.choice(_WORDS).encode()
+    return bytes(data)
+
+
+def scene_changed(content: str, chance: random.Random) -> str:
+    """Well-formed for the most part: values exchanged, elements taken away, doubled or moved."""
+    lines = content.split("\n")
+    for _ in range(chance.choice((1, 1, 2, 3))):
+        at = chance.randrange(2, len(lines) - 2)
+        quotes = [i for i, letter in enumerate(lines[at]) if letter == '"']
+        kind = chance.randrange(7)
+        plugins = [*re.finditer(r'<(\w+) type="(\w+)"', lines[at])]
+        if kind < 4 and len(quotes) >= 2:
+            first = chance.randrange(0, len(quotes) - 1, 2)
+            lines[at] = lines[at][: quotes[first] + 1] + chance.choice(_VALUES) + lines[at][quotes[first + 1] :]
+        elif kind == 4:
+            lines[at] = ""
+        elif kind == 5 and plugins:
+            found = chance.choice(plugins)
+            lines[at] = (
+                lines[at][: found.start(2)] + chance.choice(PLUGINS[found[1]].split()) + lines[at][found.end(2) :]
+            )
+        else:
+            lines.insert(chance.randrange(2, len(lines) - 2), lines[at])
+    return "\n".join(lines)
+
+
+def json_changed(value: object, chance: random.Random) -> object:
+    """One item somewhere exchanged for another."""
+    odd = (None, True, -1, 0, 1.5, 1e300, -1e308, 10**30, "", "x", "../a", [], {}, [[]], {"a": 1}, float("nan"), "a\nb")
+    if isinstance(value, dict) and value and chance.random() < 0.9:
+        key = chance.choice(sorted(value))
+        if chance.random() < 0.1:
+            return {name: item for name, item in value.items() if name != key}
+        return {**value, key: json_changed(value[key], chance)}
+    if isinstance(value, list) and value and chance.random() < 0.9:
+        at = chance.randrange(len(value))
+        return [*value[:at], json_changed(value[at], chance), *value[at + 1 :]]
+    return chance.choice(odd)
+
+
+class Fuzz:
+    """One folder with good files; each kind of work takes a seed and raises nothing but MitsimError of one line."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        beside(folder)
+        file("part.xml", PART)(folder)
+        self.scene = folder / "scene.xml"
+        rng = np.random.default_rng(2)
+        pixels = {"DN": rng.integers(0, 4095, (16, 16), dtype=np.uint32), "e": rng.random((16, 16), dtype=np.float32)}
+        write_frame(folder / "a.exr", pixels, {"run": "x", "index": 3})
+        self.frame = (folder / "a.exr").read_bytes()
+        captures = [{"file": "a.exr", "row": i, "column": j, "sign": 0} for i in range(2) for j in range(2)]
+        self.manifest = {
+            "kind": "capture",
+            "status": "complete",
+            "camera": {"name": "bench"},
+            "digital": {"exposure_s": 0.02, "black_level_dn": 40, "gain_dn_per_e": 0.1, "dark_current_e_per_s": 1},
+            "patterns": {"P_L": [[1, 0], [0, 1]], "P_R": [[1, 0], [0, 1]], "captures": captures},
+            "checksums": {"b.exr": "0"},
+        }
+
+    def xml(self, seed: int) -> None:
+        """Scene files through the check alone."""
+        chance = random.Random(seed)
+        content = scene_changed(RICH, chance)
+        self.scene.write_bytes(content.encode() if seed % 2 else bytes_changed(content.encode(), chance))
+        check_file(self.scene, {})
+
+    def load(self, seed: int) -> None:
+        """Scene files that pass the check, loaded by Mitsuba and looked at by rays."""
+        from mitsim.scene.load import load_scene
+
+        self.scene.write_text(scene_changed(RICH, random.Random(seed)), encoding="utf-8")
+        check_file(self.scene, {})
+        load_scene(self.scene)
+
+    def mesh(self, seed: int) -> None:
+        """Mesh files that pass the check, loaded by Mitsuba."""
+        from mitsim.scene.load import load_scene
+
+        chance = random.Random(seed)
+        name, content = (("m.ply", MESH), ("m.obj", OBJ))[seed % 2]
+        file(name, bytes_changed(content.encode(), chance))(self.folder)
+        kind = name[2:]
+        shape = f'<shape type="{kind}"><string name="filename" value="{name}"/></shape>'
+        self.scene.write_text(GOOD.replace("<!--here-->", shape))
+        check_file(self.scene, {})
+        load_scene(self.scene)
+
+    def image(self, seed: int) -> None:
+        """Pictures that pass the check, loaded by Mitsuba."""
+        from mitsim.scene.load import load_scene
+
+        chance = random.Random(seed)
+        good = self.frame if seed % 2 else (self.folder / "projector.png").read_bytes()
+        file("p.exr" if seed % 2 else "p.png", bytes_changed(good, chance))(self.folder)
+        light = f'<emitter type="envmap"><string name="filename" value="p.{"exr" if seed % 2 else "png"}"/></emitter>'
+        self.scene.write_text(GOOD.replace("<!--here-->", light))
+        check_file(self.scene, {})
+        load_scene(self.scene)
+
+    def json(self, seed: int) -> None:
+        """Manifests: other items in good JSON, or other bytes."""
+        chance = random.Random(seed)
+        manifest = self.manifest
+        for _ in range(chance.choice((1, 2, 3))):
+            manifest = json_changed(manifest, chance)  # type: ignore[assignment]
+        content = json.dumps(manifest).encode()
+        (self.folder / "manifest.json").write_bytes(content if seed % 2 else bytes_changed(content, chance))
+        read_run(self.folder)
+
+    def exr(self, seed: int) -> None:
+        """Frames with other bytes, mostly in the header."""
+        chance = random.Random(seed)
+        data = self.frame
+        header = 700
+        changed = bytes_changed(data[:header], chance) + data[header:] if seed % 4 else bytes_changed(data, chance)
+        (self.folder / "b.exr").write_bytes(changed)
+        read_frame(self.folder / "b.exr")
+
+
+def run(
+    work: Callable[[int], None], first: int, count: int, seconds: float, tell: Callable[[int], object]
+) -> tuple[int, int]:
+    """How many were taken and how many refused, until the count or the time is reached."""
+    taken = refused = 0
+    end = time.perf_counter() + seconds
+    for seed in range(first, first + count):
+        tell(seed)
+        started = time.perf_counter()
+        if started > end:
+            break
+        try:
+            work(seed)
+            taken += 1
+        except MitsimError as error:
+            message = str(error)
+            assert message.isprintable() and len(message) <= 1500, message
+            refused += 1
+        spent = time.perf_counter() - started
+        assert spent < LONGEST, f"seed {seed} took {spent:.1f} s"
+    return taken, refused
+
+
+def _hangs(signal_number: int, frame: FrameType | None) -> None:
+    raise TimeoutError(f"over {LONGEST * 4} s")
+
+
+def main() -> None:
+    """Work in this process, with a bound on memory and an alarm for what hangs."""
+    kind, first, count, seconds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
+    if kind in ("load", "mesh", "image"):
+        from mitsim.core.environment import load_variant
+        from mitsim.transport import plugins
+
+        mi = load_variant("llvm_ad_mono")
+        mi.set_log_level(mi.LogLevel.Error)
+        plugins.register()
+    else:
+        resource.setrlimit(resource.RLIMIT_AS, (_ROOM, resource.RLIM_INFINITY))
+    signal.signal(signal.SIGALRM, _hangs)
+
+    def said(line: str) -> None:
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()
+
+    def tell(seed: int) -> None:
+        signal.alarm(int(LONGEST * 4))
+        said(f"seed {seed}")
+
+    with tempfile.TemporaryDirectory() as folder:
+        taken, refused = run(getattr(Fuzz(Path(folder)), kind), first, count, seconds, tell)
+    said(f"{kind}: {taken} taken, {refused} refused")
+
+
+if __name__ == "__main__":
+    main()
