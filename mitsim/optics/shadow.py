@@ -33,6 +33,8 @@ from mitsim.optics.profile import Steps
 
 FloatArray = npt.NDArray[np.float64]
 SeparableTerms = list[tuple[FloatArray, FloatArray]]
+_WIDE = 32
+"""Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +162,9 @@ def geometric_terms(setting: Setting, rows: Directions, columns: Directions) -> 
 def _thin_means(setting: Setting, profiles: list[FloatArray], directions: Directions) -> FloatArray:
     """(terms, m, c) mean transmissions."""
     feature = setting.mask.feature_mm
+    if setting.half_pixel + setting.half_cell(directions) > _WIDE * feature:
+        steps, crossings = [Steps.of(profile, feature) for profile in profiles], setting.crossings(directions)
+        return np.stack([one.box_means(crossings, setting.half_pixel, setting.half_cell(directions)) for one in steps])
     centre = setting.crossings(directions) / feature
     half_pixel, half_cell = np.array(setting.half_pixel / feature), np.array(setting.half_cell(directions) / feature)
     return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])
@@ -250,7 +255,7 @@ def _trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArra
     centre = crossing + len(profile) / 2
     reach = half_a + half_b
     first = np.floor(centre - reach)
-    feature = first.astype(np.intp)
+    feature = np.clip(first, -(2**62), 2**62).astype(np.intp)
     offset = first - centre
     padded = np.concatenate(([0.0], profile, [0.0]))
     total = np.zeros_like(centre)
