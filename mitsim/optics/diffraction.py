@@ -99,8 +99,8 @@ class EdgeWaves:
         if size > _LARGEST_GRID:
             raise MitsimError(
                 f"diffraction over {product**0.5 * 1e3:.3g} um (sqrt of wavelength x distance) needs a grid of "
-                f"{size:.3g} points, more than {_LARGEST_GRID}; move the mask off the sensor and the scene, or take fewer or "
-                "smaller pixels"
+                f"{size:.3g} points, more than {_LARGEST_GRID}; move the mask off the sensor and the scene, or take "
+                "fewer or smaller pixels"
             )
         x = (np.arange(reach) + 0.5) * step_mm
         sine, cosine = fresnel(x * (2 / product) ** 0.5)
