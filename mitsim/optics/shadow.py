@@ -271,8 +271,10 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
     """Distribution function at x of the sum of two centred uniform variables of the given half-widths."""
     short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
     distance = np.abs(x)
-    # The tail is used only where it is not empty, so the floor of its divisor changes no value.
-    tail = np.square(np.maximum(short + long - distance, 0)) / np.maximum(8 * short * long, np.finfo(float).tiny)
+    # The tail is used only where it is not empty and at most 2 short wide, so neither bound changes a value.
+    tail = np.square(np.clip(short + long - distance, 0, 2 * short)) / np.maximum(
+        8 * short * long, np.finfo(float).tiny
+    )
     centre = 0.5 - distance / (2 * long)
     upper = np.where(distance <= long - short, centre, tail)
     return np.asarray(np.where(x < 0, upper, 1 - upper))
