@@ -107,7 +107,7 @@ class Setting:
     @property
     def shrink(self) -> float:
         """d s / d u = 1 - d/z."""
-        return 1 - self.distance_mm / self.depth_mm
+        return _shrink(self.distance_mm, self.depth_mm)
 
     @property
     def half_pixel(self) -> float:
@@ -227,7 +227,7 @@ def shadow_factor(
     _require_positive("mask feature size", feature_mm)
     _require_positive("distance from sensor to mask", mask_distance_mm)
     _require_beyond(depth_mm, mask_distance_mm)
-    pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * (1 - mask_distance_mm / depth_mm) / feature_mm
+    pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * _shrink(mask_distance_mm, depth_mm) / feature_mm
     cells = _checked_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
     centre = (pixels[:-1] + pixels[1:])[:, None] / 2 + (cells[:-1] + cells[1:])[None, :] / 2
     return _trapezoid_mean(values, centre, np.diff(pixels)[:, None] / 2, np.diff(cells)[None, :] / 2)
@@ -278,6 +278,11 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
     centre = 0.5 - distance / (2 * long)
     upper = np.where(distance <= long - short, centre, tail)
     return np.asarray(np.where(x < 0, upper, 1 - upper))
+
+
+def _shrink(distance_mm: float, depth_mm: float) -> float:
+    """1 - d/z as (z - d)/z: beside the scene the difference of two lengths keeps digits that 1 - d/z has lost."""
+    return (depth_mm - distance_mm) / depth_mm if np.isfinite(depth_mm) else 1.0
 
 
 def _require_beyond(depth_mm: float, mask_mm: float) -> None:
