@@ -198,7 +198,7 @@ def test_means_of_a_fine_grid_equal_fractions(a: float, b: float) -> None:
     many=st.booleans(),
 )
 def test_samplers_of_mirrored_light_equal_fractions(count: int, place: float, width: float, many: bool) -> None:
-    """Means over any width, 0 included, of up to 30 000 values; a difference of two sums had 1e-3 left at width 0."""
+    """Means over any width, 0 included, of up to 30 000 values; a difference of two sums had 5e-3 left at width 0."""
     numerators = np.random.default_rng(count).integers(0, 2**20, count * (1000 if many else 1))
     feature = 2.0**-14 if many else 2.0**-4
     sampler, length = ProfileSampler(numerators / 2**20, feature), len(numerators) * feature
@@ -244,7 +244,7 @@ def test_light_through_the_mask_is_neither_made_nor_lost(bits, feature, distance
 
 
 def test_cells_of_a_fine_grid_keep_their_values_in_a_mask_of_four_metres() -> None:
-    """65 535 features and cells of 1 nm: exact inside features; differences of sums of 2 m had 2e-7 left."""
+    """65 535 features and cells of 1 nm: exact inside features; differences of sums of 2 m had 1e-7 left."""
     bits = mls_mask(order=16).bits
     steps = Steps.of(bits, 0.06)
     for k in range(60_000, 60_020):
