@@ -8,6 +8,7 @@ from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from mitsim.capture.bench import Bench
 from mitsim.core.errors import MitsimError
@@ -18,6 +19,7 @@ from mitsim.optics.speckle import speckled
 from mitsim.scene.patterns import PatternFamily
 from mitsim.sensor.chain import (
     Digital,
+    add_dark_current,
     dn_to_electrons,
     electrons_from_irradiance,
     expose,
@@ -27,6 +29,7 @@ from mitsim.sensor.chain import (
 
 FloatArray = npt.NDArray[np.float64]
 _LONGEST_S = 1e6
+_CAN_SATURATE = 1e-3
 FRAMES_AT_ONCE = 16
 """Frames held in memory at a time."""
 
@@ -104,12 +107,20 @@ class Exposer:
         _, variance = frame_moments(electrons, self.exposure_s, self.bench.sensor)
         return float(np.sqrt(variance.mean()) / self.bench.sensor.gain_dn_per_e)
 
-    def saturated(self, digital: Digital) -> bool:
-        """Whether any pixel reached the full well or the end of the ADC."""
+    def saturated(self, digital: Digital, electrons: FloatArray) -> bool:
+        """Whether any pixel reached the full well or the ADC's end, from the frame and its expected photoelectrons.
+
+        A reading at the full well counts where the light can have filled it: with a chance of 1e-3 in the whole frame.
+        Elsewhere it is read noise.
+        """
         sensor = self.bench.sensor
-        full = sensor.superpixel_full_well_e * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn
-        limit = full if sensor.largest_dn is None else min(full, sensor.largest_dn)
-        return bool(digital.max() >= np.floor(limit)) if np.isfinite(limit) else False
+        well, brightest = sensor.superpixel_full_well_e, float(digital.max())
+        if sensor.largest_dn is not None and brightest >= sensor.largest_dn:
+            return True
+        if np.isinf(well) or brightest < np.floor(well * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn):
+            return False
+        peak = add_dark_current(electrons.max(), self.exposure_s, sensor)
+        return bool(special.pdtrc(np.ceil(well) - 1, peak) * electrons.size >= _CAN_SATURATE)
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
         """Noisy measurement [electrons / s] of every pattern (i, j); a signed pattern is a difference of two frames."""

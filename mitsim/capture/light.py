@@ -128,6 +128,12 @@ def scene_facts(bench: Bench) -> SceneFacts:
             f"mask_thickness {geometry.mask_thickness} mm shifts the far face by {geometry.wall_shift_features:.1f} "
             "features at the field stop; the two-face model holds below 1"
         )
+    longest = float(bench.spectrum.wavelengths_nm.max())
+    if geometry.mask_feature * 1e6 < longest:
+        warnings.append(
+            f"mask_feature {geometry.mask_feature:g} mm is below the wavelength of {longest:.0f} nm; scalar theory of "
+            "masks needs features above it, so the shadow is a guess"
+        )
     return SceneFacts(
         absent={
             "mirrors": "no surface reflects or transmits light in single directions",

@@ -230,7 +230,7 @@ class _Writer:
                 if frame.rendering_noise:
                     ratio = frame.rendering_noise / frame.sensor_noise if frame.sensor_noise else np.inf
                     self.noise_ratio = max(self.noise_ratio, ratio)
-                self.saturated += self.exposer.saturated(frame.digital)
+                self.saturated += self.exposer.saturated(frame.digital, frame.electrons)
                 self._noise_energy += frame.sensor_noise**2 * frame.electrons.size
                 self._energy += float(np.square(frame.electrons).sum())
             progress("frames", (chunk[-1][0] + 1) / len(expected))

@@ -98,8 +98,9 @@ class EdgeWaves:
         size = count + 2 * reach
         if size > _LARGEST_GRID:
             raise MitsimError(
-                f"diffraction over {product**0.5 * 1e3:.3g} um (sqrt of wavelength x distance) needs a grid of {size} "
-                f"points, more than {_LARGEST_GRID}; the geometric shadow is good here, leave diffraction off"
+                f"diffraction over {product**0.5 * 1e3:.3g} um (sqrt of wavelength x distance) needs a grid of "
+                f"{size:.3g} points, more than {_LARGEST_GRID}; move the mask off the sensor and the scene, or take "
+                "fewer or smaller pixels"
             )
         x = (np.arange(reach) + 0.5) * step_mm
         sine, cosine = fresnel(x * (2 / product) ** 0.5)

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
-_THIN = 1e-4
-"""Boxes narrower than this part of a pixel count as points: the second difference would divide by next to nothing."""
+_FEW = 4
+"""Edges in the narrower box that are taken one by one; with more, the box is wide enough for a second difference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +54,15 @@ class Steps:
 
     def cell_means(self, start: float, step: float, count: int) -> FloatArray:
         """(count,) means over cells of width ``step`` from ``start`` on; a cell with an edge in it gets its share."""
+        bounds = start + step * np.arange(count + 1)
+        index = np.searchsorted(self.edges, bounds, side="right")
+        found = np.concatenate(([0.0], self.values, [0.0]))[index[:-1]]
+        # Only where an edge lies inside: a difference of large sums would lose digits everywhere.
+        cut = np.flatnonzero(np.diff(index))
         covered = np.concatenate(([0.0], np.cumsum(self.values * np.diff(self.edges))))
-        at = np.interp(start + step * np.arange(count + 1), self.edges, covered)
-        return np.asarray(np.diff(at) / step)
+        at = np.interp(bounds[[cut, cut + 1]], self.edges, covered)
+        found[cut] = (at[1] - at[0]) / step
+        return np.asarray(found)
 
     def box_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
         """Means over the two boxes around ``centres`` [mm], any shape."""
@@ -106,24 +112,40 @@ class _Antiderivative:
     def means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
         """(functions, *centres.shape) means over a box of each half-width."""
         wide, narrow = max(half_pixel, half_cell), min(half_pixel, half_cell)
-        if narrow < _THIN * wide:
-            total = self._at(centres + wide, order=1) - self._at(centres - wide, order=1)
-            total /= 2 * wide
-        else:
-            total = self._at(centres + (wide + narrow), order=2) - self._at(centres + (wide - narrow), order=2)
-            total -= self._at(centres - (wide - narrow), order=2)
-            total += self._at(centres - (wide + narrow), order=2)
-            total /= 4 * wide * narrow
+        total = self._ends(centres + wide, narrow) - self._ends(centres - wide, narrow)
+        total /= 2 * wide
         total += self._mean.reshape(-1, *[1] * centres.ndim)
         return total
 
-    def _at(self, points: FloatArray, order: int) -> FloatArray:
-        """The antiderivative of that order at points, for each function."""
+    def _ends(self, points: FloatArray, half: float) -> FloatArray:
+        """(functions, *points.shape) means of the first antiderivative over [points - half, points + half]."""
+        if half == 0:
+            return self._at(points, order=1)
+        # Edge k opens interval k, so these are the edges inside.
+        first = self._index(points - half) + 1
+        most = int((self._index(points + half) + 1 - first).max())
+        if most > _FEW:
+            return (self._at(points + half, order=2) - self._at(points - half, order=2)) / (2 * half)
+        found = self._at(points, order=1)
+        jumps = np.diff(self._values, axis=1, append=self._values[:, -1:])
+        for edge in range(most):
+            opened = np.minimum(first + edge, self._values.shape[1])
+            corner = np.square(np.maximum(half - np.abs(points - self._edges[opened]), 0)) / (4 * half)
+            for jump, out in zip(jumps, found, strict=True):
+                out += jump[opened - 1] * corner
+        return found
+
+    def _index(self, points: FloatArray) -> npt.NDArray[np.intp]:
+        """The interval that holds each point."""
         if self._step is None:
             index = np.searchsorted(self._edges, points, side="right") - 1
         else:
             index = ((points - self._edges[0]) / self._step).astype(np.intp)
-        index = np.clip(index, 0, self._values.shape[1] - 1)
+        return np.clip(index, 0, self._values.shape[1] - 1)
+
+    def _at(self, points: FloatArray, order: int) -> FloatArray:
+        """The antiderivative of that order at points, for each function."""
+        index = self._index(points)
         beyond = points - self._edges[index]
         found = np.empty((len(self._values), *points.shape))
         for values, first, second, out in zip(self._values, self._first, self._second, found, strict=True):

@@ -29,20 +29,23 @@ class ProfileSampler:
         ``feature_mm``: their size [mm]."""
         values = np.asarray(profile, dtype=np.float64)
         self._values = np.concatenate(([0.0], values, [0.0]))
-        self._sums = np.concatenate(([0.0, 0.0], np.cumsum(values)))
+        self._sums = np.cumsum(self._values)
         self._feature, self._count = feature_mm, len(values)
         self._start = -len(values) / 2 if start_mm is None else start_mm / feature_mm
 
     def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
         """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
-        centre, half = s / self._feature - self._start, np.maximum(np.abs(width) / self._feature, 1e-9) / 2
-        return np.asarray((self._integral(centre + half) - self._integral(centre - half)) / (2 * half))
+        centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
+        low, high = centre - half, centre + half
+        first, last = self._index(low), self._index(high)
+        # Two features that are cut and what lies between: with nothing between, no large sums are subtracted.
+        parts = self._values[first] * (first - low) + self._values[last] * (high - last + 1)
+        parts += self._sums[np.maximum(last - 1, first)] - self._sums[first]
+        return np.asarray(np.where(first == last, self._values[first], parts / np.where(half > 0, 2 * half, 1)))
 
-    def _integral(self, x: FloatArray) -> FloatArray:
-        """Integral of the profile up to x, in features from its first edge."""
-        feature = np.clip(np.floor(x).astype(np.intp), -1, self._count)
-        inside = np.clip(x, 0, self._count) - feature
-        return np.asarray(self._sums[feature + 1] + self._values[feature + 1] * inside)
+    def _index(self, x: FloatArray) -> npt.NDArray[np.intp]:
+        """Place in the padded values of what lies at x (features from the first edge); feature k is number k + 1."""
+        return np.clip(np.floor(x), -1, self._count).astype(np.intp) + 1
 
 
 def wave_samplers(

@@ -33,6 +33,8 @@ from mitsim.optics.profile import Steps
 
 FloatArray = npt.NDArray[np.float64]
 SeparableTerms = list[tuple[FloatArray, FloatArray]]
+_WIDE = 32
+"""Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +107,7 @@ class Setting:
     @property
     def shrink(self) -> float:
         """d s / d u = 1 - d/z."""
-        return 1 - self.distance_mm / self.depth_mm
+        return _shrink(self.distance_mm, self.depth_mm)
 
     @property
     def half_pixel(self) -> float:
@@ -160,6 +162,9 @@ def geometric_terms(setting: Setting, rows: Directions, columns: Directions) -> 
 def _thin_means(setting: Setting, profiles: list[FloatArray], directions: Directions) -> FloatArray:
     """(terms, m, c) mean transmissions."""
     feature = setting.mask.feature_mm
+    if setting.half_pixel + setting.half_cell(directions) > _WIDE * feature:
+        steps, crossings = [Steps.of(profile, feature) for profile in profiles], setting.crossings(directions)
+        return np.stack([one.box_means(crossings, setting.half_pixel, setting.half_cell(directions)) for one in steps])
     centre = setting.crossings(directions) / feature
     half_pixel, half_cell = np.array(setting.half_pixel / feature), np.array(setting.half_cell(directions) / feature)
     return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])
@@ -222,7 +227,7 @@ def shadow_factor(
     _require_positive("mask feature size", feature_mm)
     _require_positive("distance from sensor to mask", mask_distance_mm)
     _require_beyond(depth_mm, mask_distance_mm)
-    pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * (1 - mask_distance_mm / depth_mm) / feature_mm
+    pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * _shrink(mask_distance_mm, depth_mm) / feature_mm
     cells = _checked_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
     centre = (pixels[:-1] + pixels[1:])[:, None] / 2 + (cells[:-1] + cells[1:])[None, :] / 2
     return _trapezoid_mean(values, centre, np.diff(pixels)[:, None] / 2, np.diff(cells)[None, :] / 2)
@@ -250,7 +255,7 @@ def _trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArra
     centre = crossing + len(profile) / 2
     reach = half_a + half_b
     first = np.floor(centre - reach)
-    feature = first.astype(np.intp)
+    feature = np.clip(first, -(2**62), 2**62).astype(np.intp)
     offset = first - centre
     padded = np.concatenate(([0.0], profile, [0.0]))
     total = np.zeros_like(centre)
@@ -266,11 +271,18 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
     """Distribution function at x of the sum of two centred uniform variables of the given half-widths."""
     short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
     distance = np.abs(x)
-    # The tail is used only where it is not empty, so the floor of its divisor changes no value.
-    tail = np.square(np.maximum(short + long - distance, 0)) / np.maximum(8 * short * long, np.finfo(float).tiny)
+    # The tail is used only where it is not empty and at most 2 short wide, so neither bound changes a value.
+    tail = np.square(np.clip(short + long - distance, 0, 2 * short)) / np.maximum(
+        8 * short * long, np.finfo(float).tiny
+    )
     centre = 0.5 - distance / (2 * long)
     upper = np.where(distance <= long - short, centre, tail)
     return np.asarray(np.where(x < 0, upper, 1 - upper))
+
+
+def _shrink(distance_mm: float, depth_mm: float) -> float:
+    """1 - d/z as (z - d)/z: beside the scene the difference of two lengths keeps digits that 1 - d/z has lost."""
+    return (depth_mm - distance_mm) / depth_mm if np.isfinite(depth_mm) else 1.0
 
 
 def _require_beyond(depth_mm: float, mask_mm: float) -> None:

@@ -8,8 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsim.core.configuration import load_model
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=1e-12, le=1e12, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
+_LARGEST_CODE = 2**32 - 1
+"""What a frame's uint32 holds."""
 
 
 class SensorModel(BaseModel):
@@ -27,7 +29,7 @@ class SensorModel(BaseModel):
     name: str = Field(description="what the sensor is called in reports")
     pixel_pitch_um: Positive = Field(description="distance between centres of the square pixels, um")
     binning: int = Field(default=1, ge=1, le=64, description="pixels summed along each side of a superpixel")
-    full_well_e: float = Field(gt=0, description="electrons a pixel holds; inf = no limit")
+    full_well_e: float = Field(ge=1e-12, description="electrons a pixel holds; inf = no limit")
     read_noise_e: NonNegative = Field(description="standard deviation of one pixel's reading, electrons")
     dark_current_e_per_s: NonNegative = Field(default=0.0, description="electrons a second and pixel")
     quantum_efficiency: float = Field(gt=0, le=1, description="electrons per photon, at source's wavelength")
@@ -40,6 +42,15 @@ class SensorModel(BaseModel):
     def _room_above_black(self) -> "SensorModel":
         if self.bits is not None and self.black_level_dn >= 2**self.bits - 1:
             raise ValueError(f"black_level_dn {self.black_level_dn} leaves no room below 2^{self.bits} - 1")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_a_frame(self) -> "SensorModel":
+        if self.largest_dn is not None and self.largest_dn > _LARGEST_CODE:
+            raise ValueError(
+                f"bits {self.bits} with binning {self.binning} has codes up to {self.largest_dn}; "
+                f"frames hold at most {_LARGEST_CODE}, so bin less or take fewer bits"
+            )
         return self
 
     @property

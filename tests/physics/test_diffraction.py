@@ -269,6 +269,7 @@ def test_a_finer_grid_changes_little(monkeypatch: pytest.MonkeyPatch, distance: 
 
 def beyond_one_term(terms: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Relative distance of sum_k left_k (x) right_k from its best single separable term; left_k ~ right_k."""
+    terms = [(left, right) for left, right in terms if right.any()]
     vectors = np.array([right.ravel() for _, right in terms])
     signs = np.array([np.vdot(left, right) / np.vdot(right, right) for left, right in terms])
     size, turn = np.linalg.eigh(vectors @ vectors.T)
@@ -303,5 +304,5 @@ def test_bad_spectra_are_refused_in_one_line(wavelengths: list, weights: list) -
 
 def test_a_hopeless_grid_is_refused() -> None:
     geometry = CameraGeometry(pixels=64, mask_distance=1e-9)
-    with pytest.raises(MitsimError, match="leave diffraction off"):
+    with pytest.raises(MitsimError, match=r"a grid of 1.31e\+08 .*move the mask off the sensor"):
         geometry.shadow_terms(Directions([0.0], 0.0), Directions([0.0], 0.0), 400.0, line())
