@@ -123,6 +123,19 @@ def test_few_photons(power: float, seed: int) -> None:
     )
 
 
+def test_noise_alone_flags_a_well_conditioned_camera() -> None:
+    """Every pixel sees one scene row and column, so the rank never suffers: at 0.4 electrons a pixel the error is 20 %.
+
+    Closed form: a factor of ones has error 1 / (8 sqrt(electrons)) here (16 responses, 64 numbers for each scene row).
+    """
+    factor = np.kron(np.eye(N), np.ones((PIXELS // N, 1)))
+    for electrons, ok in ((0.4, False), (40.0, True)):
+        found = Camera(factor, factor).calibrate(electrons)
+        assert max(found.predicted_error) == pytest.approx(1 / (8 * np.sqrt(electrons)), rel=0.15)
+        assert found.rank == (N, N) and found.ok == ok
+        assert found.status.startswith("Calibrated" if ok else "Factors are mostly noise")
+
+
 def test_unstated_noise_shows_in_the_residual() -> None:
     """Without the sensor's noise the residual alone must tell: it grows as exposure falls, and flags."""
     camera = Camera(shadow(), shadow())
