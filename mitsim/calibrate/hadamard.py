@@ -191,10 +191,11 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
 
     u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, and U H^T / N averages N of them with signs,
     so the factor has variance noise^2 / (N |v|^2). The error of v itself enters at second order and as a
-    common scale of order noise / (|a| |v|), and is left out.
+    common scale of order noise / (|a| |v|), and is left out. Infinite for a factor that is zero.
     """
     deviation = noise / (np.sqrt(count) * common_norm)
-    return float(deviation * np.sqrt(factor.size) / np.linalg.norm(factor))
+    norm = float(np.linalg.norm(factor))
+    return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
 
 
 def _verdict(inseparable: bool, residual: float, error: float, lost_rows: int, lost_columns: int) -> tuple[bool, str]:
@@ -222,6 +223,8 @@ def _rank(phi: FloatArray, error: float) -> int:
     Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
     norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
     """
+    if not phi.any():
+        return 0
     singular, rounding = _singular(phi)
     deviation = error * np.linalg.norm(phi) / np.sqrt(phi.size)
     rows = phi.shape[0]

@@ -106,8 +106,7 @@ def test_dots_of_every_pitch(n: int) -> None:
     assert conditions[0] > 1e3 and conditions[-1] < 2, "n dots are n separate pixels"
 
 
-@pytest.mark.parametrize("pixels", [512, 256, 128, 64, 32])
-@pytest.mark.parametrize("k", [1, 7])
+@pytest.mark.parametrize(("pixels", "k"), [(512, 1), (256, 1), (128, 1), (64, 1), (32, 1), (512, 7), (64, 7), (32, 7)])
 def test_binned_sensors(pixels: int, k: int) -> None:
     """512 to 32 pixels for 128 scene pixels: what is not measured is named, what is measured is right.
 
