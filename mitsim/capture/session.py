@@ -134,8 +134,9 @@ class Session:
 
         def shoot(item: tuple[int, Frame]) -> tuple[FloatArray, bool]:
             index, frame = item
-            digital = exposer.digital(exposer.lit(frame, "calibration", side, index), "calibration", side, index)
-            return exposer.rate(digital), exposer.saturated(digital)
+            lit = exposer.lit(frame, "calibration", side, index)
+            digital = exposer.digital(lit, "calibration", side, index)
+            return exposer.rate(digital), exposer.saturated(digital, lit)
 
         done = 0
         while True:

@@ -271,6 +271,16 @@ def test_folders_without_flags(bench: Callable[..., tuple[Path, Path]]) -> None:
     assert found.ok and "flagged" not in found.status
 
 
+def test_factors_that_do_not_fit_the_memory_are_refused(
+    bench: Callable[..., tuple[Path, Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = bench()
+    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 1e4)
+    with pytest.raises(MitsimError, match=r"factorising its patterns: would take about 0\.0625 MiB of memory"):
+        image_of(*folders)
+    assert not (folders[0] / "image").exists()
+
+
 def test_the_command_ends_with_1(
     bench: Callable[..., tuple[Path, Path]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
