@@ -313,8 +313,8 @@ def _warnings(
         return ()
     if evidence.unresolved > accuracy:
         return (
-            f"{evidence.unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack most "
-            "of it; give those surfaces more roughness, or make them perfect mirrors (conductor)",
+            f"{evidence.unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
+            "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)",
         )
     parts = {
         f"{anchors}x{anchors} anchors": evidence.anchor_error[anchors],
