@@ -14,6 +14,7 @@ import numpy as np
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file
 from mitsim.scene.projector import ProjectorGrid, locate_projector
+from mitsim.scene.texels import check_texels
 
 SENSOR_PLUGIN = "mitsim_lensless"
 
@@ -62,6 +63,7 @@ def load_scene(path: Path, defines: Mapping[str, str] | None = None, needs_proje
         raise
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise MitsimError(f"{path}: Mitsuba refuses the scene: {_one_line(error)}") from None
+    check_texels(path, scene)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
