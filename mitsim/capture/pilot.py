@@ -34,7 +34,7 @@ LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)
 CELL_LADDER = (1, 2, 4, 8)
 _FIRST_JUDGE, _FEW_ANCHORS = 5, 3
 _CAPTURES = 4
-_LOBE_RAYS = 2**21
+_LOBE_RAYS = 2**20
 """Rays that look for sharp lobes."""
 _FEWEST_HITS = 30.0
 """Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""

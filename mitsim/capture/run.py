@@ -29,8 +29,11 @@ from mitsim.scene.plan import Plan
 from mitsim.sensor.chain import Digital
 
 FloatArray = npt.NDArray[np.float64]
-_FIREFLIES = 0.85
-"""Part of the variance in one of 8 groups; a single heavy path gives 0.875, normal noise 0.85 once in 10 000 runs."""
+_FIREFLIES = 0.8
+"""Part of the variance in one of 8 groups: a single heavy path gives 0.875, and ordinary noise 0.2 to 0.4.
+
+Normal noise gives 0.8 once in 600 runs if it is the same in all pixels of all frames (Grubbs' test), else never.
+"""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 _OF_PROJECTOR = frozenset({"aperture", "blur", "pixel-response"})
