@@ -172,7 +172,7 @@ def test_a_perfect_mirror_is_exact(small_scene: Callable[..., Path]) -> None:
     bench = open_bench(small_scene(mask="open", **glossy(None)))
     frames = bench.mirror_light.frames(np.zeros(N * N, np.int64), bench.geometry, None)
     # The sensor's corner lies 0.53 mm off: obliquity and distance change by 1e-6.
-    assert frames.irradiance.sum(axis=0) == pytest.approx(np.full((64, 64), GLINT), rel=1e-4)
+    assert np.abs(frames.irradiance.sum(axis=0) / GLINT - 1).max() < 1e-4
 
 
 def test_light_over_sharp_lobes_alone_is_refused(small_scene: Callable[..., Path]) -> None:

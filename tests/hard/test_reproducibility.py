@@ -125,7 +125,7 @@ def test_mixing_does_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch, colu
         monkeypatch.setattr(parallel, "workers", lambda count=count: count)
         found.add(frames._mix(weights, basis).tobytes())
     assert len(found) == 1
-    assert np.frombuffer(found.pop()) == pytest.approx((weights @ basis).ravel(), rel=1e-13)
+    assert np.allclose(np.frombuffer(found.pop()), (weights @ basis).ravel(), rtol=1e-13, atol=0)
 
 
 def test_results_keep_their_order_in_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
