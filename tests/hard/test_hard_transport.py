@@ -37,6 +37,7 @@ from tests.physics.radiosity import Furnace
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE, PLACE, Z = 16, 111000.0, 60.0, 400.0
 SIGMAS, SEVEN = 5.0, 7.0
+SLOW = pytest.mark.slow
 PIXEL = 0.3 / N
 EPSILON = 9e-5 * (1 + Z)
 """Mitsuba's ray epsilon at the sheet [mm]."""
@@ -154,7 +155,9 @@ def test_sharp_lobes_are_found_from_the_surface(small_scene: Callable[..., Path]
     assert low * lobe(alpha) - SIGMAS * error < found < lobe(alpha) + SIGMAS * error
 
 
-@pytest.mark.parametrize(("alpha", "seen"), [(1e-2, True), (1e-3, False), (1e-4, False)])
+@pytest.mark.parametrize(
+    ("alpha", "seen"), [pytest.param(1e-2, True, marks=SLOW), pytest.param(1e-3, False, marks=SLOW), (1e-4, False)]
+)
 def test_a_lobe_that_would_be_missed_flags_the_plan(small_scene: Callable[..., Path], alpha: float, seen: bool) -> None:
     """At 1e-3 and below the frames would lack 95 % of the light, and no group would tell: the plan says so."""
     bench = open_bench(small_scene(**glossy(alpha)))
@@ -227,7 +230,10 @@ def of_plane(centre: np.ndarray, normal: np.ndarray, sensor: np.ndarray, half: f
 GRAZE = np.radians(89.99)
 
 
-@pytest.mark.parametrize("angle", [0.0, 80.0, 89.0, 89.9, 89.99])
+@pytest.mark.parametrize(
+    "angle",
+    [0.0, pytest.param(80.0, marks=SLOW), pytest.param(89.0, marks=SLOW), pytest.param(89.9, marks=SLOW), 89.99],
+)
 def test_a_plane_lit_at_grazing_incidence(plane: Callable[..., Bench], angle: float) -> None:
     """Turned about y until the projector's ray meets its centre at the angle; at 89.99 degrees one ray in 80 000 does.
 
@@ -248,7 +254,7 @@ def test_a_plane_lit_at_grazing_incidence(plane: Callable[..., Bench], angle: fl
     assert gate < 0.12 * expected and abs(found - expected) < gate
 
 
-@pytest.mark.parametrize("angle", [80.0, 89.0, 89.99])
+@pytest.mark.parametrize("angle", [pytest.param(80.0, marks=SLOW), pytest.param(89.0, marks=SLOW), 89.99])
 def test_a_plane_seen_at_grazing_incidence(plane: Callable[..., Bench], angle: float) -> None:
     """Turned until the camera's centre sees it at the angle from its normal, on the side that is lit."""
     centre = np.array([-10.0, 0.0, Z])
@@ -405,6 +411,7 @@ def frame_at(write: Callable[..., Path], scale: float) -> np.ndarray:
     return next(iter(simulation.expected([found], np.arange(1), weights, 0))).irradiance
 
 
+@pytest.mark.slow
 def test_scenes_in_other_units(small_scene: Callable[..., Path]) -> None:
     """All lengths times s: the same frame over s^2, for the projector's irradiance is stated at a distance of 1.
 
@@ -443,7 +450,9 @@ def furnace(write: Callable[..., Path], albedo: float) -> IndirectTracer:
     return IndirectTracer(bench.loaded.scene, bench.loaded.camera, bench.source, False, True)
 
 
-@pytest.mark.parametrize(("albedo", "samples"), [(0.9, 64), (0.99, 32), (0.999, 8)])
+@pytest.mark.parametrize(
+    ("albedo", "samples"), [pytest.param(0.9, 64, marks=SLOW), pytest.param(0.99, 32, marks=SLOW), (0.999, 8)]
+)
 def test_a_closed_room_that_absorbs_little(small_scene: Callable[..., Path], albedo: float, samples: int) -> None:
     """Light of 10, 100 and 1000 reflections against the furnace's closed form."""
     tracer = furnace(small_scene, albedo)
@@ -456,8 +465,8 @@ def test_a_closed_room_that_absorbs_little(small_scene: Callable[..., Path], alb
 # ---- single texels
 
 
-def test_one_pixel_is_a_projector(small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    """n = 1: a window of one texel among 4 x 8. All its light is the window's, and a capture of one frame is whole."""
+def test_one_pixel_is_a_projector(small_scene: Callable[..., Path]) -> None:
+    """n = 1: a window of one texel among 4 x 8. All its light is the window's."""
     canvas = np.zeros((4, 8))
     canvas[1, 5] = 255
     bench = open_bench(small_scene(canvas=canvas))
@@ -466,6 +475,11 @@ def test_one_pixel_is_a_projector(small_scene: Callable[..., Path], tmp_path: Pa
     expected = 0.5 * SCALE / Z**2 * dx @ (1 + x[:, None] ** 2 + y**2) ** -2.0 @ dy
     found, error = mean(seen_alone(bench, 8, 4096)[:, 0, 0])
     assert error < 1e-4 * expected and abs(found - expected) < SEVEN * error + 1e-6 * expected
+
+
+@pytest.mark.slow
+def test_one_pixel_is_captured(small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    bench = open_bench(small_scene(canvas=np.pad([[255.0]], ((1, 2), (5, 2)))))
     result = capture(bench, "uniform", tmp_path / "run", 2e-2, seed=1, effects={"diffraction": False})
     assert result.frames == 1 and 0 < result.mc_error < 2e-2 and np.isfinite(result.exposure_s)
 
@@ -611,6 +625,7 @@ def test_a_capture_tells_of_fireflies(
         assert any("fireflies" in warning for warning in manifest["warnings"]) is fireflies
 
 
+@pytest.mark.slow
 def test_ordinary_scenes_have_none(white: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
     """A sheet, and a plate of roughness 0.1 that adds noise of its own: no warning, shares of plain noise."""
     for name, bench in (("white", white), ("glossy", open_bench(small_scene(**glossy(0.1))))):
