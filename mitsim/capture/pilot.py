@@ -38,6 +38,8 @@ _LOBE_RAYS = 2**20
 """Rays that look for sharp lobes."""
 _FEWEST_HITS = 30.0
 """Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""
+_FAINT = 1e-3
+"""Part of the mean light on the sensor below which its centre sees nothing but rounding."""
 _PIXELS = 64**2
 """Few pixels are sampled more often, until they take as many samples as so many pixels."""
 
@@ -151,17 +153,14 @@ def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float,
     bench, own = simulation.bench, integer(seed, "pilot", "depth")
     found = simulation.direct.trace(own)
     total = float(found.value.sum())
-    if not total and not bench.loaded.mirrors:
-        if Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own).value.size:
+    if not bench.loaded.mirrors and not sharp.irradiance:
+        everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own)
+        if total < _FAINT * float(everywhere.value.sum()):
             raise MitsimError(
                 "the sensor's centre sees no light of the projector, though other parts of the sensor do: what is lit "
                 "lies edge-on or just hidden; turn or move it a little"
             )
-        if sharp.irradiance:
-            raise MitsimError(
-                "all light of the projector comes over lobes too sharp to sample; give the surfaces more roughness, or "
-                "make them perfect mirrors (conductor)"
-            )
+    if not total and not bench.loaded.mirrors:
         raise MitsimError(
             "no light of the projector reaches the camera; check the scene, the window and the field stop"
         )
