@@ -14,6 +14,7 @@ import numpy.typing as npt
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.simulation import Estimate, Simulation
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
 from mitsim.scene.evidence import GROUPS, Evidence, Settings
@@ -99,6 +100,7 @@ class Light:
         return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
 
+@single_threaded_blas()
 def make_plan(
     bench: Bench,
     labels: Labels,
@@ -155,6 +157,7 @@ def scene_facts(bench: Bench) -> SceneFacts:
     )
 
 
+@single_threaded_blas()
 def collect(
     bench: Bench,
     plan: Plan,

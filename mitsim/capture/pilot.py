@@ -24,6 +24,7 @@ from mitsim.optics.frames import ExpectedFrames
 from mitsim.scene.evidence import GROUPS, PHYSICAL, Effort, Evidence, Noise, Settings
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import AMBIENT, INDIRECT, Deposits
+from mitsim.transport.lobes import SharpLight, sharp_light
 
 FloatArray = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
@@ -33,6 +34,12 @@ LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)
 CELL_LADDER = (1, 2, 4, 8)
 _FIRST_JUDGE, _FEW_ANCHORS = 5, 3
 _CAPTURES = 4
+_LOBE_RAYS = 2**20
+"""Rays that look for sharp lobes."""
+_FEWEST_HITS = 30.0
+"""Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""
+_FAINT = 1e-3
+"""Part of the mean light on the sensor below which its centre sees nothing but rounding."""
 _PIXELS = 64**2
 """Few pixels are sampled more often, until they take as many samples as so many pixels."""
 
@@ -102,7 +109,9 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
     family = _Family(labels, _some(weights, _CAPTURES))
     names = applicable(bench)
     direct = frozenset(names) & {"mirrors", "aperture", "blur", "diffraction"}
-    depth = _depth(bench, direct, seed)
+    first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=direct))
+    sharp = _sharp(first, seed)
+    depth, light = _depth(first, seed, sharp)
     base = Settings(depth=depth, effects=direct)
     fine = _Fine(bench, base, family, accuracy, seed)
     layer_error = fine.layer_errors()
@@ -126,22 +135,40 @@ def measure(bench: Bench, labels: Labels, weights: FloatArray, accuracy: float, 
         other=effects.effort("other"),
         seconds_per_frame=fine.seconds_per_frame,
         terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
+        unresolved=sharp.irradiance / (light + sharp.irradiance) if sharp.hits * family.fine < _FEWEST_HITS else 0.0,
     )
 
 
-def _depth(bench: Bench, effects: frozenset[str], seed: int) -> float:
-    """Where the light is seen, 1 / mean(1/z) [mm], from one ray of each projector pixel."""
-    settings = Settings(depth=bench.geometry.scene_distance, effects=effects)
-    found = Simulation(bench, settings).direct.trace(integer(seed, "pilot", "depth"))
+def _sharp(simulation: Simulation, seed: int) -> SharpLight:
+    """Direct light over lobes that are too sharp to be met by connections."""
+    loaded = simulation.bench.loaded
+    if not loaded.glossy:
+        return SharpLight(0.0, 0.0, math.inf)
+    parts = loaded.scene, loaded.camera, simulation.source, simulation.geometry
+    return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
+
+
+def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float]:
+    """Where the light is seen, 1 / mean(1/z) [mm], and how much of it, from one ray of each projector pixel."""
+    bench, own = simulation.bench, integer(seed, "pilot", "depth")
+    found = simulation.direct.trace(own)
     total = float(found.value.sum())
+    if not bench.loaded.mirrors and not sharp.irradiance:
+        everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own)
+        if total < _FAINT * float(everywhere.value.sum()):
+            raise MitsimError(
+                "the sensor's centre sees no light of the projector, though other parts of the sensor do: what is lit "
+                "lies edge-on or just hidden; turn or move it a little"
+            )
     if not total and not bench.loaded.mirrors:
         raise MitsimError(
             "no light of the projector reaches the camera; check the scene, the window and the field stop"
         )
-    mean = float(found.inverse_depth @ found.value) / total if total else 0.0
+    # Sums by numpy, here and below: those of BLAS depend on the number of its threads in the last bits.
+    mean = float((found.inverse_depth * found.value).sum()) / total if total else 0.0
     # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.
     flat = abs(mean * bench.geometry.scene_distance - 1) < 1e-6
-    return bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean
+    return bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean, total
 
 
 class _Fine:
@@ -374,14 +401,14 @@ def _some(weights: FloatArray, most: int) -> FloatArray:
 
 def _difference(changed: Halves, judge: Halves) -> float:
     """||changed - judge|| / ||judge||, from two independent halves."""
-    energy = float(np.vdot(judge[0], judge[1]))
-    product = float(np.vdot(changed[0] - judge[0], changed[1] - judge[1]))
+    energy = float((judge[0] * judge[1]).sum())
+    product = float(((changed[0] - judge[0]) * (changed[1] - judge[1])).sum())
     return math.sqrt(max(product, 0.0) / energy) if energy > 0 else 0.0
 
 
 def _norm(halves: Halves) -> float:
     """Norm of the frames, without their noise."""
-    return math.sqrt(max(float(np.vdot(*halves)), 0.0))
+    return math.sqrt(max(float((halves[0] * halves[1]).sum()), 0.0))
 
 
 def _noise(halves: Halves, light: float) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from mitsim.core.parallel import in_threads, workers
+from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
 from mitsim.optics.diffraction import Spectrum
@@ -29,6 +29,8 @@ _AT_ONCE = 32
 _LARGEST_BASIS = 256
 _PROBES = 8
 _SHADOWS = 24
+_COLUMNS = 2**14
+"""Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +38,14 @@ class Frame:
     """Expected irradiance (pixels, pixels) [W m^-2] of one capture, and its Monte Carlo variance, mean over pixels.
 
     Interpolation between anchors can leave specks below zero where a pixel sees almost no light; they are set to zero,
-    and ``removed`` is their sum over the sum of the frame, so that nothing is hidden.
+    and ``removed`` is their sum over the sum of the frame, so that nothing is hidden. ``heaviest`` is the largest part
+    of the variance that one group of the light brings: with one heavy path among G groups, (G - 1) / G.
     """
 
     irradiance: FloatArray
     variance: float
     removed: float
+    heaviest: float
 
 
 class FrameOptics:
@@ -228,11 +232,14 @@ class ExpectedFrames:
         for frame, one in zip(irradiance, deviation, strict=True):
             if self._always is not None:
                 frame, one = frame + self._always[0][0], one + self._always[1][0]
-            squared = float(one @ one)
-            variance = squared / pairs / frame.size if pairs else 0.0
+            # Not a product of vectors: BLAS adds up in an order that hangs on its threads.
+            squared = np.square(one.reshape(frame.shape[0], count, -1)).sum(axis=(0, 2)) if pairs else np.zeros(1)
+            spread = float(squared.sum())
+            variance = spread / pairs / frame.size if pairs else 0.0
+            heaviest = float(squared.max()) / spread if spread else 0.0
             seen = np.maximum(frame, 0)
             total = float(seen.sum())
-            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0)
+            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest)
 
 
 def _mean_of(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
@@ -275,13 +282,12 @@ def _mix(weights: FloatArray, basis: FloatArray) -> FloatArray:
     """(captures, ...) sums of (B, ...) basis arrays by weights (captures, B)."""
     flat = basis.reshape(len(basis), -1)
     mixed = np.empty((len(weights), flat.shape[1]))
-    cuts = np.linspace(0, flat.shape[1], workers() + 1).astype(int)
 
-    def part(index: int) -> None:
-        inside = slice(cuts[index], cuts[index + 1])
+    def part(start: int) -> None:
+        inside = slice(start, start + _COLUMNS)
         mixed[:, inside] = weights @ flat[:, inside]
 
-    in_threads(part, range(workers()))
+    in_threads(part, range(0, flat.shape[1], _COLUMNS))
     return mixed.reshape(len(weights), *basis.shape[1:])
 
 

@@ -119,6 +119,8 @@ class Evidence:
         of forming a frame with one anchor, one layer, a wave-optical shadow and a cell a projector pixel.
     terms
         terms of the shadow, wave-optical over geometric.
+    unresolved
+        part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
     """
 
     depth: float
@@ -134,6 +136,7 @@ class Evidence:
     other: Effort
     seconds_per_frame: float
     terms: float
+    unresolved: float = 0.0
 
     def connecting(self, settings: Settings, anchors: int) -> float:
         """Seconds of direct light, and of its differences between anchors, in the samples that are predicted."""

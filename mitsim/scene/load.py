@@ -14,6 +14,7 @@ import numpy as np
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file
 from mitsim.scene.projector import ProjectorGrid, locate_projector
+from mitsim.scene.texels import check_texels
 
 SENSOR_PLUGIN = "mitsim_lensless"
 
@@ -69,6 +70,7 @@ def load_scene(
         line = re.search(r"\(line (\d+), col", str(error))
         place = f"{path}:{line[1]}" if line and str(path) in str(error) else path
         raise MitsimError(f"{place}: Mitsuba refuses the scene: {_one_line(error)}") from None
+    check_texels(path, scene)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')

@@ -121,6 +121,7 @@ def decide(
         evidence.layer_error[layers],
         evidence.cell_error[cells],
         coarse.error,
+        evidence.unresolved,
         *left_out.values(),
     )
     target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - left**2, (_FLOOR * accuracy) ** 2))
@@ -310,6 +311,11 @@ def _warnings(
 ) -> tuple[str, ...]:
     if left <= _FLAGGED * accuracy:
         return ()
+    if evidence.unresolved > accuracy:
+        return (
+            f"{evidence.unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
+            "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)",
+        )
     parts = {
         f"{anchors}x{anchors} anchors": evidence.anchor_error[anchors],
         f"{layers} layer{'s' if layers > 1 else ''}": evidence.layer_error[layers],

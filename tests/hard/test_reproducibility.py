@@ -1,0 +1,168 @@
+"""The same seed gives the same bits: whatever the number of threads, the process, the clock, or how work is cut.
+
+Interrupted and resumed runs are bit-equal too: tests/system/test_resume.py, tests/unit/capture/test_run.py.
+"""
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from mitsim.capture import light, pilot
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.light import make_plan
+from mitsim.capture.run import capture
+from mitsim.core import parallel
+from mitsim.core.frames import read_frame
+from mitsim.optics import frames
+
+pytestmark = pytest.mark.usefixtures("variant")
+THREADS = (1, 2, 3, 8)
+EFFECTS = {"interreflection": True, "ambient": True}
+LAMP_AND_BOX = """
+<shape type="sphere"><point name="center" x="-150" y="150" z="100"/><float name="radius" value="20"/>
+    <emitter type="area"><spectrum name="radiance" value="5"/></emitter></shape>
+<shape type="cube"><transform name="to_world"><scale value="25"/><rotate y="1" angle="30"/><translate z="340"/>
+    </transform><bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></shape>"""
+CHILD = """
+import sys
+from mitsim.capture.bench import open_bench
+from mitsim.capture.run import capture
+effects = {"interreflection": True, "ambient": True}
+capture(open_bench(sys.argv[1], check_camera=False), sys.argv[2], sys.argv[3], float(sys.argv[4]), 3, effects=effects)
+"""
+
+
+def bits(folder: Path) -> dict[str, object]:
+    """SHA-256 of each frame's channels (noisy digital numbers and expected electrons), and all that was planned."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.glob("*.exr")):
+        channels, _ = read_frame(path)
+        found[path.name] = hashlib.sha256(b"".join(channels[name].tobytes() for name in sorted(channels))).hexdigest()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    plan = manifest["plan"]
+    errors = {effect["name"]: effect["error_if_off"] for effect in plan["effects"]}
+    left = {name: manifest[name] for name in ("mc_error", "heaviest_group", "paths", "digital")}
+    return {**found, **left, "settings": plan["settings"], "errors": errors, "target": plan["sampling_target"]}
+
+
+@pytest.fixture
+def threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], object]]:
+    """Sets threads of Dr.Jit, of BLAS and of our own; put back at the end."""
+    before = dr.thread_count()
+
+    def limit(count: int) -> object:
+        dr.set_thread_count(count)
+        monkeypatch.setattr(parallel, "workers", lambda: count)
+        return threadpool_limits(count)
+
+    yield limit
+    dr.set_thread_count(before)
+
+
+def runs(bench: Bench, patterns: str, accuracy: float, where: Path, threads: Callable[[int], object]) -> list[dict]:
+    found = []
+    for count in THREADS:
+        with threads(count):
+            capture(bench, patterns, where / f"run{count}", accuracy, 3, effects=EFFECTS)
+        found.append(bits(where / f"run{count}"))
+    return found
+
+
+def test_frames_do_not_depend_on_threads_or_process(
+    small_scene: Callable[..., Path], tmp_path: Path, threads: Callable[[int], object]
+) -> None:
+    """Direct, indirect and ambient light, sensor noise, plan: four thread counts, and a process of its own."""
+    path = small_scene(extra=LAMP_AND_BOX)
+    found = runs(open_bench(path, check_camera=False), "hadamard:2", 5e-2, tmp_path, threads)
+    command = [sys.executable, "-c", CHILD, str(path), "hadamard:2", str(tmp_path / "child"), "5e-2"]
+    subprocess.run(command, check=True, capture_output=True, timeout=200)
+    found.append(bits(tmp_path / "child"))
+    assert len([name for name in found[0] if name.startswith("frame_")]) == 8
+    assert set(found[0]["settings"]["effects"]) >= set(EFFECTS)
+    for other in found[1:]:
+        assert {name for name in other if other[name] != found[0][name]} == set()
+
+
+@pytest.mark.slow
+def test_neither_do_large_ones(
+    small_scene: Callable[..., Path], tmp_path: Path, threads: Callable[[int], object]
+) -> None:
+    """Arrays of more than 10 000 numbers, which BLAS shares among its threads; 49 classes mixed."""
+    path = small_scene(extra=LAMP_AND_BOX, n=112, pixels=160)
+    found = runs(open_bench(path, check_camera=False), "hadamard:4", 2e-2, tmp_path, threads)
+    for other in found[1:]:
+        assert {name for name in other if other[name] != found[0][name]} == set()
+
+
+def test_sums_do_not_depend_on_threads_of_blas() -> None:
+    """Norms and products of the pilot: BLAS's own of so many numbers differ between 1, 2, 3 and 8 threads."""
+    a, b = np.random.default_rng(0).random((2, 2, 300, 300))
+    naive, norms, differences = set(), set(), set()
+    for count in THREADS:
+        with threadpool_limits(count):
+            naive.add(float(np.vdot(a[0], a[1])))
+            norms.add(pilot._norm((a[0], a[1])))
+            differences.add(pilot._difference((a[0], a[1]), (b[0], b[1])))
+    sys.stdout.write(f"BLAS gives {len(naive)} answers, ours {len(norms)} and {len(differences)}\n")
+    assert len(norms) == len(differences) == 1
+
+
+@pytest.mark.parametrize("columns", [100, 20_000, 3 * 2**14 + 5])
+def test_mixing_does_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+    """49 captures of 49 classes. How a product is cut shows in its last bits, so it is cut at fixed columns."""
+    rng = np.random.default_rng(1)
+    weights, basis = rng.random((49, 49)), rng.random((49, columns))
+    found = set()
+    for count in (*THREADS, 5, 7):
+        monkeypatch.setattr(parallel, "workers", lambda count=count: count)
+        found.add(frames._mix(weights, basis).tobytes())
+    assert len(found) == 1
+    assert np.allclose(np.frombuffer(found.pop()), (weights @ basis).ravel(), rtol=1e-13, atol=0)
+
+
+def test_results_keep_their_order_in_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    for count in (*THREADS, 64):
+        monkeypatch.setattr(parallel, "workers", lambda count=count: count)
+        assert parallel.in_threads(lambda item: item**2, range(100)) == [item**2 for item in range(100)]
+
+
+def test_the_plan_does_not_depend_on_the_clock(
+    small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seconds are measured and predicted; what is simulated, and how finely, does not hang on them."""
+    bench = open_bench(small_scene(extra=LAMP_AND_BOX), check_camera=False)
+    family = bench.family("dots:2").classes()
+    plans = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        times = iter(np.cumsum(rng.exponential(10.0 ** rng.uniform(-6, 3, 1000))))
+        monkeypatch.setattr(pilot.time, "perf_counter", lambda times=times: float(next(times)))
+        plans.append(make_plan(bench, *family, 5e-2, 3))
+    first, second = plans
+    assert first.predicted_seconds != second.predicted_seconds
+    assert (first.settings, first.sampling_target) == (second.settings, second.sampling_target)
+    assert first.systematic_error == second.systematic_error
+
+
+def test_light_does_not_depend_on_how_many_paths_are_held_at_once(
+    small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The chunk is a constant, not the machine's; another one adds the same light in another order, to 1e-12."""
+    bench = open_bench(small_scene("chunks"), check_camera=False)
+    labels, weights = bench.family("dots:2").classes()
+    plan = make_plan(bench, labels, weights, 5e-2, 3, {"diffraction": False})
+    found = []
+    for lanes in (light._LANES_AT_ONCE, light._LANES_AT_ONCE, 300):
+        monkeypatch.setattr(light, "_LANES_AT_ONCE", lanes)
+        one = light.collect(bench, plan, labels, weights, 3)
+        found.append(np.stack([frame.irradiance for frame in one.frames(labels, weights, 3)]))
+    assert np.array_equal(found[0], found[1])
+    assert np.linalg.norm(found[2] - found[0]) < 1e-6 * np.linalg.norm(found[0])
