@@ -152,7 +152,7 @@ def test_the_papers_mask_at_extremes_equals_fractions(name: str, record_property
     chosen = np.random.default_rng(7).choice(len(partial), 4)
     entries = [(0, 0), *partial[chosen].tolist()]
     worst = max(abs(found[i, j] - float(exact_shadow(setting, PAPER, i, j))) for i, j in entries)
-    record_property("largest error", worst)
+    record_property("largest error", float(worst))
     assert worst < gate
 
 
@@ -429,7 +429,7 @@ def test_features_from_a_micrometre_to_a_millimetre(feature: float, left: float,
     exact = exact_waves(geometry, 2.5e-4)
     assert np.isfinite(wave).all() and wave.min() > -1e-9
     error = float(np.linalg.norm(wave[:, 0] - exact) / np.linalg.norm(exact))
-    record_property("error", error)
+    record_property("error", float(error))
     assert error < left
 
 

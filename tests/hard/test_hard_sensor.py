@@ -289,7 +289,7 @@ def test_frames_of_1_to_16_bits_have_their_moments(bits: int, record_property) -
         worst = max(worst, z, abs(square.mean() - variance) / spread)
         assert z < bound, f"mean off by {z:.1f} deviations at {mean} electrons"
         assert abs(square.mean() - variance) < bound * spread, f"variance {square.mean()} for {variance} at {mean}"
-    record_property("worst z", worst)
+    record_property("worst z", float(worst))
 
 
 @pytest.mark.parametrize("bits", range(6, 17))
@@ -316,11 +316,11 @@ def test_photon_transfer_finds_gain_and_a_straight_line(bits: int, record_proper
         5 * (math.sqrt(np.sum(2 * (1 + dark) ** 2 + 1 / electrons) / count) + np.sum(dark) * math.sqrt(2 / count)) / 10
     )
     error = slopes.mean() / gain - 1
-    record_property("gain error", error)
+    record_property("gain error", float(error))
     assert abs(error) < gate
     line = np.polyfit(levels, means[1:], 1)
     departure = np.abs(means[1:] - np.polyval(line, levels)).max()
-    record_property("linearity error", departure / top)
+    record_property("linearity error", float(departure / top))
     assert departure < 6 * math.sqrt(variances.max() / count)
 
 

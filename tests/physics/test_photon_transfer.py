@@ -68,7 +68,7 @@ def test_the_slope_of_variance_over_mean_is_the_gain(camera: SensorModel, record
         mean, variance = pair(camera, level * camera.superpixel_full_well_e, side, EXPOSURE_S, f"level {level}")
         slopes.append((variance - dark_variance) / (mean - dark_mean))
     error = np.mean(slopes) / camera.gain_dn_per_e - 1
-    record_property("gain error", error)
+    record_property("gain error", float(error))
     assert abs(error) < GAIN_GATE, f"gain off by {error:.2%} at {side} x {side}"
 
 
@@ -78,7 +78,7 @@ def test_the_dark_variance_is_the_read_noise(camera: SensorModel, record_propert
     # EMVA 1288 4.0: sigma_d^2 = (sigma_y.dark^2 - sigma_q^2) / K^2 with the ADC's 1/12 DN^2.
     measured = math.sqrt(variance - 1 / 12) / camera.gain_dn_per_e
     error = measured / camera.superpixel_read_noise_e - 1
-    record_property("read noise error", error)
+    record_property("read noise error", float(error))
     assert abs(error) < READ_NOISE_GATE, f"read noise off by {error:.2%} at {side} x {side}"
 
 
