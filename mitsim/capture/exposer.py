@@ -24,8 +24,8 @@ from mitsim.sensor.chain import (
     electrons_from_irradiance,
     expose,
     exposure_for_peak,
-    frame_moments,
 )
+from mitsim.sensor.moments import frame_moments
 
 FloatArray = npt.NDArray[np.float64]
 _LONGEST_S = 1e6

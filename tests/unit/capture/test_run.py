@@ -20,7 +20,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.frames import checksum, read_frame
 from mitsim.core.resources import Limits
 from mitsim.scene.patterns import parse_patterns
-from mitsim.sensor.chain import frame_moments
+from mitsim.sensor.moments import frame_moments
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, ACCURACY = 16, 1e-2

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.sensor import chain
+from mitsim.sensor import chain, moments
 from mitsim.sensor.model import SensorModel, paper_sensor
 
 
@@ -102,7 +102,7 @@ def exact_moments(mean: float, well: float) -> tuple[float, float]:
 @settings(max_examples=60, deadline=None)
 @given(mean=st.floats(0.01, 300), well=st.floats(0.5, 400))
 def test_clipped_moments_equal_the_sum_over_the_distribution(mean: float, well: float) -> None:
-    first, variance = chain.clipped_moments(mean, well)
+    first, variance = moments.clipped_moments(mean, well)
     exact = exact_moments(mean, well)
     # Rounding: differences of terms of size mean^2 + well^2 in double precision (about 1e-16 each, 1e3
     # headroom).
@@ -112,7 +112,7 @@ def test_clipped_moments_equal_the_sum_over_the_distribution(mean: float, well: 
 
 
 def test_without_a_full_well_the_moments_are_poisson_s() -> None:
-    first, variance = chain.clipped_moments([3.0, 0.0], math.inf)
+    first, variance = moments.clipped_moments([3.0, 0.0], math.inf)
     assert first.tolist() == [3.0, 0.0] and variance.tolist() == [3.0, 0.0]
 
 

@@ -1,0 +1,235 @@
+"""Mean and variance of what the sensor makes of light, in closed form: beside every draw of `chain` stands its law.
+
+After EMVA 1288 release 4.0. Tails of the Poisson law and of the ADC's codes are sums and expansions that keep their
+digits from 1e-6 to 1e15 electrons (`tests/hard/test_hard_sensor.py`).
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from mitsim.sensor.chain import Array, add_dark_current, amplify, checked_light, clip_at_full_well, poisson_quantile
+from mitsim.sensor.model import SensorModel
+
+_FEW = 64.0
+"""Electrons below which moments behind the ADC are summed count by count."""
+_SOME = 1e4
+"""Electrons below which they are summed over the counts that occur, on a grid of expected counts."""
+_DITHERED = 0.8
+"""Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
+_SMOOTH = 2.0
+"""Standard deviation [DN] from which a sum over codes is an integral to 1e-4."""
+
+
+def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[Array, Array]:
+    """Mean and variance of min(N, F) for Poisson N with mean `expected` (any shape) and full well F.
+
+    With k P(N=k) = mu P(N=k-1), K = ceil(F), Q = P(N >= K), d = mu - F and e = mu P(N = K-1), the loss L = (N - F)^+
+    has E[L] = d Q + e and E[L^2] = (d^2 + mu) Q + (mu + K - 2F) e. Below the full well, as L (F - min(N, F)) is 0,
+    E[min] = mu - E[L] and Var[min] = mu - E[L^2] - E[L]^2 + 2 E[L] d; above it the same of the room D = (F - N)^+,
+    E[D] = e - d (1 - Q) and E[D^2] = mu + d^2 - E[L^2], where less cancels: E[min] = F - E[D], Var[min] = Var[D].
+    """
+    mean = checked_light(expected, "expected")
+    clipped, variance = mean.copy(), mean.copy()
+    # Twelve standard deviations below the full well the loss is under 1e-30: left out, and with it nearly all the time.
+    near = full_well_e - mean < 12 * np.sqrt(full_well_e) if np.isfinite(full_well_e) else np.zeros(mean.shape, bool)
+    if near.any():
+        clipped[near], variance[near] = _clipped(mean[near], full_well_e)
+    return clipped, variance
+
+
+def _clipped(mean: Array, full_well_e: float) -> tuple[Array, Array]:
+    """:func:`clipped_moments` without short cuts."""
+    step = math.ceil(full_well_e)
+    over = mean - full_well_e
+    above, below = _tails(step, mean)
+    edge = mean * _poisson(step - 1, mean)
+    skew = (mean + step - 2 * full_well_e) * edge
+    # The differences of nearly equal terms can leave a rounding error below zero, where the truth is zero.
+    loss, room = np.maximum(over * above + edge, 0.0), np.maximum(edge - over * below, 0.0)
+    low = mean - ((over**2 + mean) * above + skew) - loss**2 + 2 * loss * over
+    high = (over**2 + mean) * below - skew - room**2
+    dim = over < 0
+    return np.where(dim, mean - loss, full_well_e - room), np.maximum(np.where(dim, low, high), 0.0)
+
+
+def _tails(count: int, mean: Array) -> tuple[Array, Array]:
+    """P(N >= count) and P(N < count) for Poisson N, each as a tail of its own, so that 1e-20 still has its digits.
+
+    Large counts by Temme's uniform expansion (DLMF 8.12.8, one term: 1/count is left), because scipy's sums stop early
+    beyond 4.5 deviations: 3e-9 instead of 2.9e-7 at 1e12.
+    """
+    if count < 300_000:
+        return special.pdtrc(count - 1, mean), special.pdtr(count - 1, mean)
+    apart = (mean - count) / count
+    with np.errstate(divide="ignore"):
+        eta = np.sign(apart) * np.sqrt(2 * (apart - np.log1p(apart)))
+    small = np.abs(apart) < 1e-4
+    first = np.where(small, -1 / 3 + apart / 12, 1 / np.where(small, 1, apart) - 1 / np.where(small, 1, eta))
+    shift = np.exp(-count * np.square(eta) / 2) / math.sqrt(2 * math.pi * count) * first
+    above, below = special.ndtr(eta * math.sqrt(count)) - shift, special.ndtr(-eta * math.sqrt(count)) + shift
+    return np.maximum(above, 0.0), np.maximum(below, 0.0)
+
+
+def _poisson(count: int, mean: Array) -> Array:
+    """P(N = count) for Poisson N, by Loader's saddle point expansion (2000), which keeps its digits up to 1e15."""
+    if count == 0:
+        return np.exp(-mean)
+    if count < 32:
+        remainder = math.lgamma(count + 1) - (count + 0.5) * math.log(count) + count - math.log(2 * math.pi) / 2
+    else:
+        remainder = 1 / (12 * count) - 1 / (360 * count**3) + 1 / (1260 * count**5)
+    apart = (mean - count) / count
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.exp(-remainder - count * (apart - np.log1p(apart))) / math.sqrt(2 * math.pi * count))
+
+
+def frame_moments(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> tuple[Array, Array]:
+    """Mean (DN) and variance (DN^2) of `expose`'s output (EMVA 1288 4.0, photon transfer).
+
+    Where an end of the ADC is within eight deviations, or too little noise dithers its codes, the moments are those of
+    rounded and cut numbers: summed over the counts below 1e4 electrons, and averaged over 129 of them above.
+    """
+    expected = add_dark_current(expected_electrons, exposure_s, model)
+    clipped, variance = clipped_moments(expected, model.superpixel_full_well_e)
+    read, gain = model.superpixel_read_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
+    mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
+    if model.largest_dn is None:
+        return mean, noise
+    dim, some = expected < _FEW, (expected >= _FEW) & (expected < _SOME)
+    room, deviation = np.minimum(mean, model.largest_dn - mean), np.sqrt(noise)
+    # Counts are a lattice that only read noise blurs, as long as they are few; and so is what fills the full well.
+    full = model.superpixel_full_well_e - expected < 8 * np.sqrt(expected)
+    hard = (room < 8 * deviation) | (np.where(dim | some | full, read, deviation) < _DITHERED)
+    total = np.asarray(noise + 1 / 12)
+    gone = room < -10 * deviation
+    mean[gone], total[gone] = model.largest_dn, 0.0
+    for part, moments in ((dim, _counted), (some, _summed), (~dim & ~some, _averaged)):
+        part = hard & ~gone & part
+        if part.any():
+            mean[part], total[part] = moments(expected[part], model)
+    return mean, total
+
+
+def _counted(expected: Array, model: SensorModel) -> tuple[Array, Array]:
+    """:func:`frame_moments` as a sum over electron counts; `expected` (pixels,) of few electrons."""
+    most = float(expected.max())
+    counts = np.arange(int(most + 12 * math.sqrt(most)) + 20, dtype=np.float64)
+    levels, variances = _read_out(counts, model)
+    weight = np.exp(-expected)
+    first, second = np.zeros_like(expected), np.zeros_like(expected)
+    for count, rise, variance in zip(counts, levels - levels[0], variances, strict=True):
+        first += weight * rise
+        second += weight * (rise**2 + variance)
+        weight = weight * (expected / (count + 1))
+    return levels[0] + first, np.maximum(second - first**2, 0.0)
+
+
+def _summed(expected: Array, model: SensorModel) -> tuple[Array, Array]:
+    """:func:`frame_moments` as a sum over the counts within 12 deviations, for some hundreds of electrons."""
+    nodes = _grid(expected)
+    reach = 12 * np.sqrt(nodes) + 20
+    first, last = np.floor(nodes - reach).clip(0).astype(np.intp), np.ceil(nodes + reach).astype(np.intp)
+    counts = np.arange(first.min(), last.max() + 1, dtype=np.float64)
+    levels, variances = _read_out(counts, model)
+    logarithms = special.gammaln(counts + 1)
+    mean, variance = np.empty_like(nodes), np.empty_like(nodes)
+    for index, node in enumerate(nodes):
+        near = slice(first[index] - first.min(), last[index] - first.min() + 1)
+        weights = np.exp(counts[near] * math.log(node) - node - logarithms[near])
+        middle = levels[near][len(weights) // 2]
+        rise = (weights * (levels[near] - middle)).sum()
+        mean[index] = middle + rise
+        variance[index] = (weights * (np.square(levels[near] - middle - rise) + variances[near])).sum()
+    return _between(expected, nodes, mean, variance)
+
+
+def _averaged(expected: Array, model: SensorModel) -> tuple[Array, Array]:
+    """:func:`frame_moments` as a mean over 129 electron counts, for many electrons."""
+    nodes = _grid(expected)
+    deviates = np.linspace(-8, 8, 129)
+    weights = np.exp(-np.square(deviates) / 2)
+    start, _ = _read_out(nodes, model)
+    first, second = np.zeros_like(nodes), np.zeros_like(nodes)
+    for z, weight in zip(deviates, weights / weights.sum(), strict=True):
+        level, variance = _read_out(poisson_quantile(nodes, z), model)
+        first += weight * (level - start)
+        second += weight * (np.square(level - start) + variance)
+    return _between(expected, nodes, start + first, np.maximum(second - first**2, 0.0))
+
+
+def _grid(expected: Array) -> Array:
+    """Expected counts at which moments are formed: those of the pixels, or fewer to interpolate between.
+
+    Moments depend on the light alone, and smoothly: shot noise has a deviation of 1/2 in the root of the counts, and
+    the steps are 1/20 of that root.
+    """
+    roots = np.sqrt(expected)
+    count = int(np.ptp(roots) * 20) + 2
+    return expected if count >= expected.size else np.square(np.linspace(roots.min(), roots.max(), count))
+
+
+def _between(expected: Array, nodes: Array, mean: Array, variance: Array) -> tuple[Array, Array]:
+    if nodes is expected:
+        return mean, variance
+    roots, places = np.sqrt(expected), np.sqrt(nodes)
+    return np.interp(roots, places, mean), np.interp(roots, places, variance)
+
+
+def _read_out(electrons: Array, model: SensorModel) -> tuple[Array, Array]:
+    """Mean and variance [DN] of what the ADC makes of known electrons (pixels,), before the full well."""
+    assert model.largest_dn is not None
+    signal = amplify(clip_at_full_well(electrons, model), model)
+    read = np.full(signal.shape, model.superpixel_read_noise_e * model.gain_dn_per_e)
+    return _rounded(signal, read, model.largest_dn)
+
+
+def _rounded(mean: Array, deviation: Array, largest: int) -> tuple[Array, Array]:
+    """Mean and variance of a normal signal (pixels,) rounded to the codes 0 .. `largest`, all in DN."""
+    first, second = np.empty_like(mean), np.empty_like(mean)
+    wide = deviation >= _SMOOTH
+    for part, moments in ((wide, _cut_moments), (~wide, _code_moments)):
+        if part.any():
+            first[part], second[part] = moments(mean[part], deviation[part], largest)
+    return first, second
+
+
+def _cut_moments(mean: Array, deviation: Array, largest: int) -> tuple[Array, Array]:
+    """:func:`_rounded` for deviations of at least 2 DN.
+
+    The number is the sum over its codes of P(signal > code - 1/2), the midpoint rule for an integral in closed form:
+    that of a cut normal signal. Euler and Maclaurin's first term, -1/24 of the integrand's slope between the ends, is
+    1/12 DN^2 where nothing is cut.
+    """
+    # Noise far wider than the ADC leaves its two ends, whatever its width; and 40 deviations beyond an end are enough.
+    narrower = np.minimum(deviation, 1e4 * largest)
+    mean, deviation = mean * (narrower / deviation), narrower
+    mean = np.clip(mean, -40 * deviation, largest + 40 * deviation)
+    low, high = -mean / deviation, (largest - mean) / deviation
+    under, over = special.ndtr(low), special.ndtr(-high)
+    slope_low, slope_high = (np.exp(-np.square(x) / 2) / math.sqrt(2 * math.pi) for x in (low, high))
+    first = low * under + high * over + slope_low - slope_high
+    second = low**2 * under + high**2 * over + (1 - under - over) + low * slope_low - high * slope_high
+    first = deviation * first + (slope_high - slope_low) / (24 * deviation)
+    second = deviation**2 * second + (1 - under - over + high * slope_high - low * slope_low) / 12
+    return mean + first, np.maximum(second - first**2, 0.0)
+
+
+def _code_moments(mean: Array, deviation: Array, largest: int) -> tuple[Array, Array]:
+    """:func:`_rounded` for deviations below 2 DN: code by code around the nearest one."""
+    nearest = np.clip(np.rint(mean), 0, largest)
+    if not deviation.any():
+        return nearest, np.zeros_like(mean)
+    scale = np.where(deviation > 0, deviation, 1)
+    first, second = np.zeros_like(mean), np.zeros_like(mean)
+    for step in range(1, 18):
+        up = special.ndtr((mean - (nearest + step - 0.5)) / scale) * (nearest + step <= largest)
+        down = special.ndtr(((nearest - step + 0.5) - mean) / scale) * (nearest - step >= 0)
+        first += up - down
+        second += (2 * step - 1) * (up + down)
+    # Next to no noise resolves a tie as `quantise` does, to the even code.
+    still = deviation < 1e-9
+    first[still], second[still] = 0, 0
+    return nearest + first, np.maximum(second - first**2, 0.0)
