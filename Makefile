@@ -4,6 +4,9 @@ PYTHON ?= python3
 READY := $(VENV)/.ready
 LINT_READY := $(VENV)/.lint-ready
 
+# One test process a processor.
+PARALLEL := -n logical --maxprocesses 8 --dist worksteal
+
 .PHONY: setup demo test test-all lint
 
 setup: $(READY)
@@ -20,10 +23,10 @@ demo: setup
 	@$(VENV)/bin/mitsim demo -o demo-output
 
 test: setup
-	@$(VENV)/bin/python -m pytest -m 'not slow'
+	@$(VENV)/bin/python -m pytest -m 'not slow' $(PARALLEL)
 
 test-all: setup
-	@$(VENV)/bin/python -m pytest
+	@$(VENV)/bin/python -m pytest $(PARALLEL)
 
 lint: $(LINT_READY)
 	@$(VENV)/bin/ruff format --check .

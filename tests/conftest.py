@@ -4,6 +4,7 @@ Everything here uses the variant ``llvm_ad_mono``. Another variant is tested in 
 variant must not be used after switching.
 """
 
+import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,18 @@ import numpy as np
 import pytest
 
 from mitsim.core.configuration import shipped
+
+def pytest_configure() -> None:
+    """Give each of several test processes (pytest-xdist) processors of its own, and with them its threads' number.
+
+    Threads of Dr.Jit wait busily: two processes on the same two cores take twice the time.
+    """
+    worker, count = os.environ.get("PYTEST_XDIST_WORKER"), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if worker and hasattr(os, "sched_setaffinity"):
+        own = sorted(os.sched_getaffinity(0))[int(worker.removeprefix("gw")) :: count]
+        if own:
+            os.sched_setaffinity(0, own)
+
 
 SMALL_SCENE = """<scene version="3.0.0">
     <default name="albedo" value="0.5"/>
