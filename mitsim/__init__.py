@@ -3,4 +3,4 @@
 Importing this package imports nothing, selects no Mitsuba variant and touches no global state.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

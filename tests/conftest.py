@@ -14,6 +14,7 @@ import pytest
 
 from mitsim.core.configuration import shipped
 
+
 def pytest_configure() -> None:
     """Give each of several test processes (pytest-xdist) processors of its own, and with them its threads' number.
 
