@@ -23,8 +23,8 @@ try:
     print(os.getpid(), flush=True)
     time.sleep(60)
 except KeyboardInterrupt:
-    sys.exit(f"stopped by {signal.Signals(stop_signal()).name}")
 """
+TELL = HEED + '    sys.exit(f"stopped by {signal.Signals(stop_signal()).name}")\n'
 STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + WAIT
 
 
@@ -67,10 +67,25 @@ def test_a_worker_that_dies_leaves_one_clear_line(work: str, name: str, words: s
 def test_a_signal_to_the_parent_stops_the_worker(number: signal.Signals) -> None:
     # A shell's background jobs ignore SIGINT, and so would what they start.
     before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    process, _ = started(HEED)
+    process, _ = started(TELL)
     signal.signal(signal.SIGINT, before)
     process.send_signal(number)
     assert (*process.communicate(timeout=20), process.returncode) == ("", f"stopped by {number.name}\n", 1)
+
+
+def test_control_c_on_a_terminal_reaches_both_and_stops_once() -> None:
+    """A terminal sends it to the whole group: the worker gets it twice, its own and the one passed on."""
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    command = [sys.executable, "-c", PROGRAM.format(work=HEED + "    time.sleep(0.3)\n    print('cleaned up')\n")]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    signal.signal(signal.SIGINT, before)
+    assert process.stdout is not None
+    process.stdout.readline()
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert (out, err, process.returncode) == ("cleaned up\n", "", 0)
 
 
 def test_a_second_signal_stops_a_worker_that_does_not_listen() -> None:
