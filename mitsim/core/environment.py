@@ -20,6 +20,7 @@ VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral")
 """Variants mitsim is tested with; `load_variant` takes any that the installed Mitsuba has."""
 
 _CHILD_SECONDS = 120
+_FEWEST_THREADS = 2
 
 _RENDER = """
 from mitsim.core.environment import load_variant
@@ -71,6 +72,12 @@ def load_variant(name: str) -> ModuleType:
         mitsuba.set_variant(name)
     except ImportError as error:
         raise MitsimError(f"variant {name}: cannot be loaded ({_one_line(error)}); run: mitsim doctor") from error
+    if name.startswith("llvm_"):
+        import drjit
+
+        # With a pool of one thread, Mitsuba waits for ever when it reads an OpenEXR file (Mitsuba 3.9.1).
+        if drjit.thread_count() < _FEWEST_THREADS:
+            drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
     return module
 

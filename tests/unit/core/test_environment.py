@@ -3,10 +3,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mitsim.core import environment, llvm
 from mitsim.core.errors import MitsimError
+from mitsim.core.frames import write_frame
 
 
 def in_child(program: str, **env: str) -> subprocess.CompletedProcess[str]:
@@ -66,3 +68,21 @@ def test_the_doctor_finds_this_machine_well() -> None:
     checks = environment.doctor()
     assert len(checks) == 9
     assert not [check for check in checks if not check.ok]
+
+
+READ = """
+import os, sys
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
+from mitsim.core.environment import load_variant
+mi = load_variant("llvm_ad_mono")
+print(mi.Bitmap(sys.argv[1]).size())
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs Linux's affinity")
+def test_a_machine_of_one_processor_reads_openexr(tmp_path: Path) -> None:
+    """Mitsuba 3.9.1 waits for ever where Dr.Jit has one thread."""
+    write_frame(tmp_path / "print.exr", {"Y": np.ones((3, 5), np.float32)}, {})
+    arguments = [sys.executable, "-c", READ, str(tmp_path / "print.exr")]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[5, 3]", done.stderr
