@@ -30,7 +30,7 @@ from mitsim.optics.camera import CameraGeometry
 from mitsim.transport.cells import CellGrid
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Walk, camera_part, survival, walked
-from mitsim.transport.sampling import generator, panchromatic, stratified
+from mitsim.transport.sampling import panchromatic, stratified, streams
 from mitsim.transport.source import Projector, Source
 
 _MARGIN = 1e-4
@@ -97,8 +97,8 @@ class _Walk(Walk):
         self.tracer, self.paths, self.source, self.geometry = tracer, tracer.paths, tracer.source, tracer.geometry
         self.scene = tracer.scene
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
-        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, generator(dr.opaque(mi.UInt32, seed), cell))
-        self.rng = generator(dr.opaque(mi.UInt32, seed) ^ (sample * 0x9E3779B9 + 1), cell)
+        shared, self.rng = streams(seed, cell, sample)
+        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, shared)
         self.strength, self.part = mi.Spectrum(1), mi.Float(1)
         self.travelled, self.bounce, self.order = mi.Float(0), mi.UInt32(0), mi.UInt32(1)
         self.by_delta, self.mirrored, self.in_mirror = mi.Bool(True), mi.Bool(True), mi.Bool(False)

@@ -18,7 +18,7 @@ from mitsim.transport.histogram import DIRECT, Deposits
 from mitsim.transport.paths import launches
 from mitsim.transport.rays import ProjectorRays
 from mitsim.transport.receiver import Receiver
-from mitsim.transport.sampling import generator, panchromatic, stratified
+from mitsim.transport.sampling import panchromatic, stratified, streams
 from mitsim.transport.source import Projector
 
 IntArray = npt.NDArray[np.int64]
@@ -69,8 +69,8 @@ class DirectTracer:
         anchors = dr.opaque(mi.UInt32, self.anchors)
         row, column = anchor // anchors, anchor % anchors
         # Streams belong to pixels: every anchor is connected to the same points.
-        jitter = stratified(sample, generator(dr.opaque(mi.UInt32, seed), pixel))
-        rng = generator(dr.opaque(mi.UInt32, seed) ^ (sample * 0x9E3779B9 + 1), pixel)
+        shared, rng = streams(seed, pixel, sample)
+        jitter = stratified(sample, shared)
         wavelengths, spectral = self.receiver.wavelengths(rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         si = self.scene.ray_intersect(ray)

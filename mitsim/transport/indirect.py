@@ -24,7 +24,7 @@ from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Walk, camera_part, survival, walked
 from mitsim.transport.rays import ProjectorRays
 from mitsim.transport.receiver import Receiver
-from mitsim.transport.sampling import generator, panchromatic, stratified
+from mitsim.transport.sampling import panchromatic, stratified, streams
 from mitsim.transport.source import Projector
 
 
@@ -72,8 +72,8 @@ class _Walk(Walk):
         super().__init__()
         self.tracer, self.scene, self.pixel = tracer, tracer.scene, pixel
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
-        self.first_turn = stratified(sample, generator(dr.opaque(mi.UInt32, seed), pixel))
-        self.rng = generator(dr.opaque(mi.UInt32, seed) ^ (sample * 0x9E3779B9 + 1), pixel)
+        shared, self.rng = streams(seed, pixel, sample)
+        self.first_turn = stratified(sample, shared)
         wavelengths, spectral = tracer.receiver.wavelengths(self.rng)
         jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         self.ray = tracer.rays.sample(pixel, jitter, self.rng, wavelengths)

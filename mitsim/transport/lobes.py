@@ -22,7 +22,7 @@ from mitsim.optics.camera import CameraGeometry
 from mitsim.transport.paths import launches
 from mitsim.transport.rays import ProjectorRays
 from mitsim.transport.receiver import Receiver
-from mitsim.transport.sampling import generator, panchromatic
+from mitsim.transport.sampling import panchromatic, streams
 from mitsim.transport.source import Projector
 
 _SHARP = 100.0
@@ -74,7 +74,7 @@ class _Lobes:
 
     def meet(self, seed: int, sample: Any, pixel: Any) -> tuple[Any, Any]:
         """Two (lanes,) arrays: estimates x of the mean irradiance, and light I of a connection to the point met."""
-        rng = generator(dr.opaque(mi.UInt32, seed) ^ (sample * 0x9E3779B9 + 1), pixel)
+        _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         wavelengths, spectral = self.receiver.wavelengths(rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)

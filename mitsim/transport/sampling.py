@@ -23,6 +23,13 @@ def generator(seed: Any, stream: Any) -> Any:
     return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 
 
+def streams(seed: int, stream: Any, sample: Any) -> tuple[Any, Any]:
+    """Two generators for one sample of a stream: one that all its samples share, which :func:`stratified` scrambles
+    them by, and one of its own."""
+    shared = dr.opaque(mi.UInt32, seed)
+    return generator(shared, stream), generator(shared ^ (sample * 0x9E3779B9 + 1), stream)
+
+
 def stratified(index: Any, rng: Any) -> Any:
     """Point ``index`` of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
     first = _scrambled(dr.brev(index), rng.next_uint32())
