@@ -11,9 +11,11 @@ import psutil
 from mitsim.core.errors import MitsimError
 
 _CGROUPS = (
-    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
-    (Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"), Path("/sys/fs/cgroup/memory/memory.usage_in_bytes")),
+    (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactive_file"),
+    (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 )
+"""Where control groups of version 2 and 1 say what a container may take, what it takes, and how much of that is cache of
+files, which the kernel gives back when it is needed."""
 _USABLE = 0.9
 
 
@@ -63,9 +65,11 @@ class Cost:
 def free_memory() -> float:
     """Bytes that this process can still take: the machine's, its control group's, or its own limit's, the least."""
     left = [float(psutil.virtual_memory().available)]
-    for limit, used in _CGROUPS:
+    for folder, limit, used, cached in _CGROUPS:
         try:
-            left.append(float(limit.read_text()) - float(used.read_text()))
+            counts = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+            taken = float((folder / used).read_text()) - float(counts.get(cached, 0))
+            left.append(float((folder / limit).read_text()) - taken)
         except (OSError, ValueError):  # no such group, or "max"
             continue
     if hasattr(psutil, "RLIMIT_AS"):  # Linux and FreeBSD
