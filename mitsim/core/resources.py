@@ -14,8 +14,8 @@ _CGROUPS = (
     (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactive_file"),
     (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 )
-"""Where control groups of version 2 and 1 say what a container may take, what it takes, and how much of that is cache of
-files, which the kernel gives back when it is needed."""
+"""Where control groups of version 2 and 1 say what a container may take, what it takes, and how much of that is cache
+of files, which the kernel gives back when it is needed."""
 _USABLE = 0.9
 
 
