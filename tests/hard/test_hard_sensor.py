@@ -20,24 +20,12 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.sensor import chain, moments
 from mitsim.sensor.model import SensorModel, load_sensor
+from tests.invented import sensor
 
 SEED = 41_2026
 SIGNIFICANCE = 1e-6
 MEANS = (1e-6, 1e-4, 1e-2, 0.3, 1.0, 7.5, 60.0, 1e3, 1e5, 1e8, 1e10, 1e12, 1e13, 1e14, 1e15, 1e17)
 DRAWS = 200_000
-
-
-def sensor(**changes: object) -> SensorModel:
-    values: dict[str, object] = {
-        "name": "hard",
-        "pixel_pitch_um": 5.86,
-        "full_well_e": 1000.0,
-        "read_noise_e": 0.0,
-        "quantum_efficiency": 1.0,
-        "gain_dn_per_e": 1.0,
-        "source": "invented for this test",
-    }
-    return SensorModel(**{**values, **changes})
 
 
 def exposed(model: SensorModel, mean: float, count: int, *names: object) -> np.ndarray:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -399,3 +401,28 @@ def test_a_folder_that_holds_something(refused: Refused, lab: Any, tmp_path: Pat
         "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration),
     }[verb]
     mentions(refused(*arguments, "-o", "mine"), "mine", "holds files")
+
+
+# ---- what no check foresees ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "fragment"),
+    [
+        (MemoryError(), "out of memory"),
+        (OSError(errno.ENOSPC, "No space left on device"), "output: No space left on device"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "a" * 9), "aaaaaaaaa: File name too long"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else None,
+)
+def test_faults_of_the_machine_are_one_line(
+    refused: Refused, monkeypatch: pytest.MonkeyPatch, error: Exception, fragment: str
+) -> None:
+    monkeypatch.setattr("mitsim.core.environment.doctor", Mock(side_effect=error))
+    mentions(refused("doctor"), fragment)
+
+
+def test_a_fault_of_ours_is_not_dressed_up(call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mitsim.core.environment.doctor", Mock(side_effect=OSError(errno.EINVAL, "Invalid argument")))
+    with pytest.raises(OSError, match="Invalid argument"):
+        call("doctor")

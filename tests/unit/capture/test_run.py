@@ -398,3 +398,15 @@ def test_what_frames_alone_take_is_looked_at_before_the_plan(
     with pytest.raises(MitsimError, match="dots:3: would take about"):
         capture(bench, "dots:3", tmp_path / "run", ACCURACY, limits=limits)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_resumed_run_needs_room_for_its_missing_frames_only(
+    captured: CaptureResult, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine frames take 0.3 MB; with all of them there, 0.06 MB are enough."""
+    monkeypatch.setattr("mitsim.core.resources.free_disk", lambda _: 6e4)
+    with pytest.raises(MitsimError, match="would write about"):
+        capture(bench, "dots:3", tmp_path / "new", ACCURACY, seed=5)
+    folder = Path(shutil.copytree(captured.output, tmp_path / "run"))
+    capture(bench, "dots:3", folder, ACCURACY, seed=5, resume=True)
+    assert pixels(folder) == pixels(Path(captured.output))

@@ -12,19 +12,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.sensor import chain, moments
 from mitsim.sensor.model import SensorModel, paper_sensor
-
-
-def sensor(**changes: object) -> SensorModel:
-    values: dict[str, object] = {
-        "name": "test",
-        "pixel_pitch_um": 5.86,
-        "full_well_e": 1000.0,
-        "read_noise_e": 0.0,
-        "quantum_efficiency": 1.0,
-        "gain_dn_per_e": 1.0,
-        "source": "invented for this test",
-    }
-    return SensorModel(**{**values, **changes})
+from tests.invented import sensor
 
 
 def exposed(model: SensorModel, mean: float, size: int, seed: int = 0, exposure_s: float = 0.0) -> np.ndarray:
