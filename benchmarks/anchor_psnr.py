@@ -21,9 +21,10 @@ from collections.abc import Iterator
 import numpy as np
 from skimage import color, data
 
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import prepare
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 
 N = 128
 PHOTOGRAPHS = ("astronaut", "camera", "coffee", "chelsea", "rocket", "moon", "hubble_deep_field", "coins")

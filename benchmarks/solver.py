@@ -21,10 +21,11 @@ from collections.abc import Callable
 import mpmath
 import numpy as np
 
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 
 N, K = 128, 7
 EPS = float(np.finfo(np.float64).eps)

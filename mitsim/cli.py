@@ -153,8 +153,8 @@ def plan(
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.capture.cost import frames_cost
     from mitsim.capture.light import make_plan
+    from mitsim.capture.plan import parse_effects
     from mitsim.capture.run import plan_block
-    from mitsim.scene.plan import parse_effects
 
     forced = parse_effects(effects)
     bench = _bench(scene, variant, camera, projector, define, outside)
@@ -196,8 +196,8 @@ def capture(
 ) -> int:
     """Render, expose and write one frame for each pattern."""
     from mitsim.capture.exposer import Exposure
+    from mitsim.capture.plan import parse_effects
     from mitsim.capture.run import capture as run_capture
-    from mitsim.scene.plan import parse_effects
 
     forced, limits = parse_effects(effects), _limits(max_seconds, max_memory)
     chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
@@ -236,7 +236,7 @@ def calibrate(
     quiet: Quiet = False,
 ) -> int:
     """Render a Hadamard session on a white board and estimate the camera's factors."""
-    from mitsim.capture.bench import load_recipe
+    from mitsim.rig.recipe import load_recipe
     from mitsim.study.calibration import calibrate as run_calibration
 
     limits = _limits(max_seconds, max_memory)
@@ -300,8 +300,8 @@ def render(
     quiet: Quiet = False,
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
+    from mitsim.capture.plan import parse_effects
     from mitsim.capture.render import render as run_render
-    from mitsim.scene.plan import parse_effects
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")

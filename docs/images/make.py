@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mitsim.core.frames import read_frame
+from mitsim.core.framefile import read_frame
 
 COMMANDS = {
     "run": ("capture", "photograph", "--patterns", "dots:7"),

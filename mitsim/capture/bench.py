@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,77 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mitsim.capture.mirror import MirrorLight
+from mitsim.capture.glint import MirrorLight
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import checksum
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.diffraction import Spectrum
+from mitsim.core.framefile import checksum
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.patterns import PatternFamily, parse_patterns
+from mitsim.rig.projector import ProjectorModel, Spectrum
+from mitsim.rig.sensor import SensorModel, load_sensor
 from mitsim.scene.load import LoadedScene, load_scene
-from mitsim.scene.patterns import PatternFamily, parse_patterns
 from mitsim.scene.projector import window_at
-from mitsim.sensor.model import SensorModel, load_sensor
 from mitsim.transport import plugins
 from mitsim.transport.beams import trace_beams
 from mitsim.transport.source import Projector
 
-__all__ = ["DEFAULT_VARIANT", "Bench", "PatternFamily", "ProjectorModel", "SessionRecipe", "load_recipe", "open_bench"]
-
 DEFAULT_VARIANT = "llvm_ad_mono"
 _PITCH_TOLERANCE = 1e-3
-
-
-class ProjectorModel(BaseModel):
-    """What mitsim uses of a projector file; the rest of the file documents its sources."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    name: str = Field(description="what the projector is called in reports")
-    effective_wavelength_nm: float = Field(
-        gt=0, allow_inf_nan=False, description="one wavelength that carries as many photons per watt [nm]"
-    )
-    wavelengths_nm: tuple[float, ...] = Field((), description="spectral lines [nm]; none: the effective wavelength")
-    radiant_shares: tuple[float, ...] = Field((), description="part of the power in each line")
-    contrast_ratio: float = Field(math.inf, gt=1, description="light of a white pixel over that of a black one")
-    aperture_radius_mm: float = Field(0.0, ge=0, allow_inf_nan=False, description="radius of the lens [mm]; 0: pinhole")
-    focus_mm: float | None = Field(None, gt=0, description="distance of the sharp plane [mm]; none: scene_distance")
-    speckle_contrast: float = Field(0.0, ge=0, le=1, description="of one sensor pixel's light; see docs/physics.md")
-    blur_pixels: float = Field(0.0, ge=0, allow_inf_nan=False, description="spot's standard deviation [pixels]")
-
-    @model_validator(mode="after")
-    def _lines_have_shares(self) -> ProjectorModel:
-        if len(self.wavelengths_nm) != len(self.radiant_shares):
-            raise ValueError(
-                f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares; "
-                "give one share a line"
-            )
-        return self
-
-    @property
-    def black_level(self) -> float:
-        """Light of a black pixel, as a part of a white one's."""
-        return 1 / self.contrast_ratio
-
-    @property
-    def spectrum(self) -> Spectrum:
-        """Photons at each line: power times wavelength."""
-        wavelengths = np.array(self.wavelengths_nm or (self.effective_wavelength_nm,))
-        photons = np.array(self.radiant_shares or (1.0,)) * wavelengths
-        return Spectrum(wavelengths, photons / photons.sum())
-
-
-class SessionRecipe(BaseModel):
-    """How a calibration session is run."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    board_reflectance: float = Field(gt=0, le=1, description="diffuse reflectance of the white board")
-    exposure_fraction: float = Field(gt=0, le=1, description="brightest pixel's mean, as a part of the full well")
-    signed_capture: str = Field(pattern="^(pair|uniform)$", description="how a +-1 pattern is captured")
-    source: str = Field(description="where the numbers come from")
 
 
 @dataclass(frozen=True)
@@ -238,14 +184,8 @@ def open_bench(
     return Bench(loaded, sensor, light, variant, dict(defines or {}), str(sensor_path))
 
 
-def load_recipe(path: Path | str | None = None) -> SessionRecipe:
-    """The calibration session's recipe, the shipped one without ``path``."""
-    return load_model(Path(path) if path is not None else shipped("calibration", "session.toml"), SessionRecipe)
-
-
 def _scalar_transform(camera: Any) -> Any:
     import mitsuba as mi
-    import numpy as np
 
     matrix = np.array(camera.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
     return mi.ScalarAffineTransform4f(matrix.tolist())

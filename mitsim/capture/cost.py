@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE
 from mitsim.core.resources import Cost
 from mitsim.optics.frames import frames_in_memory
-from mitsim.scene.evidence import GROUPS, Settings
 
 _LANES_BYTES = 350e6  # paths in flight, compiled kernels, LLVM; measured
 _DEPOSIT_BYTES = 36.0  # an entry of a sparse matrix, and the sum that it is added to

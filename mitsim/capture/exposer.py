@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
 from mitsim.capture.bench import Bench
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.optics.speckle import speckled
-from mitsim.scene.patterns import PatternFamily
+from mitsim.rig.patterns import PatternFamily
 from mitsim.sensor.chain import (
     Digital,
     add_dark_current,
@@ -27,7 +27,6 @@ from mitsim.sensor.chain import (
 )
 from mitsim.sensor.moments import frame_moments
 
-FloatArray = npt.NDArray[np.float64]
 _LONGEST_S = 1e6
 _CAN_SATURATE = 1e-3
 FRAMES_AT_ONCE = 16

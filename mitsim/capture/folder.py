@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import Channel, Value, checksum, read_frame, write_frame
+from mitsim.core.framefile import Channel, Value, checksum, read_frame, write_frame
 from mitsim.core.manifest import read_json, write_json
 from mitsim.core.output import output_folder, sweep
 

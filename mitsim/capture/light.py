@@ -9,38 +9,17 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
 from mitsim.capture.simulation import Estimate, Simulation
+from mitsim.core.arrays import FloatArray, Labels, Progress
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
-from mitsim.scene.evidence import GROUPS, Evidence, Settings
-from mitsim.scene.plan import Plan, SceneFacts, check_accuracy, decide
 
-__all__ = [
-    "GROUPS",
-    "Evidence",
-    "Light",
-    "Plan",
-    "Progress",
-    "Settings",
-    "check_accuracy",
-    "collect",
-    "decide",
-    "make_plan",
-    "pinhole_view",
-    "scene_facts",
-    "silent",
-    "speckle_of",
-    "uniform_light",
-]
-
-FloatArray = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
-Progress = Callable[[str, float], None]
 Target = Callable[[ExpectedFrames], float]
 _CHECKED_CAPTURES = 8
 _MOST_PATHS = 2**32

@@ -1,6 +1,6 @@
 """A short look at a scene before the real work: the error that each effect or coarseness would leave, and the pace.
 
-Numbers in, numbers out: the effect plan (:mod:`mitsim.scene.plan`) reads them and decides. Every error is relative,
+Numbers in, numbers out: the effect plan (:mod:`mitsim.capture.plan`) reads them and decides. Every error is relative,
 ``||a - b|| / ||b||``, over up to four captures of the family. Two independent halves A and B see the same change with
 independent noise, so ``<a_A - b_A, a_B - b_B>`` estimates ``||a - b||^2`` without the noise's own energy.
 """
@@ -13,21 +13,19 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import GROUPS, PHYSICAL, Effort, Evidence, Noise, Settings
 from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.scene.evidence import GROUPS, PHYSICAL, Effort, Evidence, Noise, Settings
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import AMBIENT, INDIRECT, Deposits
 from mitsim.transport.lobes import SharpLight, sharp_light
 
-FloatArray = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
 Halves = tuple[FloatArray, FloatArray]
 ANCHOR_LADDER = (1, 2, 3, 5, 8)
 LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.cost import frames_cost
-from mitsim.capture.light import Progress, collect, make_plan, silent, uniform_light
+from mitsim.capture.light import collect, make_plan, uniform_light
+from mitsim.core.arrays import FloatArray, Progress, silent
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import write_frame
+from mitsim.core.framefile import write_frame
 from mitsim.core.manifest import versions
 from mitsim.core.output import prepare_output
 from mitsim.core.resources import Cost, Limits
@@ -26,7 +26,6 @@ from mitsim.core.seeds import integer
 from mitsim.scene.load import LoadedScene, load_scene
 from mitsim.transport import plugins
 
-FloatArray = npt.NDArray[np.float64]
 ESTIMATORS = ("reference", "factored")
 _SAMPLES_A_PASS = 64
 _FEWEST_PASSES = 4

@@ -11,26 +11,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from mitsim.capture.bench import Bench, load_recipe
-from mitsim.capture.clock import Clock
+from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
+from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
 from mitsim.capture.folder import RunFolder, claimed, frame_name
-from mitsim.capture.light import Light, Progress, collect, make_plan, silent, speckle_of, uniform_light
+from mitsim.capture.light import Light, collect, make_plan, speckle_of, uniform_light
+from mitsim.capture.plan import Plan
+from mitsim.core.arrays import FloatArray, Progress, silent
+from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import Channel
+from mitsim.core.framefile import Channel
 from mitsim.core.manifest import DECIDING, versions
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.resources import Limits
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.scene.evidence import GROUPS, Settings
-from mitsim.scene.patterns import Capture, PatternFamily
-from mitsim.scene.plan import Plan
+from mitsim.rig.patterns import Capture, PatternFamily
+from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import Digital
 
-FloatArray = npt.NDArray[np.float64]
 _FIREFLIES = 0.8
 """Part of the variance in one of 8 groups: a single heavy path gives 0.875, and ordinary noise 0.2 to 0.4.
 

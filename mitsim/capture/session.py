@@ -11,22 +11,21 @@ from collections.abc import Iterator
 from itertools import islice
 
 import numpy as np
-import numpy.typing as npt
 
-from mitsim.capture.bench import Bench, SessionRecipe
-from mitsim.capture.clock import Clock
+from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
-from mitsim.capture.light import Light, Progress, collect, make_plan, speckle_of, uniform_light
+from mitsim.capture.light import Light, collect, make_plan, speckle_of, uniform_light
+from mitsim.capture.plan import Plan
+from mitsim.core.arrays import FloatArray, Labels, Progress
+from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.core.resources import Limits
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.scene.patterns import hadamard_matrix
-from mitsim.scene.plan import Plan
+from mitsim.rig.patterns import hadamard_matrix
+from mitsim.rig.recipe import SessionRecipe
 
-FloatArray = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
 SIDES = ("horizontal", "vertical")
 _LINES = 4
 

@@ -12,14 +12,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
-from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
-from mitsim.optics.diffraction import Spectrum
+from mitsim.capture.evidence import Settings
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
-from mitsim.scene.evidence import Settings
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
 from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.direct import DirectTracer
@@ -27,8 +28,6 @@ from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.source import Projector
 
-FloatArray = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
 AMBIENT_NM, AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over this range, in so many bands."""
 

@@ -112,7 +112,7 @@ def _openexr() -> Check:
         # Imported here: a broken OpenEXR must be a finding, not the end of the doctor.
         import numpy as np
 
-        from mitsim.core.frames import read_frame, write_frame
+        from mitsim.core.framefile import read_frame, write_frame
 
         values = np.arange(6, dtype=np.uint32).reshape(2, 3)
         with tempfile.TemporaryDirectory() as folder:

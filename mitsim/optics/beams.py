@@ -18,13 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry
 from mitsim.optics.samplers import ProfileSampler, SeparableTerm, geometric_terms
+from mitsim.rig.camera import CameraGeometry
 
 __all__ = ["Beams", "ProfileSampler", "SeparableTerm", "SpecularFrames", "beam_frames", "geometric_terms"]
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Response = Callable[[FloatArray, FloatArray], FloatArray]
 _BOXES_AT_ONCE = 2**18

@@ -23,19 +23,18 @@ clear aperture of both faces, propagated from the exit face: diffraction inside 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
 from scipy.special import fresnel
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.optics.profile import Steps, sampled_box_means
 from mitsim.optics.shadow import Directions, SeparableTerms, Setting, both_axes
+from mitsim.rig.projector import Spectrum
 
-FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4
 _STEPS_PER_FRESNEL_LENGTH = 130
@@ -44,39 +43,6 @@ geometry's shadow, half of it 1.4e-4, twice 7e-4 (against an eighth; tests/physi
 _THICK_STEPS = 2
 """Grid of a thick mask, whose every direction needs fields of its own, in steps of the thin one's."""
 _LARGEST_GRID = 1 << 24
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """Wavelengths and the share of the photons at each.
-
-    Attributes
-    ----------
-    wavelengths_nm
-        (w,) wavelengths [nm], above 0; read-only.
-    weights
-        (w,) shares, not negative, that sum to 1; read-only.
-    """
-
-    wavelengths_nm: FloatArray
-    weights: FloatArray
-
-    def __post_init__(self) -> None:
-        wavelengths, weights = (np.array(v, dtype=np.float64) for v in (self.wavelengths_nm, self.weights))
-        if wavelengths.ndim != 1 or wavelengths.size == 0 or wavelengths.shape != weights.shape:
-            raise MitsimError(
-                f"spectrum of {wavelengths.shape} wavelengths and {weights.shape} weights; give one weight a wavelength"
-            )
-        if not (np.isfinite(wavelengths).all() and (wavelengths > 0).all()):
-            raise MitsimError(f"spectrum has a wavelength of {wavelengths.min()} nm; give finite numbers above 0")
-        if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
-            raise MitsimError(
-                f"spectrum weights are at least {weights.min()} and sum to {weights.sum()}; "
-                "give shares of 0 or more that sum to 1"
-            )
-        for name, array in (("wavelengths_nm", wavelengths), ("weights", weights)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
 
 
 class EdgeWaves:

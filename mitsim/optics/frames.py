@@ -17,13 +17,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
-from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
-from mitsim.optics.diffraction import Spectrum
+from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions, SeparableTerms
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 _AT_ONCE = 32
 _LARGEST_BASIS = 256
@@ -340,7 +342,7 @@ def _shadow(
 ) -> SeparableTerms:
     """The mask's shadow; the last few are kept, for a plan asks for the same ones many times."""
     spectrum = None if lines is None else Spectrum(np.frombuffer(lines[0]), np.frombuffer(lines[1]))
-    return geometry.shadow_terms(rows.directions, columns.directions, depth, spectrum)
+    return shadow_terms(geometry, rows.directions, columns.directions, depth, spectrum)
 
 
 def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from mitsim.core.arrays import FloatArray
+
 _FEW = 4
 """Edges in the narrower box that are taken one by one; with more, the box is wide enough for a second difference."""
 

@@ -13,10 +13,12 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.diffraction import Spectrum, wave_profiles
+from mitsim.core.arrays import FloatArray
+from mitsim.optics.diffraction import wave_profiles
+from mitsim.optics.terms import shadow_setting
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
 
-FloatArray = npt.NDArray[np.float64]
 Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 SeparableTerm = tuple[float, Sampler, Sampler]
 
@@ -53,7 +55,7 @@ def wave_samplers(
 ) -> list[SeparableTerm]:
     """The mask's wave-optical shadow of a (virtual) source at ``depth`` [mm] and tan-angles ``tau``, as samplers."""
     edges = geometry.pixel_edges
-    setting = geometry.setting(depth)
+    setting = shadow_setting(geometry, depth)
     reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + float(edges[1] - edges[0])
     found: list[SeparableTerm] = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):

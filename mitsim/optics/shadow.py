@@ -27,11 +27,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.optics.mask import Mask
 from mitsim.optics.profile import Steps
+from mitsim.rig.mask import Mask
 
-FloatArray = npt.NDArray[np.float64]
 SeparableTerms = list[tuple[FloatArray, FloatArray]]
 _WIDE = 32
 """Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel little."""
@@ -178,13 +178,6 @@ def _thick_means(setting: Setting, profiles: list[FloatArray], directions: Direc
         for term, clear in enumerate(setting.clear(profiles, float(tau))):
             found[term, :, j] = clear.box_means(crossings[:, j], setting.half_pixel, half_cell)
     return found
-
-
-def centred_edges(count: int, pitch: float) -> FloatArray:
-    """(count + 1,) edges of ``count`` equal cells centred on zero, in the unit of ``pitch``."""
-    if count < 1 or not (np.isfinite(pitch) and pitch > 0):
-        raise MitsimError(f"a grid of {count} cells of size {pitch} is empty; give at least 1 cell and a size above 0")
-    return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)
 
 
 def shadow_factor(

@@ -9,11 +9,9 @@ an illuminated patch D = 120 mm is 2 um at 400 mm, below a pixel. Contrast 0 pas
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def speckled(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:

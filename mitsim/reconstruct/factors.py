@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse.csgraph import connected_components
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 
-FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.intp]
 Method = Literal["svd", "gram"]
 Structure = Literal["auto", "block", "full"]

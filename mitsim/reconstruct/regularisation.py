@@ -11,19 +11,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-
-FloatArray = npt.NDArray[np.float64]
 
 RISK_POWER = 0.5
 """Errors are weighted by sigma to this power: 0 is the image's error, 2 that of predicted frames."""
 
 
 @dataclass(frozen=True, eq=False)
-class Spectrum:
+class DiagonalProblem:
     """The inverse problem in its diagonal basis.
 
     Attributes
@@ -59,7 +57,7 @@ class Spectrum:
         return float(np.square(self.sigma.max()))
 
 
-def risk_score(spectrum: Spectrum, lam: float, noise: float) -> float:
+def risk_score(spectrum: DiagonalProblem, lam: float, noise: float) -> float:
     """Unbiased estimate of the weighted squared error of the image, up to a constant.
 
     With kept shares k, coefficient (k W / sigma) has expected squared error (1 - k)^2 x^2 + k^2 noise /
@@ -73,7 +71,7 @@ def risk_score(spectrum: Spectrum, lam: float, noise: float) -> float:
     return float(np.sum(sigma**RISK_POWER * errors))
 
 
-def noise_variance(spectrum: Spectrum) -> float:
+def noise_variance(spectrum: DiagonalProblem) -> float:
     """Mean noise variance of one datum [data unit squared], from the energy outside the model's range."""
     spare = spectrum.data_count - np.count_nonzero(spectrum.sigma)
     if spare <= 0:
@@ -82,7 +80,7 @@ def noise_variance(spectrum: Spectrum) -> float:
     return max(spectrum.energy - float(inside), 0.0) / spare
 
 
-def automatic_lambda(spectrum: Spectrum) -> float:
+def automatic_lambda(spectrum: DiagonalProblem) -> float:
     """Lambda that minimises :func:`risk_score`: a grid over 16 decades, refined between its best neighbours.
 
     Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there

@@ -28,19 +28,12 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.accumulator import Accumulator, centred_columns
-from mitsim.reconstruct.factors import (
-    FloatArray,
-    Method,
-    Side,
-    Structure,
-    check_choices,
-    factorise,
-    group_pixels,
-)
-from mitsim.reconstruct.regularisation import Spectrum, automatic_lambda
+from mitsim.reconstruct.factors import Method, Side, Structure, check_choices, factorise, group_pixels
+from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 
 ROUNDING_LIMIT = 0.01
 """Rounding above this part of the image flags a solution: two digits are the least that anyone can see or use."""
@@ -121,7 +114,7 @@ class Prepared:
         """An empty sum to add frames to."""
         return Accumulator(self.left, self.right, self.centre)
 
-    def spectrum(self, frames: Accumulator) -> Spectrum:
+    def spectrum(self, frames: Accumulator) -> DiagonalProblem:
         """Data and singular values in the basis where the problem is diagonal.
 
         MitsimError when frames are missing: the closed form holds for all patterns or none.
@@ -138,7 +131,7 @@ class Prepared:
             rotated = self.left.basis.T @ projected @ self.right.basis
             projected = np.divide(rotated, sigma, out=np.zeros_like(sigma), where=sigma > 0)
         data_count = self.left.data_rows * self.right.data_rows
-        return Spectrum(sigma, projected, frames.energy, data_count)
+        return DiagonalProblem(sigma, projected, frames.energy, data_count)
 
     def image(self, coefficients: npt.ArrayLike) -> FloatArray:
         """Scene image (n, n') of coefficients (r, r') in the diagonal basis: V_L coefficients V_R^T."""
@@ -184,7 +177,7 @@ class Prepared:
             status=f"{status} {self.extent}, rounding below {rounding:.0e}.",
         )
 
-    def _rounding(self, spectrum: Spectrum, lam: float) -> float:
+    def _rounding(self, spectrum: DiagonalProblem, lam: float) -> float:
         """Bound on ||error|| / ||image|| by rounding; the module's text says where it comes from."""
         sigma = spectrum.sigma[spectrum.sigma > 0]
         power = np.square(sigma) + lam

@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from skimage.restoration import denoise_tv_chambolle
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.accumulator import Accumulator
-from mitsim.reconstruct.regularisation import Spectrum, automatic_lambda, noise_variance
+from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
 from mitsim.reconstruct.solver import Prepared
-
-FloatArray = npt.NDArray[np.float64]
 
 _BALANCE = 3.0
 AUTO_WEIGHT = 0.12
@@ -40,7 +38,7 @@ class TVSolution:
     status: str
 
 
-def automatic_weight(spectrum: Spectrum) -> float:
+def automatic_weight(spectrum: DiagonalProblem) -> float:
     """Weight from the noise estimate: noise standard deviation times the root mean square of sigma, times a
     constant.
 
@@ -98,7 +96,7 @@ def solve_tv(
     return _solution(prepared, spectrum, smooth, float(weight), spent, change, change < tolerance)
 
 
-def _penalty(spectrum: Spectrum) -> float:
+def _penalty(spectrum: DiagonalProblem) -> float:
     """ADMM penalty, which sets the speed only: the Tikhonov lambda balances both of its steps."""
     measured = np.square(spectrum.sigma[spectrum.sigma > 0])
     if spectrum.data_count > measured.size:
@@ -110,7 +108,7 @@ def _penalty(spectrum: Spectrum) -> float:
 
 def _solution(
     prepared: Prepared,
-    spectrum: Spectrum,
+    spectrum: DiagonalProblem,
     image: FloatArray,
     weight: float,
     iterations: int,

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.check import check_file
+from mitsim.scene.guard.check import check_file
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 

@@ -14,11 +14,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

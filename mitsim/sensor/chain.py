@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.units import photon_energy
-from mitsim.sensor.model import SensorModel
+from mitsim.rig.sensor import SensorModel
 
 Array = npt.NDArray[np.float64]
 Digital = npt.NDArray[np.float64] | npt.NDArray[np.uint32]

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.chain import Array, add_dark_current, amplify, checked_light, clip_at_full_well, poisson_quantile
-from mitsim.sensor.model import SensorModel
 
 _FEW = 64.0
 """Electrons below which moments behind the ADC are summed count by count."""

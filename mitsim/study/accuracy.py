@@ -19,25 +19,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.capture import pilot
-from mitsim.capture.bench import Bench, PatternFamily
+from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import Evidence, Settings
 from mitsim.capture.exposer import Exposure
-from mitsim.capture.light import Evidence, Light, Plan, Progress, Settings, collect, decide, scene_facts, silent
+from mitsim.capture.light import Light, collect, scene_facts
+from mitsim.capture.plan import Plan, decide
 from mitsim.capture.render import projected, reference
 from mitsim.capture.run import NoiseTarget
 from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray, Progress, silent
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifest import versions, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.rig.patterns import PatternFamily
 from mitsim.study import plots
 from mitsim.study.knobs import Variant, at_once, sampled, variants, without
 from mitsim.study.metrics import relative_error
 from mitsim.study.solver_cost import SolverRow, solver_costs
 
-FloatArray = npt.NDArray[np.float64]
 ACCURACIES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
 SAMPLES = (16, 64, 256)
 QUOTED = 1e-3

@@ -6,22 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from mitsim.calibrate.hadamard import Calibration, estimate_factors
-from mitsim.capture.bench import Bench, SessionRecipe, load_recipe
-from mitsim.capture.clock import Clock
+from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposure
-from mitsim.capture.light import Progress, silent
 from mitsim.capture.run import digital_block
 from mitsim.capture.session import Session
-from mitsim.core.frames import checksum, write_frame
+from mitsim.core.arrays import Progress, silent
+from mitsim.core.clock import Clock
+from mitsim.core.framefile import checksum, write_frame
 from mitsim.core.manifest import versions, write_json
 from mitsim.core.output import output_folder
 from mitsim.core.resources import Limits
+from mitsim.reconstruct.calibration import Calibration, estimate_factors
+from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.study.metrics import relative_error
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,23 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from mitsim.calibrate.hadamard import Calibration
-from mitsim.capture.bench import Bench, PatternFamily
+from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer, Exposure
-from mitsim.capture.light import Light, Plan, Progress
+from mitsim.capture.light import Light
+from mitsim.capture.plan import Plan
 from mitsim.capture.run import board_flux
+from mitsim.core.arrays import FloatArray, Progress
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.calibration import Calibration
 from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.rig.patterns import PatternFamily
 from mitsim.sensor.chain import Digital, electrons_from_irradiance
 from mitsim.study.ideal import ideal_factors, ideal_light
 from mitsim.study.metrics import psnr, ssim
 from mitsim.study.report import FamilyResult, Recovery
 
-FloatArray = npt.NDArray[np.float64]
 CONVENTIONS = ("equal peak", "equal frame", "equal total")
 
 

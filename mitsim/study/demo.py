@@ -13,19 +13,20 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from mitsim.calibrate.hadamard import Calibration
-from mitsim.capture.bench import Bench, PatternFamily, load_recipe, open_bench
-from mitsim.capture.clock import Clock
+from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.folder import frame_name
-from mitsim.capture.light import Progress, check_accuracy, collect, pinhole_view, silent
+from mitsim.capture.light import collect, pinhole_view
+from mitsim.capture.plan import check_accuracy
 from mitsim.capture.run import CaptureResult, capture
+from mitsim.core.arrays import FloatArray, Progress, silent
+from mitsim.core.clock import Clock
 from mitsim.core.configuration import shipped
-from mitsim.core.frames import read_frame
+from mitsim.core.framefile import read_frame
 from mitsim.core.manifest import read_json, versions, write_json
 from mitsim.core.output import output_folder, sweep
+from mitsim.reconstruct.calibration import Calibration
+from mitsim.rig.patterns import PatternFamily
+from mitsim.rig.recipe import load_recipe
 from mitsim.study.calibration import CalibrationResult, calibrate
 from mitsim.study.compare import Comparison
 from mitsim.study.describe import scene_line
@@ -42,7 +43,6 @@ from mitsim.study.report import (
     verdict,
 )
 
-FloatArray = npt.NDArray[np.float64]
 _PARTS = ("run", "calibration", "demo.json", "report.html")
 MAIN = "dots:7"
 FAMILIES = {

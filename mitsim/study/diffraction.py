@@ -19,22 +19,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from mitsim.calibrate.hadamard import estimate_factors
-from mitsim.capture.bench import Bench, PatternFamily, load_recipe
-from mitsim.capture.clock import Clock
+from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.light import Light, Plan, Progress, collect, make_plan, speckle_of
+from mitsim.capture.light import Light, collect, make_plan, speckle_of
+from mitsim.capture.plan import Plan
 from mitsim.capture.run import board_flux, truth
 from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray, Progress
+from mitsim.core.clock import Clock
 from mitsim.core.manifest import versions, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.optics.mask import MaskKind
+from mitsim.reconstruct.calibration import estimate_factors
 from mitsim.reconstruct.solver import prepare
+from mitsim.rig.mask import MaskKind
+from mitsim.rig.patterns import PatternFamily
+from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.study import plots
 from mitsim.study.compare import accumulate, peak_time
@@ -42,7 +45,6 @@ from mitsim.study.ideal import IdealCamera, ideal_factors
 from mitsim.study.metrics import psnr, ssim
 from mitsim.study.shadows import GEOMETRIC, LINE, PROJECTOR, ShadowRow, lights, point_profiles, shadow_row
 
-FloatArray = npt.NDArray[np.float64]
 Factors = tuple[FloatArray, FloatArray]
 ACCURACY = 1e-3
 MASKS: tuple[MaskKind, ...] = ("separable", "flatcam")

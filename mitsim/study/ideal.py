@@ -9,20 +9,21 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-from mitsim.capture.bench import Bench, PatternFamily
-from mitsim.capture.light import Light, Settings
+from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import Settings
+from mitsim.capture.light import Light
 from mitsim.capture.simulation import Estimate, Simulation
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.diffraction import Spectrum
+from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames, FrameOptics
-from mitsim.optics.mask import MaskKind
 from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions, SeparableTerms
-
-FloatArray = npt.NDArray[np.float64]
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.mask import MaskKind
+from mitsim.rig.patterns import PatternFamily
+from mitsim.rig.projector import Spectrum
 
 
 def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Light:
@@ -54,7 +55,7 @@ def ideal_factors(bench: Bench, board_flux: float, electrons_per_joule: float) -
     ``electrons_per_joule`` turns W m^-2 into electrons a second.
     """
     rows, columns = (Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows)
-    left, right = bench.geometry.shadow_terms(rows, columns, bench.geometry.scene_distance)[-1]
+    left, right = shadow_terms(bench.geometry, rows, columns, bench.geometry.scene_distance)[-1]
     scale = np.sqrt(board_flux * electrons_per_joule)
     return left * scale, right * scale
 
@@ -68,7 +69,7 @@ class IdealCamera:
         self.geometry: CameraGeometry = bench.geometry.model_copy(update={"mask": mask})
         self._depth = bench.geometry.scene_distance
         self._rows, self._columns = (Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows)
-        self.terms = self.geometry.shadow_terms(self._rows, self._columns, self._depth, spectrum)
+        self.terms = shadow_terms(self.geometry, self._rows, self._columns, self._depth, spectrum)
 
     @property
     def centre(self) -> bool:
@@ -78,7 +79,7 @@ class IdealCamera:
     def points(self) -> SeparableTerms:
         """The same operator for point sources at the centres of the projector's pixels."""
         rows, columns = (Directions(pixels.centres, 0.0) for pixels in (self._rows, self._columns))
-        return self.geometry.shadow_terms(rows, columns, self._depth, self.spectrum)
+        return shadow_terms(self.geometry, rows, columns, self._depth, self.spectrum)
 
     @cached_property
     def factors(self) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.light import GROUPS, Evidence, Plan, Settings
+from mitsim.capture.evidence import GROUPS, Evidence, Settings
+from mitsim.capture.plan import Plan
 from mitsim.optics.frames import ExpectedFrames
 
 Target = Callable[[ExpectedFrames], float]

@@ -77,7 +77,7 @@ def read_truth(run_folder: Path, board_reflectance: float | None = None) -> NDAr
     It is relative to the board of the shipped session recipe, or to one of ``board_reflectance`` when that is given.
     Raises MitsimError when the folder holds no truth, as with frames of a real camera.
     """
-    from mitsim.core.frames import read_frame
+    from mitsim.core.framefile import read_frame
 
     path = Path(run_folder) / TRUTH_FILE
     if not path.is_file():

@@ -8,18 +8,17 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib import image as matplotlib_image
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import write_frame
+from mitsim.core.framefile import write_frame
 from mitsim.core.manifest import write_json
 from mitsim.core.output import output_folder, whole_file
-from mitsim.reconstruct.run import check_fit, inherited, load, read_calibration, read_run, solve, verify
+from mitsim.reconstruct.folders import check_fit, inherited, load, read_calibration, read_run, solve, verify
 from mitsim.reconstruct.solver import Solution
 from mitsim.study.metrics import TRUTH_FILE, psnr, read_truth, ssim
 
-FloatArray = npt.NDArray[np.float64]
 IMAGE_FILE = "image.exr"
 
 

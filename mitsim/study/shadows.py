@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.capture.bench import Bench
-from mitsim.optics.diffraction import Spectrum
+from mitsim.core.arrays import FloatArray
 from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.projector import Spectrum
 from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import relative_error
 
-FloatArray = npt.NDArray[np.float64]
 BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
 GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
 
@@ -75,6 +75,6 @@ def point_profiles(bench: Bench) -> dict[str, FloatArray]:
     """(pixels,) shadow of a point on the axis along one side of the sensor, through the separable mask, by light."""
     camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
     return {
-        name: best_term(camera.shadow_terms(axis, axis, camera.scene_distance, spectrum)).left[:, 0]
+        name: best_term(shadow_terms(camera, axis, axis, camera.scene_distance, spectrum)).left[:, 0]
         for name, spectrum in lights(bench).items()
     }

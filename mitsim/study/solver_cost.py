@@ -29,18 +29,17 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray, Progress
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.rig.camera import CameraGeometry, centred_edges
+from mitsim.rig.mask import mls_mask
 from mitsim.study.metrics import relative_error
 
-FloatArray = npt.NDArray[np.float64]
-Progress = Callable[[str, float], None]
 Precision = Literal["float64", "float32 frames", "float32 products"]
 Timed = list[tuple[float, FloatArray]]
 PRECISIONS: tuple[Precision, ...] = ("float64", "float32 frames", "float32 products")

@@ -19,13 +19,13 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import Beams
-from mitsim.optics.camera import CameraGeometry
+from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.mirrors import Crossings, MirrorTracer, delta_bsdfs
 from mitsim.transport.source import Projector
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 _UNIT = 2**10

@@ -26,7 +26,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.optics.camera import CameraGeometry
+from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.cells import CellGrid
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Walk, camera_part, survival, walked

@@ -13,7 +13,8 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.optics.camera import CameraGeometry, anchor_positions
+from mitsim.optics.anchors import anchor_positions
+from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import DIRECT, Deposits
 from mitsim.transport.paths import launches
 from mitsim.transport.rays import ProjectorRays

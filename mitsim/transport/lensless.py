@@ -57,7 +57,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry
+from mitsim.rig.camera import CameraGeometry
 
 PLUGIN = "mitsim_lensless"
 _REGISTERED: set[str] = set()

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry
+from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.paths import launches
 from mitsim.transport.rays import ProjectorRays
 from mitsim.transport.receiver import Receiver

@@ -16,10 +16,10 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.transport.pinhole import PinholeRays, channels, host, vectors, wavelength_sets
 from mitsim.transport.source import Projector
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
 Mask = npt.NDArray[np.bool_]

@@ -14,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.transport.source import Projector
 
-FloatArray = npt.NDArray[np.float64]
 _WAVELENGTH_SETS = 8
 
 

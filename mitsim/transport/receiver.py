@@ -18,7 +18,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.optics.camera import CameraGeometry
+from mitsim.rig.camera import CameraGeometry
 
 
 @dataclass

@@ -21,10 +21,10 @@ from types import FrameType
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import read_frame, write_frame
-from mitsim.reconstruct.run import read_run
-from mitsim.scene.check import check_file
-from mitsim.scene.vocabulary import PLUGINS
+from mitsim.core.framefile import read_frame, write_frame
+from mitsim.reconstruct.folders import read_run
+from mitsim.scene.guard.check import check_file
+from mitsim.scene.guard.vocabulary import PLUGINS
 from tests.hard.hostile import GOOD, MESH, OBJ, beside, file
 
 LONGEST = 5.0

@@ -18,11 +18,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
-from mitsim.calibrate.hadamard import LARGEST_ERROR, UNKNOWN_NOISE, Calibration, estimate_factors
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import write_frame
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.core.framefile import write_frame
+from mitsim.optics.shadow import scene_factor
+from mitsim.reconstruct.calibration import LARGEST_ERROR, UNKNOWN_NOISE, Calibration, estimate_factors
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 from mitsim.study.quality import ReconstructionResult, reconstruct
 
 N, PIXELS = 16, 64
@@ -333,8 +334,8 @@ def test_a_saturated_session_is_flagged(
     (That no frame is counted without cause: tests/unit/capture/test_session.py::test_the_folder.)
     """
     from mitsim.capture.bench import open_bench
+    from mitsim.capture.evidence import PHYSICAL
     from mitsim.capture.light import make_plan
-    from mitsim.scene.evidence import PHYSICAL
     from mitsim.study.calibration import calibrate
 
     def simple_plan(*arguments: object) -> object:

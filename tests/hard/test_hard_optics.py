@@ -19,12 +19,14 @@ from hypothesis import strategies as st
 from scipy.special import fresnel
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.diffraction import EdgeWaves, Spectrum
-from mitsim.optics.mask import Mask, mls_mask
+from mitsim.optics.diffraction import EdgeWaves
 from mitsim.optics.profile import Steps, sampled_box_means
 from mitsim.optics.samplers import ProfileSampler
 from mitsim.optics.shadow import Directions, Setting, geometric_terms
+from mitsim.optics.terms import shadow_setting, shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.mask import Mask, mls_mask
+from mitsim.rig.projector import Spectrum
 
 EPS = np.finfo(float).eps
 NM = 550.0
@@ -145,7 +147,7 @@ def test_the_papers_mask_at_extremes_equals_fractions(name: str, record_property
     """
     numbers, gate = EXTREMES[name]
     geometry = CameraGeometry(**numbers)
-    setting = geometry.setting(400.0)
+    setting = shadow_setting(geometry, 400.0)
     ((found, _),) = geometric_terms(setting, PAPER, PAPER)
     assert np.isfinite(found).all() and found.min() > -1e-9 and found.max() < 1 + 1e-9
     partial = np.argwhere((found > 1e-6) & (found < 1 - 1e-6))
@@ -263,7 +265,7 @@ def test_a_mask_on_the_sensor_is_its_own_shadow() -> None:
     cells = Directions(np.linspace(-0.15, 0.15, 5), 0.01)
     ends = {}
     for distance in (1e-9, 1e-6, 1e-3):
-        setting = CameraGeometry(pixels=12, pixel_pitch=0.05, mask_distance=distance).setting(400.0)
+        setting = shadow_setting(CameraGeometry(pixels=12, pixel_pitch=0.05, mask_distance=distance), 400.0)
         ((found, _),) = geometric_terms(setting, cells, cells)
         edges, values = mask_edges(setting.mask), [Fraction(int(bit)) for bit in setting.mask.bits]
         half = Fraction(setting.active_mm) / 2
@@ -285,14 +287,14 @@ def test_waves_of_a_mask_near_the_sensor_tend_to_its_shadow() -> None:
     errors = []
     for distance in (2e-2, 1e-3, 1e-4, 1e-5):
         geometry = CameraGeometry(pixels=16, mask_order=5, mask_distance=distance)
-        ((wave, _),), ((rays, _),) = (geometry.shadow_terms(at, at, 400.0, light) for light in (LINE, None))
+        ((wave, _),), ((rays, _),) = (shadow_terms(geometry, at, at, 400.0, light) for light in (LINE, None))
         assert np.isfinite(wave).all() and wave.min() > -1e-9
         errors.append(float(np.linalg.norm(wave - rays) / np.linalg.norm(rays)))
     assert errors[0] < 0.2 and errors[-1] < 1e-3
     for (near, far), (small, large) in zip(pairwise(errors), pairwise((2e-2, 1e-3, 1e-4, 1e-5)), strict=True):
         assert far / near < 1.3 * math.sqrt(large / small)
     with pytest.raises(MitsimError, match=r"^diffraction over [^\n]*move the mask off the sensor[^\n]*$"):
-        CameraGeometry(mask_distance=1e-9).shadow_terms(at, at, 400.0, LINE)
+        shadow_terms(CameraGeometry(mask_distance=1e-9), at, at, 400.0, LINE)
 
 
 @pytest.mark.parametrize(("distance", "thickness"), [(400.0, 0.0), (399.9, 0.1), (500.0, 0.0), (1e300, 0.0)])
@@ -425,7 +427,7 @@ def test_features_from_a_micrometre_to_a_millimetre(feature: float, left: float,
     order = 5 if feature <= 0.2 else 2
     geometry = CameraGeometry(pixels=64, mask_order=order, mask_feature=feature, mask_distance=0.2)
     at = Directions([0.0], 0.0)
-    ((wave, _),) = geometry.shadow_terms(at, at, math.inf, LINE)
+    ((wave, _),) = shadow_terms(geometry, at, at, math.inf, LINE)
     exact = exact_waves(geometry, 2.5e-4)
     assert np.isfinite(wave).all() and wave.min() > -1e-9
     error = float(np.linalg.norm(wave[:, 0] - exact) / np.linalg.norm(exact))

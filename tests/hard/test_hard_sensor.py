@@ -18,8 +18,8 @@ from mitsim.capture.exposer import Exposer
 from mitsim.core.configuration import shipped, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
+from mitsim.rig.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain, moments
-from mitsim.sensor.model import SensorModel, load_sensor
 from tests.invented import sensor
 
 SEED = 41_2026

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.mask import mls_mask
 from mitsim.optics.separable import centred as centred_terms
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.solver import ROUNDING_LIMIT, Prepared, prepare
 from mitsim.reconstruct.tv import solve_tv
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 from mitsim.study.solver_cost import dots
 
 EPS = float(np.finfo(np.float64).eps)

@@ -21,14 +21,14 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.light import GROUPS, make_plan, uniform_light
+from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.light import make_plan, uniform_light
 from mitsim.capture.run import capture
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry
 from mitsim.optics.frames import ExpectedFrames, FrameOptics
 from mitsim.optics.shadow import Directions
-from mitsim.scene.evidence import Settings
+from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.lobes import SharpLight, sharp_light

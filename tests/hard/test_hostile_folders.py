@@ -20,9 +20,9 @@ import pytest
 
 from mitsim.core.configuration import read_toml
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import read_frame, write_frame
-from mitsim.reconstruct.run import check_fit, load, read_calibration, read_run
-from mitsim.sensor.model import load_sensor
+from mitsim.core.framefile import read_frame, write_frame
+from mitsim.reconstruct.folders import check_fit, load, read_calibration, read_run
+from mitsim.rig.sensor import load_sensor
 
 LONGEST = 5.0
 ROOM = 3 << 30

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.check import check_file
+from mitsim.scene.guard.check import check_file
 from tests.hard.hostile import CASES, GOOD, OBJ, Case, ball, beside, file, mesh, picture, png, put, skin, swap
 
 LONGEST = 5.0

@@ -20,7 +20,7 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.light import make_plan
 from mitsim.capture.run import capture
 from mitsim.core import parallel
-from mitsim.core.frames import read_frame
+from mitsim.core.framefile import read_frame
 from mitsim.optics import frames
 
 pytestmark = pytest.mark.usefixtures("variant")

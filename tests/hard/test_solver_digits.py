@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Solution, prepare
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 from mitsim.study.solver_cost import Judge, dots, make_problem
 
 EPS = float(np.finfo(np.float64).eps)

@@ -22,12 +22,12 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import Settings
 from mitsim.capture.pilot import applicable
 from mitsim.capture.simulation import Estimate, Simulation
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import FrameOptics
-from mitsim.scene.evidence import Settings
 from mitsim.transport.histogram import AMBIENT, Deposits
 
 GROUPS = 6

@@ -11,10 +11,12 @@ import pytest
 from scipy.integrate import quad
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.diffraction import EdgeWaves, Spectrum
+from mitsim.optics.diffraction import EdgeWaves
 from mitsim.optics.profile import Steps
 from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
 
 STEP = 2.5e-4
 LAMBDA_NM = 550.0
@@ -102,7 +104,7 @@ def by_point_source(
 @pytest.mark.parametrize("tau", [0.0, 0.013, -0.15])
 def test_a_point_source_equals_its_field_propagated_without_any_scaling(tau: float) -> None:
     geometry = CameraGeometry(**NEAR)
-    ((left, right),) = geometry.shadow_terms(Directions([tau], 0.0), Directions([tau], 0.0), 40.0, line())
+    ((left, right),) = shadow_terms(geometry, Directions([tau], 0.0), Directions([tau], 0.0), 40.0, line())
     expected = by_point_source(geometry, tau, 40.0)
     assert relative(left[:, 0], expected) < 1e-3
     assert np.array_equal(left, right)
@@ -112,7 +114,7 @@ def test_a_point_source_equals_its_field_propagated_without_any_scaling(tau: flo
 def test_a_point_source_equals_a_plane_wave_over_the_effective_distance(depth: float) -> None:
     geometry = CameraGeometry(**NEAR)
     tau = np.array([-0.1, 0.0, 0.07])
-    ((left, _),) = geometry.shadow_terms(Directions(tau, 0.0), Directions([0.0], 0.0), depth, line())
+    ((left, _),) = shadow_terms(geometry, Directions(tau, 0.0), Directions([0.0], 0.0), depth, line())
     for j, one in enumerate(tau):
         assert relative(left[:, j], by_plane_wave(geometry, one, depth)) < 1e-3
 
@@ -126,7 +128,7 @@ def test_what_the_paraxial_approximation_leaves(tau: float, left_over: float) ->
     """
     geometry = CameraGeometry(**NEAR)
     at = Directions([tau], 0.0)
-    (((wave, _),), ((rays, _),)) = (geometry.shadow_terms(at, at, 40.0, light) for light in (line(), None))
+    (((wave, _),), ((rays, _),)) = (shadow_terms(geometry, at, at, 40.0, light) for light in (line(), None))
     exact = by_point_source(geometry, tau, 40.0, paraxial=False)
     assert relative(wave[:, 0], exact) == pytest.approx(left_over, rel=0.2)
     assert relative(rays[:, 0], exact) > 8 * relative(wave[:, 0], exact)
@@ -136,7 +138,7 @@ def test_a_thick_mask_propagates_the_field_behind_its_clear_aperture() -> None:
     """The model, not the whole truth: both faces multiply, then free space from the exit face."""
     geometry = CameraGeometry(**NEAR, mask_thickness=0.2)
     tau, depth, d = 0.15, 40.0, 2.0
-    ((left, _),) = geometry.shadow_terms(Directions([tau], 0.0), Directions([0.0], 0.0), depth, line())
+    ((left, _),) = shadow_terms(geometry, Directions([tau], 0.0), Directions([0.0], 0.0), depth, line())
     s, bits = grid(1 << 16), code(5)
     # The entrance's edges fall between points: the mean of 32 points in each step, or slits come out 0.5 % too wide.
     leaves = (s[:, None] + (np.arange(32) - 15.5) / 32 * STEP).ravel()
@@ -146,7 +148,7 @@ def test_a_thick_mask_propagates_the_field_behind_its_clear_aperture() -> None:
     edges = geometry.pixel_edges * (1 - d / depth) + d * tau
     expected = pixel_means(np.abs(field) ** 2, s, edges[:-1], edges[1:])
     assert relative(left[:, 0], expected) < 1e-3
-    thin = CameraGeometry(**NEAR).shadow_terms(Directions([tau], 0.0), Directions([0.0], 0.0), depth, line())
+    thin = shadow_terms(CameraGeometry(**NEAR), Directions([tau], 0.0), Directions([0.0], 0.0), depth, line())
     assert relative(thin[0][0][:, 0], expected) > 0.1, "a wall shift of half a feature has to show"
 
 
@@ -158,7 +160,7 @@ def test_the_four_terms_of_a_flatcam_mask_equal_a_field_propagated_in_two_dimens
     )
     tau_row, tau_column = 0.004, -0.007
     depth = 300.0
-    terms = geometry.shadow_terms(Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth, line())
+    terms = shadow_terms(geometry, Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth, line())
     assert len(terms) == 4
     got = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms)
     s, signed = grid(2048, step), code(3, signed=True)
@@ -224,7 +226,7 @@ def test_short_waves_cast_the_geometric_shadow(kind: str) -> None:
     at = Directions(np.linspace(-0.05, 0.05, 9), 0.002)
 
     def whole(spectrum: Spectrum | None) -> np.ndarray:
-        terms = geometry.shadow_terms(at, at, 400.0, spectrum)
+        terms = shadow_terms(geometry, at, at, 400.0, spectrum)
         return np.asarray(sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms))
 
     geometric = whole(None)
@@ -239,7 +241,7 @@ def test_short_waves_cast_the_geometric_shadow(kind: str) -> None:
 def test_large_features_cast_the_geometric_shadow(kind: str) -> None:
     geometry = CameraGeometry(mask=kind, pixels=64, pixel_pitch=0.5, mask_order=5, mask_feature=2.0, mask_distance=4.0)
     at = Directions(np.linspace(-0.5, 0.5, 5), 0.1)
-    wave, rays = geometry.shadow_terms(at, at, 400.0, line()), geometry.shadow_terms(at, at, 400.0)
+    wave, rays = shadow_terms(geometry, at, at, 400.0, line()), shadow_terms(geometry, at, at, 400.0)
     images = [sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms) for terms in (wave, rays)]
     assert relative(*images) < 1e-3
 
@@ -251,7 +253,7 @@ SCENE = Directions.cells((np.arange(129) - 64) * (120 / 128 / 400))
 def test_at_the_papers_geometry_diffraction_is_no_detail(nm: float, a_side: float) -> None:
     """23 to 30 % a side, averaged over a scene pixel: the figures of the feasibility study."""
     geometry = CameraGeometry()
-    ((wave, _),), ((rays, _),) = (geometry.shadow_terms(SCENE, SCENE, 400.0, light) for light in (line(nm), None))
+    ((wave, _),), ((rays, _),) = (shadow_terms(geometry, SCENE, SCENE, 400.0, light) for light in (line(nm), None))
     assert relative(wave, rays) == pytest.approx(a_side, abs=2e-3)
 
 
@@ -260,10 +262,10 @@ def test_a_finer_grid_changes_little(monkeypatch: pytest.MonkeyPatch, distance: 
     from mitsim.optics import diffraction
 
     geometry = CameraGeometry(mask_distance=distance)
-    ((coarse, _),) = geometry.shadow_terms(SCENE, SCENE, 400.0, line())
+    ((coarse, _),) = shadow_terms(geometry, SCENE, SCENE, 400.0, line())
     monkeypatch.setattr(diffraction, "_STEP_MM", diffraction._STEP_MM / 4)
     monkeypatch.setattr(diffraction, "_STEPS_PER_FRESNEL_LENGTH", diffraction._STEPS_PER_FRESNEL_LENGTH * 4)
-    ((fine, _),) = geometry.shadow_terms(SCENE, SCENE, 400.0, line())
+    ((fine, _),) = shadow_terms(geometry, SCENE, SCENE, 400.0, line())
     assert 0 < relative(coarse, fine) < 4e-4
 
 
@@ -280,7 +282,7 @@ def beyond_one_term(terms: list[tuple[np.ndarray, np.ndarray]]) -> float:
 
 def test_broadband_light_stays_one_separable_term_to_four_thousandths() -> None:
     white = Spectrum(np.linspace(400, 700, 13), np.full(13, 1 / 13))
-    terms = CameraGeometry().shadow_terms(SCENE, SCENE, 400.0, white)
+    terms = shadow_terms(CameraGeometry(), SCENE, SCENE, 400.0, white)
     assert len(terms) == 13
     assert beyond_one_term(terms) == pytest.approx(4e-3, abs=5e-4)
 
@@ -288,7 +290,7 @@ def test_broadband_light_stays_one_separable_term_to_four_thousandths() -> None:
 def test_flatcam_light_is_far_from_one_separable_term() -> None:
     """Once frames are centred (each row and column of means taken off): 12 % at 450 nm to 18 % at 640 nm."""
     for nm, expected in ((450.0, 0.12), (640.0, 0.178)):
-        terms = CameraGeometry(mask="flatcam").shadow_terms(SCENE, SCENE, 400.0, line(nm))
+        terms = shadow_terms(CameraGeometry(mask="flatcam"), SCENE, SCENE, 400.0, line(nm))
         centred = [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
         assert beyond_one_term(centred) == pytest.approx(expected, abs=5e-3)
 
@@ -305,4 +307,4 @@ def test_bad_spectra_are_refused_in_one_line(wavelengths: list, weights: list) -
 def test_a_hopeless_grid_is_refused() -> None:
     geometry = CameraGeometry(pixels=64, mask_distance=1e-9)
     with pytest.raises(MitsimError, match=r"a grid of 1.31e\+08 .*move the mask off the sensor"):
-        geometry.shadow_terms(Directions([0.0], 0.0), Directions([0.0], 0.0), 400.0, line())
+        shadow_terms(geometry, Directions([0.0], 0.0), Directions([0.0], 0.0), 400.0, line())

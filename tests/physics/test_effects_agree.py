@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import Settings
 from mitsim.capture.light import collect, make_plan, uniform_light
 from mitsim.capture.render import projected
 from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped
-from mitsim.scene.evidence import Settings
 from tests.physics.radiosity import gauss, solid_angle
 from tests.physics.test_estimators_agree import (
     LIMIT,

@@ -33,8 +33,8 @@ from scipy import stats
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.light import Light, collect, make_plan
+from mitsim.capture.plan import Plan
 from mitsim.capture.render import projected
-from mitsim.scene.plan import Plan
 
 PASSES = 8
 FAMILY_ALPHA, CASES = 1e-3, 26

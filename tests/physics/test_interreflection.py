@@ -81,8 +81,8 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     Light of one reflection is traced apart from light of more.
     """
     from mitsim.capture.bench import open_bench
+    from mitsim.capture.evidence import Settings
     from mitsim.capture.simulation import Simulation
-    from mitsim.scene.evidence import Settings
 
     bench = open_bench(scene, check_camera=False)
     family = bench.family(f"dots:{K}", 0)

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.optics.camera import CameraGeometry
 from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
 
 pytestmark = pytest.mark.usefixtures("variant")
 SCALE, Z, ALBEDO = 111000.0, 400.0, 0.5
@@ -102,7 +103,7 @@ def test_masked_mean_is_that_of_the_closed_form_shadow(small_scene: Callable[...
     edges = np.linspace(-WINDOW, WINDOW, 65)
     centre, size = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
     falloff = (1 + np.square(centre)[:, None] + np.square(centre)[None, :]) ** -2
-    terms = geometry.shadow_terms(Directions.cells(edges), Directions.cells(edges), Z)
+    terms = shadow_terms(geometry, Directions.cells(edges), Directions.cells(edges), Z)
     expected = RADIANCE * size**2 * sum((left @ falloff @ right.T).mean() for left, right in terms)
     # Two passes: half their difference is free of the mask's pattern on the sensor.
     assert 2 * SIGMAS * error < 0.03 * expected
@@ -180,8 +181,8 @@ def centroid(frame: np.ndarray) -> tuple[float, float]:
 def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     """Frame of the factored estimator when projector pixel (r, c) emits ``light[r, c]`` of its power."""
     from mitsim.capture.bench import open_bench
+    from mitsim.capture.evidence import Settings
     from mitsim.capture.simulation import Simulation
-    from mitsim.scene.evidence import Settings
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.diffraction import Spectrum
-from mitsim.optics.mask import Mask
-from mitsim.optics.shadow import Directions, Setting, centred_edges, geometric_terms
+from mitsim.optics.shadow import Directions, Setting, geometric_terms
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry, centred_edges
+from mitsim.rig.mask import Mask
+from mitsim.rig.projector import Spectrum
 
 WIDTH, THICK = 0.06, 0.1
 
@@ -59,7 +60,7 @@ def test_a_frame_equals_rays_counted_through_both_faces(kind: str) -> None:
         pixels=16, pixel_pitch=0.03, mask=kind, mask_order=4, mask_thickness=0.15, scene_distance=30.0
     )
     tau_row, tau_column, depth, d = 0.12, -0.16, 30.0, 2.0
-    terms = geometry.shadow_terms(Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth)
+    terms = shadow_terms(geometry, Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth)
     got = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms)
     u = (np.arange(16 * 40) - 320 + 0.5) * 0.03 / 40
 
@@ -75,7 +76,7 @@ def test_a_frame_equals_rays_counted_through_both_faces(kind: str) -> None:
     assert np.abs(got - counted).max() < 0.05
     assert abs(got.mean() - counted.mean()) < 2e-3
     thin = geometry.model_copy(update={"mask_thickness": 0.0})
-    terms = thin.shadow_terms(Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth)
+    terms = shadow_terms(thin, Directions([tau_row], 0.0), Directions([tau_column], 0.0), depth)
     single = sum(np.outer(left[:, 0], right[:, 0]) for left, right in terms)
     if kind != "open":
         assert np.abs(single - counted).max() > 0.3, "the second face has to matter"
@@ -99,7 +100,7 @@ def test_rendered_frames_are_the_closed_form(kind: str) -> None:
         at = Directions.cells(np.linspace(-1, 1, 401) * camera.tan_half_fov)
         squared = np.square(at.centres)[:, None] + np.square(at.centres)[None, :]
         light = (1 + squared) ** -2 * camera.angular_response(squared) * at.width**2
-        return np.asarray(sum(left @ light @ right.T for left, right in camera.shadow_terms(at, at, np.inf)))
+        return np.asarray(sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, np.inf)))
 
     film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     camera = {"type": "mitsim_lensless", "mask": kind, **values, **effects, "film": film}
@@ -129,7 +130,7 @@ def test_a_mask_of_next_to_no_thickness_is_a_thin_one(kind: str, spectrum: Spect
     frames = []
     for thickness in (0.0, 1e-9):
         geometry = CameraGeometry(mask=kind, pixels=64, mask_order=6, mask_thickness=thickness)
-        terms = geometry.shadow_terms(at, at, 400.0, spectrum)
+        terms = shadow_terms(geometry, at, at, 400.0, spectrum)
         frames.append(np.asarray(sum(np.einsum("ir,jc->ijrc", left, right) for left, right in terms)))
     thin, thick = frames
     error = np.linalg.norm(thick - thin) / np.linalg.norm(thin)
@@ -140,9 +141,9 @@ def test_a_mask_of_next_to_no_thickness_is_a_thin_one(kind: str, spectrum: Spect
 def test_each_direction_sees_an_aperture_of_its_own(spectrum: Spectrum | None) -> None:
     geometry = CameraGeometry(mask="flatcam", pixels=32, mask_order=6, mask_thickness=0.1)
     at = Directions([-0.14, 0.02, 0.13], 1e-3)
-    together = geometry.shadow_terms(at, at, 50.0, spectrum)
+    together = shadow_terms(geometry, at, at, 50.0, spectrum)
     for j, tau in enumerate(at.centres):
-        alone = geometry.shadow_terms(Directions([tau], 1e-3), Directions([tau], 1e-3), 50.0, spectrum)
+        alone = shadow_terms(geometry, Directions([tau], 1e-3), Directions([tau], 1e-3), 50.0, spectrum)
         for (left, right), (one_left, one_right) in zip(together, alone, strict=True):
             assert np.allclose(left[:, [j]], one_left, rtol=0, atol=1e-9)
             assert np.allclose(right[:, [j]], one_right, rtol=0, atol=1e-9)
@@ -151,8 +152,8 @@ def test_each_direction_sees_an_aperture_of_its_own(spectrum: Spectrum | None) -
 def test_a_thick_flatcam_mask_has_four_products_or_sixteen_terms_of_waves() -> None:
     geometry = CameraGeometry(mask="flatcam", pixels=8, mask_order=4, mask_thickness=0.05)
     at = Directions([0.05], 0.0)
-    assert len(geometry.shadow_terms(at, at, 400.0)) == 4
-    assert len(geometry.shadow_terms(at, at, 400.0, Spectrum([550.0], [1.0]))) == 16
+    assert len(shadow_terms(geometry, at, at, 400.0)) == 4
+    assert len(shadow_terms(geometry, at, at, 400.0, Spectrum([550.0], [1.0]))) == 16
 
 
 def test_a_cell_takes_the_clear_profile_of_its_centre() -> None:
@@ -160,9 +161,9 @@ def test_a_cell_takes_the_clear_profile_of_its_centre() -> None:
     geometry = CameraGeometry(pixels=128, mask_order=7, mask_thickness=0.06)
     width = 120 / 128 / 400
     centres = np.linspace(-0.15, 0.15, 5)
-    ((left, _),) = geometry.shadow_terms(Directions(centres, width), Directions([0.0], 0.0), 400.0)
+    ((left, _),) = shadow_terms(geometry, Directions(centres, width), Directions([0.0], 0.0), 400.0)
     parts = (centres[:, None] + (np.arange(64) - 31.5) / 64 * width).ravel()
-    ((fine, _),) = geometry.shadow_terms(Directions(parts, width / 64), Directions([0.0], 0.0), 400.0)
+    ((fine, _),) = shadow_terms(geometry, Directions(parts, width / 64), Directions([0.0], 0.0), 400.0)
     mean = fine.reshape(128, 5, 64).mean(axis=2)
     assert 0 < np.linalg.norm(left - mean) / np.linalg.norm(mean) < 2e-3
 
@@ -178,4 +179,4 @@ def test_a_mask_reaching_into_the_scene_is_refused() -> None:
         CameraGeometry.checked("here", mask_thickness=398.0)
     at = Directions([0.0], 0.0)
     with pytest.raises(MitsimError, match=r"beyond the mask at 2\.5 mm"):
-        CameraGeometry(mask_thickness=0.5).shadow_terms(at, at, 2.2)
+        shadow_terms(CameraGeometry(mask_thickness=0.5), at, at, 2.2)

@@ -15,7 +15,7 @@ from scipy.signal import max_len_seq
 
 from mitsim.capture.light import collect, make_plan
 from mitsim.optics.beams import SpecularFrames, beam_frames, geometric_terms
-from mitsim.scene.patterns import parse_patterns
+from mitsim.rig.patterns import parse_patterns
 from mitsim.transport.aperture import aperture_scene_parts, register
 from mitsim.transport.beams import trace_beams
 from mitsim.transport.mirrors import MirrorTracer

@@ -15,8 +15,8 @@ from scipy import stats
 
 from mitsim.core.configuration import shipped
 from mitsim.core.seeds import stream
+from mitsim.rig.sensor import SensorModel, load_sensor, paper_sensor
 from mitsim.sensor import chain, moments
-from mitsim.sensor.model import SensorModel, load_sensor, paper_sensor
 
 Record = Callable[[str, object], None]
 SEED = 20211

@@ -15,7 +15,7 @@ import pytest
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.light import make_plan
-from mitsim.scene.plan import SWITCHES, Plan
+from mitsim.capture.plan import SWITCHES, Plan
 from tests.physics.plan_property import Change, Effort, measured
 
 pytestmark = pytest.mark.usefixtures("variant")

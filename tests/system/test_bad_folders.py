@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.frames import read_frame, write_frame
+from mitsim.core.framefile import read_frame, write_frame
 
 Refused = Callable[..., str]
 Edit = Callable[[dict[str, Any]], object]

@@ -19,7 +19,7 @@ import numpy as np
 import psutil
 import pytest
 
-from mitsim.core.frames import read_frame
+from mitsim.core.framefile import read_frame
 from mitsim.core.output import LOCK
 from tests.system.interrupted import PATTERNS, assert_equal_runs, cut_short, ended, running
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.frames import read_frame, write_frame
+from mitsim.core.framefile import read_frame, write_frame
 
 CAMERA = {"name": "bench 3"}
 DIGITAL = {"exposure_s": 0.02, "black_level_dn": 160, "gain_dn_per_e": 0.125, "dark_current_e_per_s": 4000}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.frames import read_frame
+from mitsim.core.framefile import read_frame
 from tests.system.interrupted import PATTERNS, assert_equal_runs, cut_short
 
 

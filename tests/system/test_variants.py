@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.frames import read_frame
+from mitsim.core.framefile import read_frame
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_spectral")
 

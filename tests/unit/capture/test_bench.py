@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, load_recipe, open_bench
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import Settings
 from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.scene.evidence import Settings
+from mitsim.rig.recipe import load_recipe
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import GROUPS, PHYSICAL
 from mitsim.capture.light import collect, make_plan, scene_facts, uniform_light
+from mitsim.capture.plan import Plan
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, relative_error
-from mitsim.scene.evidence import GROUPS, PHYSICAL
-from mitsim.scene.patterns import parse_patterns
-from mitsim.scene.plan import Plan
+from mitsim.rig.patterns import parse_patterns
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16

@@ -13,11 +13,11 @@ import pytest
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import PHYSICAL, Evidence, Settings
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
-from mitsim.scene.evidence import PHYSICAL, Evidence, Settings
-from mitsim.scene.patterns import parse_patterns
+from mitsim.rig.patterns import parse_patterns
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16

@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 
 from mitsim.capture import run
-from mitsim.capture.bench import Bench, load_recipe, open_bench
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import GROUPS
 from mitsim.capture.exposer import Exposer, Exposure
-from mitsim.capture.light import GROUPS, collect, make_plan
+from mitsim.capture.light import collect, make_plan
 from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import checksum, read_frame
+from mitsim.core.framefile import checksum, read_frame
 from mitsim.core.resources import Limits
-from mitsim.scene.patterns import parse_patterns
+from mitsim.rig.patterns import parse_patterns
+from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.moments import frame_moments
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -10,16 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.calibrate.hadamard import Calibration
-from mitsim.capture.bench import Bench, load_recipe, open_bench
-from mitsim.capture.clock import Clock
-from mitsim.capture.light import make_plan, silent, uniform_light
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import PHYSICAL
+from mitsim.capture.light import make_plan, uniform_light
+from mitsim.capture.plan import Plan
 from mitsim.capture.session import Session
+from mitsim.core.arrays import silent
+from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import checksum, read_frame
-from mitsim.optics.shadow import centred_edges, scene_factor
-from mitsim.scene.evidence import PHYSICAL
-from mitsim.scene.plan import Plan
+from mitsim.core.framefile import checksum, read_frame
+from mitsim.optics.shadow import scene_factor
+from mitsim.reconstruct.calibration import Calibration
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.recipe import load_recipe
 from mitsim.study.calibration import CalibrationResult, calibrate
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import PHYSICAL, Settings
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.frames import FrameOptics
 from mitsim.optics.shadow import Directions
-from mitsim.scene.evidence import PHYSICAL, Settings
 from mitsim.transport.histogram import Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")

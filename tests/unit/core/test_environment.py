@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.core import environment, llvm
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import write_frame
+from mitsim.core.framefile import write_frame
 
 
 def in_child(program: str, **env: str) -> subprocess.CompletedProcess[str]:

@@ -5,7 +5,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import Beams, ProfileSampler, beam_frames, geometric_terms
-from mitsim.optics.camera import CameraGeometry
+from mitsim.rig.camera import CameraGeometry
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3

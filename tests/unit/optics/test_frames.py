@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
+from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.frames import (
     ClassFrames,
     ExpectedFrames,
@@ -19,8 +19,10 @@ from mitsim.optics.frames import (
     FrameOptics,
     relative_error,
 )
-from mitsim.optics.mask import Mask
 from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.mask import Mask
 
 Z, WINDOW = 40.0, (-0.13, 0.17)
 CAMERA = CameraGeometry(
@@ -130,7 +132,7 @@ def test_orientation_of_rows_and_columns() -> None:
     """Light in one cell: its shadow is the outer product of the two factors, rows by rows."""
     rows, columns = np.linspace(-0.2, 0.2, 5), np.linspace(-0.1, 0.3, 8)
     optics = cell_optics(CAMERA, rows, columns)
-    ((left, right),) = CAMERA.shadow_terms(Directions.cells(rows), Directions.cells(columns), Z)
+    ((left, right),) = shadow_terms(CAMERA, Directions.cells(rows), Directions.cells(columns), Z)
     frame = optics.frame(np.array([3 * 7 + 1]), np.array([2.0]))
     assert np.allclose(frame, 2 * np.outer(left[:, 3], right[:, 1]), rtol=1e-14)
     assert not np.allclose(frame, frame.T)
@@ -145,8 +147,8 @@ def test_both_orders_of_the_product_agree_with_the_dense_one(lit: str) -> None:
     place = (slice(2, 4), slice(None)) if lit == "few rows" else (slice(None), slice(7, 9))
     light[place] = rng.random(light[place].shape)
     flat = np.flatnonzero(light)
-    terms = CAMERA.model_copy(update={"mask": "flatcam"}).shadow_terms(
-        Directions.cells(rows), Directions.cells(columns), Z
+    terms = shadow_terms(
+        CAMERA.model_copy(update={"mask": "flatcam"}), Directions.cells(rows), Directions.cells(columns), Z
     )
     dense = sum(left @ light @ right.T for left, right in terms)
     assert np.allclose(optics.frame(flat, light.ravel()[flat]), dense, rtol=1e-12)

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import Directions, Setting, centred_edges, geometric_terms, scene_factor, shadow_factor
+from mitsim.optics.shadow import Directions, Setting, geometric_terms, scene_factor, shadow_factor
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 
 ANCHOR = (0.06, centred_edges(512, 0.01172), centred_edges(128, 120 / 128), 2.0, 400.0)
 

@@ -5,11 +5,12 @@ import pytest
 from skimage import data
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.regularisation import automatic_lambda, noise_variance, risk_score
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.tv import solve_tv
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 
 N = 128
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
+from mitsim.rig.sensor import SensorModel, paper_sensor
 from mitsim.sensor import chain, moments
-from mitsim.sensor.model import SensorModel, paper_sensor
 from tests.invented import sensor
 
 

@@ -10,8 +10,9 @@ import pytest
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.light import collect, make_plan, silent
-from mitsim.scene.evidence import GROUPS
+from mitsim.capture.evidence import GROUPS
+from mitsim.capture.light import collect, make_plan
+from mitsim.core.arrays import silent
 from mitsim.study import accuracy, plots
 from mitsim.study.accuracy import AccuracyStudy, study_accuracy
 from mitsim.study.knobs import at_once, sampled, variants, without

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.calibrate.hadamard import estimate_factors
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.optics.diffraction import Spectrum
 from mitsim.optics.separable import best_term, centred
-from mitsim.scene.patterns import hadamard_matrix
+from mitsim.reconstruct.calibration import estimate_factors
+from mitsim.rig.patterns import hadamard_matrix
+from mitsim.rig.projector import Spectrum
 from mitsim.study import diffraction, shadows
 from mitsim.study.ideal import IdealCamera, ideal_factors, ideal_light
 from mitsim.study.metrics import relative_error

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.frames import write_frame
+from mitsim.core.framefile import write_frame
 from mitsim.study.metrics import contrast, psnr, read_truth, relative_error, ssim
 
 RNG = np.random.default_rng(11)

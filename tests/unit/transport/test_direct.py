@@ -13,7 +13,8 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry, anchor_positions
+from mitsim.optics.anchors import anchor_positions
+from mitsim.rig.camera import CameraGeometry
 from mitsim.transport import paths
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import DIRECT, Deposits

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from mitsim.optics.camera import CameraGeometry
+from mitsim.rig.camera import CameraGeometry
 
 pytestmark = pytest.mark.usefixtures("variant")
 SIGMAS = 5.0

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import max_len_seq
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 
 MaskKind = Literal["separable", "flatcam", "open"]
-FloatArray = npt.NDArray[np.float64]
 Term = tuple[float, FloatArray, FloatArray]
 
 

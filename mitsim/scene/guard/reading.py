@@ -13,7 +13,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from mitsim.core.errors import MitsimError, cut
-from mitsim.scene.files import SceneFiles
+from mitsim.scene.guard.files import SceneFiles
 
 DEEPEST = 16
 """Elements inside elements, references followed: beyond, Mitsuba's stack overflows or it takes for ever."""

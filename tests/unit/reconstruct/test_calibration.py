@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from mitsim.calibrate.hadamard import estimate_factors, predicted_error
 from mitsim.core.errors import MitsimError
-from mitsim.optics.mask import mls_mask
-from mitsim.optics.shadow import centred_edges, scene_factor
+from mitsim.optics.shadow import scene_factor
+from mitsim.reconstruct.calibration import estimate_factors, predicted_error
 from mitsim.reconstruct.solver import prepare
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
 
 N, M = 16, 40
 H = hadamard(N).astype(float)

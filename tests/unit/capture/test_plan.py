@@ -6,9 +6,9 @@ from dataclasses import asdict, replace
 
 import pytest
 
+from mitsim.capture.evidence import GROUPS, PHYSICAL, Effort, Evidence, Noise
+from mitsim.capture.plan import SWITCHES, Effect, Plan, SceneFacts, check_accuracy, decide, parse_effects
 from mitsim.core.errors import MitsimError
-from mitsim.scene.evidence import GROUPS, PHYSICAL, Effort, Evidence, Noise
-from mitsim.scene.plan import SWITCHES, Effect, Plan, SceneFacts, check_accuracy, decide, parse_effects
 
 FACTS = SceneFacts(absent={"mirrors": "no mirror there"}, notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
 EVIDENCE = Evidence(

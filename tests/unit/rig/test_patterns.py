@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene import patterns
-from mitsim.scene.patterns import hadamard_matrix, hadamard_orders, parse_patterns
+from mitsim.rig import patterns
+from mitsim.rig.patterns import hadamard_matrix, hadamard_orders, parse_patterns
 
 FAMILIES = [
     "uniform",

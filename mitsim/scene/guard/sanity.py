@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.scene.headers import FARTHEST
-from mitsim.scene.reading import Element
-from mitsim.scene.vocabulary import is_plugin
+from mitsim.scene.guard.headers import FARTHEST
+from mitsim.scene.guard.reading import Element
+from mitsim.scene.guard.vocabulary import is_plugin
 
 Matrix = npt.NDArray[np.float64]
 _LARGEST = 1e20

@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.camera import CameraGeometry, anchor_positions, anchor_weights
-from mitsim.optics.diffraction import Spectrum
+from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions, shadow_factor
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
 
 
 def test_the_defaults_are_the_papers_geometry() -> None:
@@ -63,7 +65,7 @@ def test_shadow_terms_sum_to_the_masks_mean_transmission(kind: str) -> None:
     """Each entry against a plain average of the mask over 200 x 200 points, axis by axis."""
     geometry = CameraGeometry(pixels=3, pixel_pitch=0.05, mask=kind, mask_order=4, mask_distance=3.0)
     rows, columns, depth = np.array([-0.11, -0.02, 0.07]), np.array([-0.06, 0.0, 0.06, 0.12]), 250.0
-    terms = geometry.shadow_terms(Directions.cells(rows), Directions.cells(columns), depth)
+    terms = shadow_terms(geometry, Directions.cells(rows), Directions.cells(columns), depth)
     mask, edges = geometry.build_mask(), geometry.pixel_edges
     middle = (np.arange(200) + 0.5) / 200
 
@@ -84,7 +86,7 @@ def test_shadow_terms_sum_to_the_masks_mean_transmission(kind: str) -> None:
 def test_one_shadow_serves_both_axes_but_only_for_equal_edges() -> None:
     geometry = CameraGeometry(pixels=8)
     rows, columns = np.linspace(-0.1, 0.1, 9), np.linspace(-0.12, 0.1, 12)
-    (left, right), *_ = geometry.shadow_terms(Directions.cells(rows), Directions.cells(columns), 400.0)
+    (left, right), *_ = shadow_terms(geometry, Directions.cells(rows), Directions.cells(columns), 400.0)
     profile = geometry.build_mask().terms[0][1]
     # The same numbers from edges: rounding of the edges only.
     for factor, edges in ((left, rows), (right, columns)):
@@ -100,7 +102,7 @@ def test_a_fill_factor_averages_over_the_active_square_and_scales_by_it(kind: st
     camera = CameraGeometry(pixels=9, pixel_pitch=0.04, mask=kind, mask_order=6, pixel_fill_factor=0.25)
     # 19 pixels of 0.02: numbers 1, 3, ... 17 have the centres of the nine.
     fine = camera.model_copy(update={"pixels": 19, "pixel_pitch": 0.02, "pixel_fill_factor": 1.0})
-    got, parts = camera.shadow_terms(at, at, 300.0, spectrum), fine.shadow_terms(at, at, 300.0, spectrum)
+    got, parts = shadow_terms(camera, at, at, 300.0, spectrum), shadow_terms(fine, at, at, 300.0, spectrum)
     assert len(got) == len(parts)
     for (left, right), (every_left, every_right) in zip(got, parts, strict=True):
         assert np.allclose(left, 0.25 * every_left[1::2], rtol=0, atol=1e-9)
@@ -109,7 +111,7 @@ def test_a_fill_factor_averages_over_the_active_square_and_scales_by_it(kind: st
 
 def test_open_mask_transmits_all_but_the_inactive_area() -> None:
     at = Directions([-0.1, 0.1], 0.01)
-    ((left, right),) = CameraGeometry(pixels=4, mask="open", pixel_fill_factor=0.36).shadow_terms(at, at, 400.0)
+    ((left, right),) = shadow_terms(CameraGeometry(pixels=4, mask="open", pixel_fill_factor=0.36), at, at, 400.0)
     assert np.allclose(left[:, :, None, None] * right, 0.36, rtol=1e-14)
 
 
@@ -123,10 +125,10 @@ def test_angular_response_is_a_power_of_the_cosine() -> None:
 def test_a_spectrum_multiplies_terms_by_its_shares() -> None:
     at = Directions([0.0, 0.02], 0.001)
     camera = CameraGeometry(pixels=8, mask="flatcam", mask_order=5)
-    both = camera.shadow_terms(at, at, 400.0, Spectrum([450.0, 600.0], [0.25, 0.75]))
+    both = shadow_terms(camera, at, at, 400.0, Spectrum([450.0, 600.0], [0.25, 0.75]))
     assert len(both) == 8
     for nm, share, mixed in ((450.0, 0.25, both[:4]), (600.0, 0.75, both[4:])):
-        alone = camera.shadow_terms(at, at, 400.0, Spectrum([nm], [1.0]))
+        alone = shadow_terms(camera, at, at, 400.0, Spectrum([nm], [1.0]))
         for (left, right), (one_left, one_right) in zip(mixed, alone, strict=True):
             assert np.allclose(left, share * one_left, rtol=1e-14) and np.array_equal(right, one_right)
 
@@ -136,8 +138,8 @@ def test_rows_and_columns_each_take_their_own_directions() -> None:
     for extra in ({}, {"mask_thickness": 0.05}):
         camera = CameraGeometry(pixels=8, mask_order=5, **extra)
         for spectrum in (None, Spectrum([550.0], [1.0])):
-            ((left, right),) = camera.shadow_terms(rows, columns, 400.0, spectrum)
-            ((swapped_left, swapped_right),) = camera.shadow_terms(columns, rows, 400.0, spectrum)
+            ((left, right),) = shadow_terms(camera, rows, columns, 400.0, spectrum)
+            ((swapped_left, swapped_right),) = shadow_terms(camera, columns, rows, 400.0, spectrum)
             assert left.shape == (8, 2) and right.shape == (8, 3)
             assert np.array_equal(left, swapped_right) and np.array_equal(right, swapped_left)
             assert not np.allclose(left[:, 0], left[:, 1])

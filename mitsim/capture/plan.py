@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from mitsim.capture.evidence import FOLLOWED, GROUPS, PHYSICAL, Evidence, Settings
 from mitsim.core.errors import MitsimError
-from mitsim.scene.evidence import FOLLOWED, GROUPS, PHYSICAL, Evidence, Settings
 
 State = Literal["exact", "approximate", "off"]
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import max_len_seq
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.mask import Mask, mls_mask
+from mitsim.rig.mask import Mask, mls_mask
 
 
 @pytest.mark.parametrize(("kind", "open_share"), [("separable", 0.25), ("flatcam", 0.5), ("open", 1.0)])

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.sensor.model import SensorModel, load_sensor, paper_sensor
+from mitsim.rig.sensor import SensorModel, load_sensor, paper_sensor
 
 BASE = {
     "name": "test",

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.beams import Beams, beam_frames
-from mitsim.optics.camera import CameraGeometry
-from mitsim.optics.diffraction import Spectrum
 from mitsim.optics.frames import ClassFrames
 from mitsim.optics.samplers import SeparableTerm, geometric_terms, wave_samplers
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
 
-FloatArray = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
 _KEPT = 4
 
 

@@ -11,11 +11,11 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from mitsim.scene.files import SceneFiles
-from mitsim.scene.headers import MOST_TEXELS, check_image, check_obj, check_ply, read_spectrum
-from mitsim.scene.reading import DEEPEST, MOST_ELEMENTS, Element, read_scene
-from mitsim.scene.sanity import check_camera, check_numbers, check_reflectance, is_reflectance
-from mitsim.scene.vocabulary import check_words, is_plugin
+from mitsim.scene.guard.files import SceneFiles
+from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply, read_spectrum
+from mitsim.scene.guard.reading import DEEPEST, MOST_ELEMENTS, Element, read_scene
+from mitsim.scene.guard.sanity import check_camera, check_numbers, check_reflectance, is_reflectance
+from mitsim.scene.guard.vocabulary import check_words, is_plugin
 
 _IMAGES = ("bitmap", "envmap")
 _LARGEST_MATERIAL = 256

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 
 from mitsim.core.errors import cut
-from mitsim.scene.reading import Element
+from mitsim.scene.guard.reading import Element
 
 _ATTRIBUTES = {
     "alias": ("id as", ""),

@@ -12,19 +12,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, StrictBool
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.frames import checksum, read_frame
+from mitsim.core.framefile import checksum, read_frame
 from mitsim.core.manifest import read_json
 from mitsim.core.resources import Cost, Limits
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 
-FloatArray = npt.NDArray[np.float64]
 _MOST_PIXELS = 4096
 _BYTES_A_NUMBER = 32.0
 """Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""

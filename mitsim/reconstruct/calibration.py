@@ -15,9 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-
-FloatArray = npt.NDArray[np.float64]
 
 SEPARABLE_RESIDUAL = 0.01
 """Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform

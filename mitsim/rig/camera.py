@@ -8,19 +8,14 @@ so that a fact such as the mask distance is written once. Coordinates are index 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError
-from mitsim.optics.diffraction import Spectrum, wave_terms
-from mitsim.optics.mask import Mask, MaskKind, mls_mask
-from mitsim.optics.shadow import Directions, SeparableTerms, Setting, centred_edges, geometric_terms
-
-FloatArray = npt.NDArray[np.float64]
+from mitsim.rig.mask import Mask, MaskKind, mls_mask
 
 
 class CameraGeometry(BaseModel):
@@ -98,50 +93,9 @@ class CameraGeometry(BaseModel):
         """A pixel's response, relative to normal incidence, to rays of the given tan^2(theta): cos^n(theta)."""
         return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
 
-    def setting(self, depth: float) -> Setting:
-        """Sensor, mask and a depth [mm] of the scene, for one shadow."""
-        edges = self.pixel_edges
-        return Setting(
-            mask=self.build_mask(),
-            pixel_centres_mm=(edges[:-1] + edges[1:]) / 2,
-            active_mm=self.active_side,
-            distance_mm=self.mask_distance,
-            thickness_mm=self.mask_thickness,
-            depth_mm=depth,
-        )
 
-    def shadow_terms(
-        self, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None = None
-    ) -> SeparableTerms:
-        """Shadow on each pixel of directions at one depth, as separable terms: [(left (m, r), right (m, c)), ...].
-
-        Geometric, or with a ``spectrum`` wave-optical: then each wavelength has its own terms, weighted by its share.
-        The mean over a pixel's active area times the fill factor: irradiance is per pixel area. All weights are folded
-        into left. The angular response is not in here; it belongs to the light.
-        """
-        setting = self.setting(depth)
-        if spectrum is None:
-            terms = geometric_terms(setting, rows, columns)
-        else:
-            terms = wave_terms(setting, rows, columns, spectrum)
-        if self.pixel_fill_factor == 1:
-            return terms
-        return [(self.pixel_fill_factor * left, right) for left, right in terms]
-
-
-def anchor_positions(count: int, half_width: float) -> FloatArray:
-    """(count,) sensor coordinates of the anchors [mm]: Chebyshev nodes, the near-best points for interpolation."""
-    if count < 1:
-        raise MitsimError(f"number of anchors a side is {count}; give at least 1")
-    k = np.arange(count)
-    return -half_width * np.cos(np.pi * (2 * k + 1) / (2 * count))
-
-
-def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
-    """(len(at), len(anchors)) Lagrange weights that interpolate values known at ``anchors`` to the points ``at``."""
-    nodes = np.asarray(anchors, dtype=np.float64)
-    weights = np.ones((len(at), len(nodes)))
-    for j, node in enumerate(nodes):
-        for other in np.delete(nodes, j):
-            weights[:, j] *= (at - other) / (node - other)
-    return weights
+def centred_edges(count: int, pitch: float) -> FloatArray:
+    """(count + 1,) edges of ``count`` equal cells centred on zero, in the unit of ``pitch``."""
+    if count < 1 or not (np.isfinite(pitch) and pitch > 0):
+        raise MitsimError(f"a grid of {count} cells of size {pitch} is empty; give at least 1 cell and a size above 0")
+    return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)

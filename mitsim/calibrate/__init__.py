@@ -1,1 +1,0 @@
-"""Calibration frames in, sensor factors out. Knows neither Mitsuba nor the scene."""

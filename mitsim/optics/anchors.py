@@ -1,0 +1,28 @@
+"""Points of the sensor from which radiance is evaluated, and the weights that interpolate between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+
+
+def anchor_positions(count: int, half_width: float) -> FloatArray:
+    """(count,) sensor coordinates of the anchors [mm]: Chebyshev nodes, the near-best points for interpolation."""
+    if count < 1:
+        raise MitsimError(f"number of anchors a side is {count}; give at least 1")
+    k = np.arange(count)
+    return -half_width * np.cos(np.pi * (2 * k + 1) / (2 * count))
+
+
+def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
+    """(len(at), len(anchors)) Lagrange weights that interpolate values known at ``anchors`` to the points ``at``."""
+    nodes = np.asarray(anchors, dtype=np.float64)
+    weights = np.ones((len(at), len(nodes)))
+    for j, node in enumerate(nodes):
+        for other in np.delete(nodes, j):
+            weights[:, j] *= (at - other) / (node - other)
+    return weights
