@@ -1,6 +1,90 @@
 """mitsim: coded light on a scene in, frames of a lensless camera and the images recovered from them out.
 
-Importing this package imports nothing, selects no Mitsuba variant and touches no global state.
+>>> import mitsim as ms
+>>> bench = ms.open_bench("photograph")
+>>> shots = bench.capture("dots:7", accuracy=1e-3)
+>>> image = ms.reconstruct(shots, bench.calibrate())
+>>> ms.psnr(image.image, shots.truth)
+
+Importing this package imports nothing, selects no Mitsuba variant and touches no global state: names are fetched when
+they are first used.
 """
 
-__version__ = "0.3.0"
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench, open_bench
+    from mitsim.capture.light import Light
+    from mitsim.capture.plan import Plan
+    from mitsim.capture.render import Rendered
+    from mitsim.capture.request import Request
+    from mitsim.core.errors import ArgumentError, MitsimError
+    from mitsim.core.job import Clock, Job
+    from mitsim.core.resources import Limits
+    from mitsim.core.runs import Capture, load_run
+    from mitsim.reconstruct.factors import Factors, load_calibration
+    from mitsim.reconstruct.image import Reconstruction, reconstruct
+    from mitsim.rig.recipe import load_recipe
+    from mitsim.study.metrics import psnr, ssim
+
+__version__ = "0.4.0"
+
+_HOMES = {
+    "open_bench": "capture.bench",
+    "load_run": "core.runs",
+    "load_calibration": "reconstruct.factors",
+    "load_recipe": "rig.recipe",
+    "reconstruct": "reconstruct.image",
+    "psnr": "study.metrics",
+    "ssim": "study.metrics",
+    "Bench": "capture.bench",
+    "Plan": "capture.plan",
+    "Request": "capture.request",
+    "Light": "capture.light",
+    "Capture": "core.runs",
+    "Factors": "reconstruct.factors",
+    "Reconstruction": "reconstruct.image",
+    "Rendered": "capture.render",
+    "Job": "core.job",
+    "Clock": "core.job",
+    "Limits": "core.resources",
+    "MitsimError": "core.errors",
+    "ArgumentError": "core.errors",
+}
+__all__ = [
+    "ArgumentError",
+    "Bench",
+    "Capture",
+    "Clock",
+    "Factors",
+    "Job",
+    "Light",
+    "Limits",
+    "MitsimError",
+    "Plan",
+    "Reconstruction",
+    "Rendered",
+    "Request",
+    "load_calibration",
+    "load_recipe",
+    "load_run",
+    "open_bench",
+    "psnr",
+    "reconstruct",
+    "ssim",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mitsim' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"mitsim.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

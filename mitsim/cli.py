@@ -1,23 +1,34 @@
-"""The command line: parse, dispatch, print. No physics; heavy imports happen inside the verb that needs them."""
+"""The command line: parse, call the Python face, print. No physics; heavy imports happen inside the verb that needs them.
+
+Options that make up a request come from :class:`mitsim.capture.request.Request`, so that they are the same in Python.
+Errors of the library speak of arguments; :func:`_spoken` writes them as the options that they are here.
+"""
 
 from __future__ import annotations
 
 import errno
-import importlib
 import json
+import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 import mitsim
-from mitsim.core.errors import MitsimError
+from mitsim.core.arrays import Progress, silent
+from mitsim.core.environment import DEFAULT_VARIANT
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.worker import enter_worker, stop_signal
+
+if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench
+    from mitsim.capture.plan import Plan
+    from mitsim.core.job import Job
 
 app = typer.Typer(
     name="mitsim",
@@ -25,12 +36,17 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 INTERRUPTED = 130
+"""128 + SIGINT, as a shell says it."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_OPTIONS = {"lam": "lambda", "parameters": "D"}
+"""Options that are not called like the argument."""
+_BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
 
-Scene = Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
+Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
 Variant = Annotated[
@@ -39,18 +55,22 @@ Variant = Annotated[
         help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral", callback=lambda name: _variant(name)
     ),
 ]
-Seed = Annotated[int, typer.Option(help="root of every random stream")]
+Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
-Camera = Annotated[Path | None, typer.Option(help="camera electronics, TOML", metavar="FILE.toml")]
-ProjectorFile = Annotated[Path | None, typer.Option("--projector", help="projector, TOML", metavar="FILE.toml")]
+Seed = Annotated[int, typer.Option(help="root of every random stream")]
+Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
+Camera = Annotated[str | None, typer.Option(help="camera electronics: name or TOML file", metavar="NAME|FILE")]
+Projector = Annotated[str | None, typer.Option(help="projector: name or TOML file", metavar="NAME|FILE")]
 Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
 Outside = Annotated[bool, typer.Option("--allow-outside-files", help="let the scene read files outside its own folder")]
-Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
+Resume = Annotated[bool, typer.Option("--resume", help="go on where an interrupted one of the same options stopped")]
 MaxSeconds = Annotated[float, typer.Option("--max-seconds", help="refuse work that would take longer")]
 MaxMemory = Annotated[
-    float | None, typer.Option("--max-memory", help="refuse work that would take more [what is free]", metavar="GIB")
+    float | None,
+    typer.Option("--max-memory", help="refuse work that would take more; all that is free if not given", metavar="GIB"),
 ]
-Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
+DAY = 86400.0
+"""Work that would take longer is a mistake, unless it is asked for."""
 
 
 def main() -> None:
@@ -64,7 +84,7 @@ def run() -> None:
     try:
         code = app(standalone_mode=False)
     except MitsimError as error:
-        _fail(str(error))
+        _fail(_spoken(error))
     except (typer.Abort, KeyboardInterrupt):
         code = INTERRUPTED
     except MemoryError:
@@ -84,6 +104,15 @@ def run() -> None:
         print(f"mitsim: {'interrupted' if number == signal.SIGINT else f'ended by {number.name}'}", file=sys.stderr)
         code = 128 + number
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _spoken(error: MitsimError) -> str:
+    """The message of an error with its arguments written as options."""
+    text = str(error)
+    if isinstance(error, ArgumentError):
+        option = _OPTIONS.get(error.argument, error.argument).replace("_", "-")
+        text = f"--{option}{text.removeprefix(error.argument)}"
+    return re.sub(r"\b(\w+)=True\b", lambda match: "--" + match[1].replace("_", "-"), text)
 
 
 def _usage(error: Any) -> str:
@@ -112,27 +141,27 @@ def _root(
 
 @app.command()
 def demo(
+    scene: Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene")] = "photograph",
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of the demo")] = Path("demo-output"),
-    scene: Annotated[Path | None, typer.Option(help="another scene than scenes/photograph")] = None,
+    patterns: Patterns = "dots:7",
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
-    variant: Variant = "llvm_ad_mono",
+    camera: Camera = None,
+    projector: Projector = None,
+    define: Defines = None,
+    outside: Outside = False,
+    variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """The main job on a shipped scene: plan, capture, calibrate, reconstruct, report.html."""
-    from mitsim.study.demo import FAMILIES
+    """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
     from mitsim.study.demo import demo as run_demo
 
-    with _work(output, quiet or as_json) as progress:
-        path = _scene(scene) if scene is not None else None
-        result = run_demo(output, path, variant, accuracy, seed, progress)
-    lines = [
-        f"{FAMILIES[name]:>14}: {value:5.1f} dB rendered and calibrated, {result.psnr_ideal[name]:5.1f} dB idealised"
-        for name, value in result.psnr.items()
-    ]
-    lines += [f"49 dots beat uniform by {result.gain_db:.1f} dB.", f"Report: {result.report}"]
-    return _finish(as_json, asdict(result), lines, result.warnings)
+    request = _request(patterns=patterns, accuracy=accuracy, seed=seed)
+    with _job(quiet or as_json) as job:
+        bench = _open(scene, variant, camera, projector, define, outside)
+        result = run_demo(bench, output, request, job)
+    return _finish(as_json, result.payload(), result.lines(), result.warnings)
 
 
 @app.command()
@@ -142,32 +171,20 @@ def plan(
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
     camera: Camera = None,
-    projector: ProjectorFile = None,
+    projector: Projector = None,
     define: Defines = None,
     outside: Outside = False,
     effects: Effects = "",
-    variant: Variant = "llvm_ad_mono",
+    variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
-    from mitsim.capture.cost import frames_cost
-    from mitsim.capture.light import make_plan
-    from mitsim.capture.plan import parse_effects
-    from mitsim.capture.run import plan_block
-
-    forced = parse_effects(effects)
-    bench = _bench(scene, variant, camera, projector, define, outside)
-    labels, weights = bench.family(patterns, seed).classes()
-    made = make_plan(bench, labels, weights, accuracy, seed, forced)
-    block = plan_block(made)
-    payload = {key: block[key] for key in ("effects", "accuracy", "predicted_seconds", "settings", "warnings")}
-    payload |= {"sampling_target": made.sampling_target, "systematic_error": made.systematic_error}
-    cost = frames_cost(bench, made.settings, weights.shape[1], len(weights))
-    payload |= {"predicted_memory_bytes": cost.memory_bytes, "predicted_disk_bytes": cost.disk_bytes}
+    request = _request(patterns=patterns, accuracy=accuracy, seed=seed, effects=effects)
+    plan = _open(scene, variant, camera, projector, define, outside).plan(**request)
     if not as_json:
-        _print_plan(made, cost)
-    return _finish(as_json, payload, [], made.warnings)
+        _print_plan(plan)
+    return _finish(as_json, plan.payload(), [], plan.warnings)
 
 
 @app.command()
@@ -177,7 +194,7 @@ def capture(
     patterns: Patterns,
     accuracy: Accuracy = 1e-3,
     camera: Camera = None,
-    projector: ProjectorFile = None,
+    projector: Projector = None,
     exposure: Annotated[str, typer.Option(help="seconds a frame, or auto", metavar="auto|SECONDS")] = "auto",
     exposure_fraction: Annotated[float, typer.Option(help="brightest pixel, as a part of full well")] = 0.8,
     effects: Effects = "",
@@ -187,35 +204,36 @@ def capture(
     seed: Seed = 0,
     define: Defines = None,
     outside: Outside = False,
-    resume: Annotated[bool, typer.Option("--resume", help="finish an interrupted run")] = False,
-    variant: Variant = "llvm_ad_mono",
-    max_seconds: MaxSeconds = 86400.0,
+    resume: Resume = False,
+    variant: Variant = DEFAULT_VARIANT,
+    max_seconds: MaxSeconds = DAY,
     max_memory: MaxMemory = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Render, expose and write one frame for each pattern."""
-    from mitsim.capture.exposer import Exposure
-    from mitsim.capture.plan import parse_effects
-    from mitsim.capture.run import capture as run_capture
-
-    forced, limits = parse_effects(effects), _limits(max_seconds, max_memory)
-    chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
-    with _work(output, quiet or as_json) as progress:
-        bench = _bench(scene, variant, camera, projector, define, outside)
-        result = run_capture(
-            bench, patterns, output, accuracy, seed, chosen, resume, progress, forced, noise_fraction, limits
-        )
-    payload = {key: value for key, value in asdict(result).items() if key != "plan"}
-    seconds = result.seconds
+    request = _request(
+        patterns=patterns,
+        accuracy=accuracy,
+        seed=seed,
+        exposure=_number("exposure", exposure),
+        exposure_fraction=exposure_fraction,
+        effects=effects,
+        noise_fraction=noise_fraction,
+    )
+    with _job(quiet or as_json, max_seconds, max_memory) as job:
+        bench = _open(scene, variant, camera, projector, define, outside)
+        shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
+    payload = shots.summary()
+    seconds = payload["seconds"]
     lines = [
-        f"{result.frames} frames of {result.shape[0]}x{result.shape[1]} in {seconds['total']:.1f} s "
+        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {seconds['total']:.1f} s "
         f"(transport {seconds['transport']:.2f}, optics {seconds['optics']:.2f}, sensor {seconds['sensor']:.2f}, "
-        f"write {seconds['write']:.2f}): {result.output}",
-        f"Monte Carlo error {result.mc_error:.1e}, {result.mc_to_sensor_noise:.0%} of the sensor's noise; "
-        f"exposure {result.exposure_s:.3g} s a frame",
+        f"write {seconds['write']:.2f}): {payload['output']}",
+        f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
+        f"exposure {payload['exposure_s']:.3g} s a frame",
     ]
-    return _finish(as_json, payload, lines, result.warnings)
+    return _finish(as_json, payload, lines, shots.warnings)
 
 
 @app.command()
@@ -224,31 +242,32 @@ def calibrate(
     output: Annotated[Path, typer.Option("-o", "--output", help="calibration folder to make", metavar="CAL")],
     accuracy: Accuracy = 1e-3,
     camera: Camera = None,
-    projector: ProjectorFile = None,
+    projector: Projector = None,
     recipe: Annotated[Path | None, typer.Option(help="session recipe, TOML", metavar="FILE.toml")] = None,
     seed: Seed = 0,
     define: Defines = None,
     outside: Outside = False,
-    variant: Variant = "llvm_ad_mono",
-    max_seconds: MaxSeconds = 86400.0,
+    resume: Resume = False,
+    variant: Variant = DEFAULT_VARIANT,
+    max_seconds: MaxSeconds = DAY,
     max_memory: MaxMemory = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Render a Hadamard session on a white board and estimate the camera's factors."""
     from mitsim.rig.recipe import load_recipe
-    from mitsim.study.calibration import calibrate as run_calibration
 
-    limits = _limits(max_seconds, max_memory)
-    with _work(output, quiet or as_json) as progress:
-        bench = _bench(scene, variant, camera, projector, define, outside)
-        result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress, limits)
+    session = load_recipe(recipe)
+    with _job(quiet or as_json, max_seconds, max_memory) as job:
+        bench = _open(scene, variant, camera, projector, define, outside)
+        factors = bench.calibrate(seed, accuracy, session, output, resume, job)
+    payload = factors.summary()
     lines = [
-        f"{result.frames} frames of {result.n} stripes in {result.seconds['total']:.1f} s: {result.output}",
-        f"separability residual {result.separability_residual:.2%} ({result.noise_free_residual:.1e} without noise), "
-        f"factor error {result.phi_error:.1e}, condition {result.condition:.2e}",
+        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
+        f"separability residual {payload['separability_residual']:.2%} ({payload['noise_free_residual']:.1e} without "
+        f"noise), factor error {payload['phi_error']:.1e}, condition {payload['condition']:.2e}",
     ]
-    return _finish(as_json, asdict(result), lines, result.warnings)
+    return _finish(as_json, payload, lines, factors.warnings)
 
 
 @app.command()
@@ -256,30 +275,30 @@ def reconstruct(
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
     calibration: Annotated[Path, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder for the image [RUN/reconstruction]")
+        Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
     ] = None,
     lam: Annotated[str, typer.Option("--lambda", help="regularisation, or auto", metavar="auto|VALUE")] = "auto",
     method: Annotated[str, typer.Option(help="tikhonov or tv")] = "tikhonov",
-    variant: Variant = "llvm_ad_mono",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
+    variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Recover the image from frames and a calibration alone."""
-    from mitsim.study.quality import reconstruct as run_reconstruct
-    from mitsim.study.quality import summary
+    from mitsim.study.quality import reconstruct_folder
 
-    value: float | Literal["auto"] = _number("--lambda", lam, "auto", least=0.0) if lam != "auto" else "auto"  # type: ignore[assignment]
-    output = output or run / "reconstruction"
-    with _work(output, silent=True):
-        result = run_reconstruct(run, calibration, output, value, method)
-    lines = [result.status]
-    if result.psnr is not None and result.ssim is not None:
-        lines.append(f"PSNR {result.psnr:.2f} dB, SSIM {result.ssim:.3f}")
-    lines.append(
-        f"lambda {result.lam:.3g}, rank {result.rank}, condition {result.condition:.3g}, "
-        f"residual {result.residual:.1e}: {result.output}"
+    result = reconstruct_folder(
+        run, calibration, output or run / "reconstruction", _number("lambda", lam), method, overwrite
     )
-    return _finish(as_json, summary(result), lines, () if result.ok else (result.status,))
+    payload = result.payload()
+    lines = [payload["status"]]
+    if payload["psnr"] is not None:
+        lines.append(f"PSNR {payload['psnr']:.2f} dB, SSIM {payload['ssim']:.3f}")
+    lines.append(
+        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition']:.3g}, "
+        f"residual {payload['residual']:.1e}: {payload['output']}"
+    )
+    return _finish(as_json, payload, lines, () if result.ok else (payload["status"],))
 
 
 @app.command()
@@ -290,72 +309,64 @@ def render(
     spp: Annotated[int, typer.Option(help="samples a pixel of the reference")] = 64,
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
+    projector: Projector = None,
     define: Defines = None,
     outside: Outside = False,
     effects: Effects = "",
-    variant: Variant = "llvm_ad_mono",
-    max_seconds: MaxSeconds = 86400.0,
+    variant: Variant = DEFAULT_VARIANT,
+    max_seconds: MaxSeconds = DAY,
     max_memory: MaxMemory = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
-    from mitsim.capture.plan import parse_effects
-    from mitsim.capture.render import render as run_render
+    from mitsim.core.output import prepare_output
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
-    limits = _limits(max_seconds, max_memory)
-    with _work(output, quiet or as_json) as progress:
-        result = run_render(
-            _scene(scene),
-            output,
-            estimator,
-            spp,
-            accuracy,
-            seed,
-            variant,
-            _defines(define),
-            progress,
-            parse_effects(effects),
-            limits,
-            outside,
-        )
+    request = _request(accuracy=accuracy, seed=seed, effects=effects)
+    method: Any = estimator
+    with _job(quiet or as_json, max_seconds, max_memory) as job:
+        place = prepare_output(output, overwrite=True, kind="file")
+        bench = _open(scene, variant, None, projector, define, outside, for_render=True)
+        frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
+        payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
-        f"{result.estimator}: mean irradiance {result.mean:.4e} W/m^2, relative noise {result.mc_error:.1e}, "
-        f"{result.seconds:.2f} s: {result.output}"
+        f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
+        f"{payload['seconds']:.2f} s: {payload['output']}"
     ]
-    return _finish(as_json, asdict(result), lines, result.warnings)
+    return _finish(as_json, payload, lines, frame.warnings)
 
 
 @app.command()
 def study(
     name: Annotated[str, typer.Argument(help="accuracy or diffraction", metavar="NAME")],
-    scene: Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene")] = Path("photograph"),
+    scene: Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene")] = "photograph",
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of the study")] = Path("study-output"),
     patterns: Patterns = "dots:7",
     seed: Seed = 0,
+    camera: Camera = None,
+    projector: Projector = None,
     define: Defines = None,
     outside: Outside = False,
-    variant: Variant = "llvm_ad_mono",
+    variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """An experiment with plots and JSON: what `accuracy` costs in time, what `diffraction` at the mask does."""
-    from mitsim.study import STUDIES
+    from mitsim.study import find_study
 
-    if name not in STUDIES:
-        raise MitsimError(f"study {name!r}: this version has {', '.join(STUDIES)}")
-    with _work(output, quiet or as_json) as progress:
-        module, function = STUDIES[name].split(":")
-        run_study = getattr(importlib.import_module(module), function)
-        result = run_study(_bench(scene, variant, None, None, define, outside), output, patterns, seed, progress)
+    run_study = find_study(name)
+    request = _request(patterns=patterns, seed=seed)
+    with _job(quiet or as_json) as job:
+        bench = _open(scene, variant, camera, projector, define, outside)
+        result = run_study(bench, output, request, job)
     return _finish(as_json, result.payload(), result.lines(), ())
 
 
 @app.command()
 def doctor(
-    variant: Variant = "llvm_ad_mono",
+    variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -375,19 +386,6 @@ def doctor(
 # ---- helpers ---------------------------------------------------------------------------------------------------------
 
 
-def _scene(scene: Path) -> Path:
-    """The path as given, or the shipped scene of that name."""
-    if scene.suffix or scene.exists() or len(scene.parts) > 1:
-        return scene / "scene.xml" if scene.is_dir() else scene
-    from mitsim.core.configuration import shipped
-
-    folder = shipped("scenes")
-    if (folder / scene / "scene.xml").is_file():
-        return folder / scene / "scene.xml"
-    known = ", ".join(sorted(path.parent.name for path in folder.glob("*/scene.xml")))
-    raise MitsimError(f"{scene}: no such scene file, and no shipped scene of that name; shipped are {known}")
-
-
 def _variant(name: str) -> str:
     """The name, refused when it is none that light can be traced in; every verb checks it alike."""
     from mitsim.core.environment import VARIANTS
@@ -398,97 +396,93 @@ def _variant(name: str) -> str:
     return name
 
 
-def _bench(
-    scene: Path,
+def _request(**values: object) -> dict[str, Any]:
+    """Checked fields of a request: refused before anything is opened."""
+    from mitsim.capture.request import Request
+
+    request = Request.of(**values).model_dump()
+    return {name: request[name] for name in values}
+
+
+def _open(
+    scene: str,
     variant: str,
-    camera: Path | None,
-    projector: Path | None,
+    camera: str | None,
+    projector: str | None,
     define: Sequence[str] | None,
     outside: bool,
-) -> Any:
-    from mitsim.capture.bench import open_bench
-
-    return open_bench(_scene(scene), variant, camera, projector, _defines(define), outside=outside)
-
-
-def _defines(define: Sequence[str] | None) -> dict[str, str]:
-    pairs = {}
+    for_render: bool = False,
+) -> Bench:
+    parameters = {}
     for text in define or ():
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise MitsimError(f"-D {text!r}: give NAME=VALUE")
-        pairs[name] = value
-    return pairs
+        if name in _BENCH_ARGUMENTS:
+            raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
+        parameters[name] = value
+    return mitsim.open_bench(scene, variant, camera, projector, outside, for_render, **parameters)
 
 
-def _limits(seconds: float, gibibytes: float | None) -> Any:
+def _number(argument: str, text: str) -> float | Literal["auto"]:
+    """The number in ``text``, or auto."""
+    if text == "auto":
+        return "auto"
+    try:
+        return float(text)
+    except ValueError:
+        raise ArgumentError("lam" if argument == "lambda" else argument, f"{text!r}: give a number or auto") from None
+
+
+@contextmanager
+def _job(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
+    """A job with limits, and a progress bar on stderr while the context lasts."""
+    from mitsim.core.job import Job
     from mitsim.core.resources import Limits
 
-    return Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
-
-
-def _number(option: str, text: str, word: str, least: float | None = None) -> float | None:
-    """The number in ``text``, or None for ``word``."""
-    if text == word:
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        raise MitsimError(f"{option} {text!r}: give a number or {word}") from None
-    if least is not None and not least <= value < float("inf"):
-        raise MitsimError(f"{option} {text}: give a finite number of at least {least:g}, or {word}")
-    return value
+    limits = Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
+    with _progress(silent_progress) as progress:
+        yield Job(progress=progress, limits=limits)
 
 
 @contextmanager
-def _work(output: Path, silent: bool) -> Iterator[Callable[[str, float], None]]:
-    """A progress bar while the context lasts; a folder ``output`` left empty by a refusal or Control-C is removed."""
-    existed = output.exists()
-    try:
-        with _progress(silent) as progress:
-            yield progress
-    except (MitsimError, KeyboardInterrupt):
-        if not existed:
-            with suppress(OSError):
-                output.rmdir()
-        raise
-
-
-@contextmanager
-def _progress(silent: bool) -> Iterator[Callable[[str, float], None]]:
+def _progress(hidden: bool) -> Iterator[Progress]:
     """A progress bar on stderr; nothing when asked to be quiet, or when stderr is no terminal."""
-    if silent or not sys.stderr.isatty():
-        yield lambda stage, fraction: None
+    if hidden or not sys.stderr.isatty():
+        yield silent
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
 
     columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
 
 
-def _print_plan(made: Any, cost: Any) -> None:
+def _print_plan(plan: Plan) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"Effect plan at accuracy {made.accuracy:g}")
+    table = Table(title=f"Effect plan at accuracy {plan.accuracy:g}")
     for heading in ("effect", "state", "reason", "error if off", "seconds"):
         table.add_column(heading, justify="right" if heading in ("error if off", "seconds") else "left")
-    for effect in made.effects:
-        error = "-" if effect.error_if_off is None else f"{effect.error_if_off:.1e}"
-        table.add_row(effect.name, effect.state, effect.reason, error, f"{effect.seconds:.2f}")
+    for row in plan.effects:
+        error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}"
+        table.add_row(row.name, row.state, row.reason, error, f"{row.seconds:.2f}")
     console = Console()
     console.print(table)
-    console.print(f"Predicted time for transport and optics: {made.predicted_seconds:.2f} s")
-    console.print(f"At most {cost.memory_bytes / 2**30:.2g} GiB of memory, {cost.disk_bytes / 2**20:.3g} MiB of disk")
+    console.print(f"Predicted time for transport and optics: {plan.predicted_seconds:.2f} s")
+    if plan.cost:
+        memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
+        console.print(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
 
 
 def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
     """Print the result; exit status 1 when there are warnings."""
     if as_json:
-        from mitsim.core.manifest import plain
+        from mitsim.core.jsonfile import plain
 
         print(json.dumps(plain(payload), allow_nan=False))
     else:

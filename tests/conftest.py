@@ -159,6 +159,6 @@ def shipped_bench(variant: str) -> Callable[..., object]:
 
     @cache
     def load(name: str, **defines: str) -> object:
-        return open_bench(shipped("scenes", name, "scene.xml"), variant, defines=defines)
+        return open_bench(shipped("scenes", name, "scene.xml"), variant, **defines)
 
     return load

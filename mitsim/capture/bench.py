@@ -6,34 +6,53 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mitsim.capture.glint import MirrorLight
-from mitsim.core.configuration import load_model, shipped
-from mitsim.core.environment import load_variant
+from mitsim.core.configuration import load_model, locate
+from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.rig.projector import ProjectorModel, Spectrum
 from mitsim.rig.sensor import SensorModel, load_sensor
-from mitsim.scene.load import LoadedScene, load_scene
-from mitsim.scene.projector import window_at
-from mitsim.transport import plugins
-from mitsim.transport.beams import trace_beams
-from mitsim.transport.source import Projector
 
-DEFAULT_VARIANT = "llvm_ad_mono"
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitsim.capture.glint import Glint
+    from mitsim.capture.light import Light
+    from mitsim.capture.plan import Plan
+    from mitsim.capture.render import Rendered
+    from mitsim.core.job import Job
+    from mitsim.core.runs import Capture
+    from mitsim.reconstruct.calibrated import Factors
+    from mitsim.rig.recipe import SessionRecipe
+    from mitsim.scene.load import LoadedScene
+    from mitsim.transport.source import Projector
+
 _PITCH_TOLERANCE = 1e-3
+"""Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """A loaded scene with the camera's electronics and the projector's light.
+    """A loaded scene with the camera's electronics and the projector's light, ready to plan, capture and calibrate.
 
-    ``defines`` are the ``-D`` parameters that the scene was loaded with, ``camera_file`` where the electronics stand.
+    Attributes
+    ----------
+    loaded
+        the scene.
+    sensor, projector
+        the devices' models.
+    variant
+        of Mitsuba.
+    defines
+        parameters that the scene was loaded with.
+    camera_file
+        where the camera's electronics stand.
     """
 
     loaded: LoadedScene
@@ -42,6 +61,149 @@ class Bench:
     variant: str
     defines: dict[str, str]
     camera_file: str
+
+    def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
+        """What will be simulated, why, and what it costs, by a short look at the scene.
+
+        Parameters
+        ----------
+        patterns
+            ``uniform``, ``dots:K``, ``hadamard:K`` or ``random:K``.
+        **request
+            other fields of :class:`mitsim.capture.request.Request`, such as ``accuracy`` or ``effects``.
+
+        Raises
+        ------
+        MitsimError
+            for a request that cannot be served, or when no light of the projector reaches the camera.
+        """
+        from mitsim.capture.request import Request
+        from mitsim.capture.run import plan_request
+
+        return plan_request(self, Request.of(patterns=patterns, **request))
+
+    def light(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Light:
+        """Light of the scene by projector pixel, traced once, from which any family can be exposed.
+
+        Parameters
+        ----------
+        patterns
+            the family whose frames are to have the accuracy.
+        job
+            clock, progress and limits.
+        **request
+            other fields of :class:`mitsim.capture.request.Request`.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`plan`.
+        """
+        from mitsim.capture.run import trace_request
+
+        return trace_request(self, self.plan(patterns, **request), job)
+
+    def capture(
+        self,
+        plan: Plan | str = "dots:7",
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+        **request: Any,
+    ) -> Capture:
+        """One noisy frame for each shot of a pattern family.
+
+        Parameters
+        ----------
+        plan
+            a plan of this bench, or the name of a family.
+        output
+            folder that the frames are written to as they are made; None keeps them in memory.
+        resume
+            go on with an interrupted capture of the same request in ``output``, bit-equal to an uninterrupted one.
+        job
+            clock, progress and limits.
+        **request
+            other fields of :class:`mitsim.capture.request.Request`; of a plan, all but patterns, accuracy and effects.
+
+        Raises
+        ------
+        MitsimError
+            for a request that cannot be served, an output that cannot be written or holds something else, or more
+            memory, disk or time than the job's limits allow.
+        """
+        from mitsim.capture.run import capture, request_of
+
+        known = None if isinstance(plan, str) else plan
+        return capture(self, request_of(plan, request), job, output, resume, known)
+
+    def calibrate(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> Factors:
+        """The camera's two factors, from a rendered Hadamard session on a white board.
+
+        Parameters
+        ----------
+        seed
+            root of every random stream.
+        accuracy
+            relative rms error of the expected responses.
+        recipe
+            how the session is run; None: the shipped one.
+        output
+            CAL folder that is written, with its unfinished parts meanwhile; None keeps the factors in memory.
+        resume
+            go on with an interrupted session in ``output``.
+        job
+            clock, progress and limits.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture`.
+        """
+        from mitsim.capture.calibrate import calibrate
+
+        return calibrate(self, seed, accuracy, recipe, output, resume, job)
+
+    def render(
+        self,
+        estimator: Literal["reference", "factored"] = "reference",
+        spp: int = 64,
+        accuracy: float = 1e-3,
+        seed: int = 0,
+        effects: Mapping[str, bool] | None = None,
+        job: Job | None = None,
+    ) -> Rendered:
+        """The expected irradiance under the scene's own light.
+
+        Parameters
+        ----------
+        estimator
+            ``reference``: the scene's own integrator, path by path; ``factored``: what all captures are made with.
+        spp
+            samples a pixel of the reference.
+        accuracy, effects
+            of the factored estimator: relative error, and effects switched on or off by name.
+        seed
+            root of every random stream.
+        job
+            clock, progress and limits.
+
+        Raises
+        ------
+        MitsimError
+            for another estimator, an integrator that cannot render this sensor, or work beyond the job's limits.
+        """
+        from mitsim.capture.render import render
+
+        return render(self, estimator, spp, accuracy, seed, effects, job)
 
     @property
     def geometry(self) -> CameraGeometry:
@@ -57,6 +219,8 @@ class Bench:
     @property
     def source(self) -> Projector:
         """The projector as the tracer wants it."""
+        from mitsim.transport.source import Projector
+
         grid, model = self.loaded.pixels, self.projector
         return Projector(
             self.loaded.projector,
@@ -75,9 +239,12 @@ class Bench:
         return self.projector.spectrum
 
     @cached_property
-    def mirror_light(self) -> MirrorLight:
+    def glint(self) -> Glint:
         """Light of the projector that mirrors alone bring to the sensor."""
-        return MirrorLight(trace_beams(self.loaded.scene, self.loaded.camera, self.source))
+        from mitsim.capture.glint import Glint
+        from mitsim.transport.beams import trace_beams
+
+        return Glint(trace_beams(self.loaded.scene, self.loaded.camera, self.source))
 
     @property
     def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -88,6 +255,8 @@ class Bench:
         """The same on a plane at ``depth`` [mm]."""
         if depth == self.geometry.scene_distance:
             return self.windows
+        from mitsim.scene.projector import window_at
+
         return window_at(str(self.loaded.path), self.loaded.projector, self.loaded.camera, self.loaded.pixels, depth)
 
     @property
@@ -98,7 +267,7 @@ class Bench:
         return bool(reach + shift > self.geometry.tan_half_fov)
 
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
-        """The pattern family of that name on this projector; MitsimError when it does not fit."""
+        """The family ``patterns`` on this projector, ``seed`` for random ones; MitsimError when it does not fit."""
         return parse_patterns(patterns, self.n, seed)
 
     def identity(self) -> dict[str, Any]:
@@ -130,7 +299,7 @@ class Bench:
         }
 
     def with_board(self, reflectance: float) -> Bench:
-        """The same rig in front of a diffuse board on the aligned plane, larger than the field stop's view."""
+        """The same rig before a diffuse board of that ``reflectance`` on the aligned plane, larger than the view."""
         import mitsuba as mi
 
         z = self.geometry.scene_distance
@@ -152,39 +321,61 @@ def open_bench(
     variant: str = DEFAULT_VARIANT,
     camera: Path | str | None = None,
     projector: Path | str | None = None,
-    defines: Mapping[str, str] | None = None,
-    check_camera: bool = True,
-    outside: bool = False,
+    allow_outside_files: bool = False,
+    for_render: bool = False,
+    **parameters: object,
 ) -> Bench:
     """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
 
-    ``camera`` and ``projector`` are TOML files; the shipped IMX249 and MP-CL1 are used without them.
-    ``outside`` allows files of the scene outside its folder.
-    ``check_camera`` is off where only light matters and the electronics are not used.
+    Parameters
+    ----------
+    scene
+        name of a shipped scene, or path of a scene XML or of the folder that holds it (``./name`` for a folder that is
+        called like a shipped scene).
+    variant
+        of Mitsuba.
+    camera, projector
+        name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1.
+    allow_outside_files
+        whether the scene may read files outside its folder.
+    for_render
+        only light matters: the camera's electronics need not fit, and the scene needs no projector.
+    **parameters
+        values of the scene's ``<default>`` parameters, text or numbers.
 
     Raises
     ------
     MitsimError
         for anything wrong with the files, or a camera file whose pixel pitch is not the scene's.
     """
-    mi = load_variant(variant)
-    mi.set_log_level(mi.LogLevel.Error)
-    plugins.register()
-    sensor_path = Path(camera) if camera is not None else shipped("calibration", "imx249.toml")
+    path = locate(scene, "scenes", "scene.xml")
+    sensor_path = locate(camera if camera is not None else "imx249", "calibration", ".toml")
     sensor = load_sensor(sensor_path)
-    projector_path = Path(projector) if projector is not None else shipped("calibration", "mp_cl1.toml")
-    light = load_model(projector_path, ProjectorModel)
-    loaded = load_scene(Path(scene), defines, outside=outside)
+    light = load_model(locate(projector if projector is not None else "mp_cl1", "calibration", ".toml"), ProjectorModel)
+    defines = {name: _text(value) for name, value in parameters.items()}
+    # Only now, with all else checked: the renderer takes a second to import.
+    mitsuba = load_variant(variant)
+    from mitsim.scene.load import load_scene
+    from mitsim.transport import plugins
+
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    plugins.register()
+    loaded = load_scene(path, defines, needs_projector=not for_render, outside=allow_outside_files)
     pitch, stated = sensor.superpixel_pitch_um * 1e-3, loaded.camera.geometry.pixel_pitch
-    if check_camera and abs(pitch - stated) > _PITCH_TOLERANCE * stated:
+    if not for_render and abs(pitch - stated) > _PITCH_TOLERANCE * stated:
         raise MitsimError(
             f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
             "use the camera of that scene, or change pixel_pitch, or binning"
         )
-    return Bench(loaded, sensor, light, variant, dict(defines or {}), str(sensor_path))
+    return Bench(loaded, sensor, light, variant, defines, str(sensor_path))
 
 
-def _scalar_transform(camera: Any) -> Any:
+def _text(value: object) -> str:
+    """A parameter as a scene spells it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _scalar_transform(camera: mi.Sensor) -> mi.ScalarAffineTransform4f:
     import mitsuba as mi
 
     matrix = np.array(camera.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]

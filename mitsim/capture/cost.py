@@ -7,32 +7,47 @@ from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE
 from mitsim.core.resources import Cost
 from mitsim.optics.frames import frames_in_memory
+from mitsim.rig.patterns import Lighting
 
-_LANES_BYTES = 350e6  # paths in flight, compiled kernels, LLVM; measured
-_DEPOSIT_BYTES = 36.0  # an entry of a sparse matrix, and the sum that it is added to
-_SECONDS_PER_PIXEL = 9e-8  # exposing and writing; measured on two cores
-_BYTES_PER_PIXEL = 8  # digital number and expected electrons, uncompressed
+_LANES_BYTES = 350e6
+"""Paths in flight, compiled kernels, LLVM; measured."""
+_DEPOSIT_BYTES = 36.0
+"""An entry of a sparse matrix, and the sum that it is added to."""
+_SECONDS_PER_PIXEL = 9e-8
+"""Exposing and writing; measured on two cores."""
+_BYTES_PER_PIXEL = 8
+"""Digital number and expected electrons, uncompressed."""
 _BYTES_PER_ROW, _HEADER_BYTES = 16, 2000
+"""Of an OpenEXR file."""
 
 
 def frames_cost(
-    bench: Bench, settings: Settings, classes: int, captures: int, seconds: float = 0.0, on_disk: float = 0.0
+    bench: Bench, settings: Settings, lighting: Lighting, seconds: float = 0.0, on_disk: float = 0.0
 ) -> Cost:
-    """Memory, disk and time of a capture of so many frames; ``seconds`` is what its light takes.
+    """Memory, disk and time of a capture.
 
-    ``on_disk``: bytes of frames that are there already.
+    Memory is an upper estimate: measured runs take between a third and all of it (tests/hard/test_memory.py).
 
-    Memory is an upper estimate: measured runs take between a third and all of it
-    (``tests/hard/test_memory.py``).
+    Parameters
+    ----------
+    bench, settings
+        what is simulated.
+    lighting
+        its classes and shots.
+    seconds
+        what its light takes.
+    on_disk
+        bytes of frames that are there already.
     """
+    shots, classes = lighting.weights.shape
     rows = bench.geometry.pixels
     pixels = rows**2
-    files = captures * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
+    files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
     truth = 4.0 * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES
-    held = frames_in_memory(classes, captures) + 4 * FRAMES_AT_ONCE
+    held = frames_in_memory(classes, shots) + 4 * FRAMES_AT_ONCE
     places = bench.n**2 * (2 * settings.subdivision**2 + (settings.anchors**2 + 1) * settings.coarse_cells**2)
     return Cost(
-        seconds=seconds + captures * pixels * _SECONDS_PER_PIXEL,
+        seconds=seconds + shots * pixels * _SECONDS_PER_PIXEL,
         memory_bytes=_LANES_BYTES + 8.0 * held * pixels + GROUPS * places * _DEPOSIT_BYTES,
         disk_bytes=max(files + truth - on_disk, 0.0),
     )

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-PHYSICAL = (
-    *("interreflection", "mirrors", "ambient", "diffraction", "mask-thickness", "pixel-response"),
-    *("aperture", "blur", "black-level", "speckle"),
-)
-"""Effects that are simulated or not; ``anchors`` and ``layers`` are effects with a number."""
+from mitsim.capture.effects import names
+
 _FEWEST_SAMPLES = 1e-3
-FOLLOWED = frozenset({"interreflection", "ambient", "mirrors"})
-"""Effects whose light is followed over more than one surface, or from the camera."""
+"""Samples of light without noise: next to none, and above 0 because costs are ratios."""
 GROUPS = 8
-"""Independent estimates of the light, whose spread tells the Monte Carlo error."""
+"""Independent estimates of the light: eight tell their spread, the Monte Carlo error, to a quarter (1 / sqrt(14))."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +28,8 @@ class Settings:
     subdivision
         cells a side of a projector pixel.
     effects
-        those of :data:`PHYSICAL` that are simulated.
-    direct_samples, anchored_samples, indirect_samples, other_samples
+        names of those that are simulated (:mod:`mitsim.capture.effects`).
+    direct_samples, anchored_samples, indirect_samples, from_camera_samples
         samples that each group is predicted to need: a projector pixel of direct light, of its differences between
         anchors, and of indirect light; a cell of what is followed from the camera.
     coarse_cells, coarse_layers
@@ -49,7 +45,7 @@ class Settings:
     direct_samples: float = 1.0
     anchored_samples: float = 1.0
     indirect_samples: float = 1.0
-    other_samples: float = 1.0
+    from_camera_samples: float = 1.0
     coarse_cells: int = 1
     coarse_layers: bool = False
 
@@ -109,10 +105,10 @@ class Evidence:
     cell_error
         by cells a side of a projector pixel.
     effect_error
-        error of leaving out each effect of :data:`PHYSICAL` that the scene or its devices have.
+        error of leaving out each effect that the bench has.
     direct_part
         direct light in all light.
-    direct, anchored, indirect, other
+    direct, anchored, indirect, from_camera
         what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
         and what is followed from the camera.
     seconds_per_frame
@@ -133,7 +129,7 @@ class Evidence:
     direct: Effort
     anchored: Effort
     indirect: Effort
-    other: Effort
+    from_camera: Effort
     seconds_per_frame: float
     terms: float
     unresolved: float = 0.0
@@ -145,6 +141,7 @@ class Evidence:
 
     def following(self, settings: Settings) -> float:
         """Seconds of all other light; none when no effect calls for it."""
-        if not settings.effects & FOLLOWED:
+        if not settings.effects & names(lambda effect: effect.followed):
             return 0.0
-        return GROUPS * (settings.indirect_samples * self.indirect.cost + settings.other_samples * self.other.cost)
+        indirect = settings.indirect_samples * self.indirect.cost
+        return GROUPS * (indirect + settings.from_camera_samples * self.from_camera.cost)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 from scipy import special
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.request import Exposure
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.optics.frames import ExpectedFrames, Frame
@@ -23,43 +24,14 @@ from mitsim.sensor.chain import (
     dn_to_electrons,
     electrons_from_irradiance,
     expose,
-    exposure_for_peak,
 )
 from mitsim.sensor.moments import frame_moments
 
-_LONGEST_S = 1e6
+Item = TypeVar("Item")
 _CAN_SATURATE = 1e-3
+"""Chance of saturation anywhere in a frame from which a reading at the full well counts as saturation."""
 FRAMES_AT_ONCE = 16
-"""Frames held in memory at a time."""
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One exposure for a whole session: ``seconds`` by hand, or the brightest pixel at ``fraction`` of full well."""
-
-    seconds: float | None = None
-    fraction: float = 0.8
-
-    def __post_init__(self) -> None:
-        if self.seconds is not None and not 0 < self.seconds <= _LONGEST_S:
-            raise MitsimError(f"exposure {self.seconds} s: give a time above 0, up to {_LONGEST_S:g} s, or auto")
-        if not 0 < self.fraction <= 1:
-            raise MitsimError(f"exposure fraction {self.fraction} of full well: give a number above 0, up to 1")
-
-    def check(self, bench: Bench) -> None:
-        """MitsimError when the time is to follow from a full well that the camera does not have."""
-        if self.seconds is None and not np.isfinite(bench.sensor.full_well_e):
-            raise MitsimError(
-                f"camera {bench.camera_file}: full_well_e is inf, so there is no full well to fill; "
-                "give a finite one, or an exposure in seconds"
-            )
-
-    def choose(self, bench: Bench, peak_irradiance: float) -> float:
-        """Exposure time [s] for frames whose brightest expected pixel has this irradiance [W m^-2]."""
-        if self.seconds is not None:
-            return self.seconds
-        wavelength = bench.projector.effective_wavelength_nm
-        return exposure_for_peak(peak_irradiance, self.fraction, bench.sensor, wavelength)
+"""Frames held in memory at a time: enough work for eight processors, and 32 MB at 512 x 512."""
 
 
 @dataclass(frozen=True)
@@ -122,18 +94,62 @@ class Exposer:
         return bool(special.pdtrc(np.ceil(well) - 1, peak) * electrons.size >= _CAN_SATURATE)
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
-        """Noisy measurement [electrons / s] of every pattern (i, j); a signed pattern is a difference of two frames."""
-        numbered = zip(family.captures, expected, strict=True)
-        half: FloatArray | None = None
-        while chunk := list(islice(numbered, FRAMES_AT_ONCE)):
-            rates = in_threads(lambda item: self._measured(item[1], *item[0].names), chunk)
-            for (shown, _), rate in zip(chunk, rates, strict=True):
-                if shown.sign == 1:
-                    half = rate
+        """Noisy measurement [electrons / s] of every pattern (i, j) of ``family``, from its ``expected`` frames.
+
+        A signed pattern is a difference of two frames.
+        """
+        positive: FloatArray | None = None
+        for shots in in_chunks(zip(family.captures, expected, strict=True)):
+            rates = in_threads(lambda item: self._measured(item[1], *item[0].names), shots)
+            for (shot, _), rate in zip(shots, rates, strict=True):
+                if shot.sign == 1:
+                    positive = rate
                     continue
-                yield rate if half is None else half - rate, shown.row, shown.column
-                half = None
+                yield rate if positive is None else positive - rate, shot.row, shot.column
+                positive = None
 
     def _measured(self, frame: Frame, *names: str | int) -> FloatArray:
         """Noisy electrons a second of the frame ``names``."""
         return self.rate(self.digital(self.lit(frame, *names), *names))
+
+
+def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
+    """Lists of up to :data:`FRAMES_AT_ONCE` ``items``, in order."""
+    remaining = iter(items)
+    while chunk := list(islice(remaining, FRAMES_AT_ONCE)):
+        yield chunk
+
+
+@dataclass(frozen=True)
+class NoiseTarget:
+    """Monte Carlo error at which more sampling buys nothing: a part of the sensor's own relative noise.
+
+    Attributes
+    ----------
+    bench, exposure
+        the camera, and how its exposure time is found.
+    fraction
+        part of the noise.
+    """
+
+    bench: Bench
+    exposure: Exposure
+    fraction: float
+
+    def __call__(self, expected: ExpectedFrames) -> float:
+        """Relative error to stop at, from the frames ``expected`` so far."""
+        peak = peak_irradiance(expected)
+        if peak <= 0:
+            return np.inf
+        exposer = Exposer(self.bench, self.exposure.choose(self.bench, peak), 0)
+        noise = energy = 0.0
+        for frame in expected:
+            electrons = exposer.electrons(frame)
+            noise += exposer.sensor_noise(electrons) ** 2 * electrons.size
+            energy += float(np.square(electrons).sum())
+        return self.fraction * float(np.sqrt(noise / energy))
+
+
+def peak_irradiance(expected: ExpectedFrames) -> float:
+    """Irradiance [W m^-2] of the brightest pixel of ``expected`` frames."""
+    return max(float(frame.irradiance.max()) for frame in expected)

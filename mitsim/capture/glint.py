@@ -14,33 +14,34 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
 
 _KEPT = 4
+"""Frames of so many lightings and cameras: what the pilot switches between."""
 
 
-class MirrorLight:
+class Glint:
     """Frames made from beams; the last few are kept, because forming them takes as long as tracing does."""
 
     def __init__(self, beams: Beams) -> None:
         self.beams = beams
-        self._made: dict[tuple[bytes, CameraGeometry, bytes], ClassFrames] = {}
+        self._frames: dict[tuple[bytes, CameraGeometry, bytes], ClassFrames] = {}
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
         """Frames by class for ``labels`` (n^2,); without a ``spectrum`` the mask's shadow is geometric."""
         if not len(self.beams):
             return None
         key = labels.tobytes(), geometry, spectrum.wavelengths_nm.tobytes() if spectrum else b""
-        if key not in self._made:
-            while len(self._made) >= _KEPT:
-                del self._made[next(iter(self._made))]
-            self._made[key] = self._form(labels, geometry, spectrum)
-        return self._made[key]
+        if key not in self._frames:
+            while len(self._frames) >= _KEPT:
+                del self._frames[next(iter(self._frames))]
+            self._frames[key] = self._form(labels, geometry, spectrum)
+        return self._frames[key]
 
     def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
         def response(row: FloatArray, column: FloatArray) -> FloatArray:
             return geometry.pixel_fill_factor * geometry.angular_response(np.square(row) + np.square(column))
 
         active = math.sqrt(geometry.pixel_fill_factor)
-        found = beam_frames(self.beams, geometry, self._terms(geometry, spectrum), labels, response, active)
-        return ClassFrames(found.classes, found.irradiance)
+        formed = beam_frames(self.beams, geometry, self._terms(geometry, spectrum), labels, response, active)
+        return ClassFrames(formed.classes, formed.irradiance)
 
     def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SeparableTerm]:
         """The mask for a virtual source at the beams' mean depth and direction."""

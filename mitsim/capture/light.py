@@ -1,37 +1,70 @@
-"""Light for a family of patterns: from a bench and an accuracy to sampled light, its frames and their error."""
+"""Light of a scene: from a bench and an accuracy to sampled light, its frames and their error."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from operator import add
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
 from mitsim.capture.simulation import Estimate, Simulation
-from mitsim.core.arrays import FloatArray, Labels, Progress
+from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, relative_error
+from mitsim.rig.patterns import Lighting
+from mitsim.rig.recipe import load_recipe
+
+if TYPE_CHECKING:
+    from mitsim.core.job import Job
+    from mitsim.core.runs import Capture
 
 Target = Callable[[ExpectedFrames], float]
-_CHECKED_CAPTURES = 8
+"""The relative Monte Carlo error to stop at, from the frames seen so far."""
+_CHECKED_SHOTS = 8
+"""Shots that are formed to see the error: their errors differ by a few percent, and each costs its forming."""
 _MOST_PATHS = 2**32
+"""Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _LARGEST_GROWTH = 8.0
+"""Most that the samples grow by in one round, because the first rounds know their error badly."""
 _FIRST_ROUND = 0.5
+"""Part of the predicted samples that is traced first: where the plan was careful, half of them do."""
+_FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
+"""Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
+what direct light brings), direct light's with their 0.8th power or faster."""
 _VIEW_SAMPLES = 64
+"""Samples a cell of a picture to look at: below the step of eight bits."""
 _LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 
 
-def silent(stage: str, fraction: float) -> None:
-    """A progress report that goes nowhere: stage name, and its finished part 0..1."""
+@dataclass(frozen=True)
+class Sampling:
+    """How light is sampled.
+
+    Attributes
+    ----------
+    purpose
+        names the random streams: light for two purposes shares none.
+    by_pixel
+        keep the light of every projector pixel apart, for any family; else by the lighting's classes, which is faster.
+    target
+        error to stop at, where the plan's own is not wanted.
+    """
+
+    purpose: str = "scene"
+    by_pixel: bool = True
+    target: Target | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +77,8 @@ class Light:
         independent estimates.
     simulation
         what was simulated; it turns light into frames.
+    plan, seed
+        what it was traced for, and the root of its random streams.
     labels
         (n^2,) row of each projector pixel: its class, or the pixel itself when any family is to be formed.
     flux
@@ -56,109 +91,145 @@ class Light:
 
     groups: tuple[Estimate, ...]
     simulation: Simulation
+    plan: Plan
+    seed: int
     labels: Labels
     flux: FloatArray
     paths: int
     sampling_error: float
     reached: bool
 
-    def frames(self, labels: Labels, weights: FloatArray, seed: int) -> ExpectedFrames:
-        """Expected frames of the captures that ``labels`` (n^2,) and ``weights`` (captures, classes) describe.
+    @property
+    def bench(self) -> Bench:
+        """Where it shines."""
+        return self.simulation.bench
 
-        Light by pixel serves every family; light by class only families that never split one of its classes.
+    def frames(self, lighting: Lighting, seed: int) -> ExpectedFrames:
+        """Expected frames of the shots of ``lighting``; ``seed`` is of the probes that tell their error.
+
+        Light by pixel serves every family; light by class only families that never split one of its classes
+        (ValueError else).
         """
         rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
-        rows[self.labels] = labels
-        if not np.array_equal(rows[self.labels], labels):
-            raise ValueError("the light was collected for another family of patterns")
-        exact = self.simulation.mirrored(labels)
-        return self.simulation.expected(self.groups, rows, weights, seed, exact)
+        rows[self.labels] = lighting.labels
+        if not np.array_equal(rows[self.labels], lighting.labels):
+            raise ValueError("the light was traced for another family of patterns")
+        return self.simulation.expected(self.groups, rows, lighting, seed)
+
+    def expose(
+        self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
+    ) -> Capture:
+        """One noisy frame for each shot of a family in this light.
+
+        Parameters
+        ----------
+        patterns
+            the family.
+        output
+            folder that the frames are written to; None keeps them in memory.
+        job
+            clock, progress and limits.
+        **request
+            ``seed``, ``exposure`` or ``exposure_fraction`` other than those that the light was traced with.
+
+        Raises
+        ------
+        MitsimError
+            for patterns that do not fit, an output that cannot be written, or a field that would need other light.
+        """
+        from mitsim.capture.run import capture, request_of
+
+        own = replace(self.plan, request=request_of(self.plan, {}).changed(patterns=patterns))
+        return capture(self.bench, request_of(own, request), job, output, light=self)
 
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""
         return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
+    @cached_property
+    def board_flux(self) -> FloatArray:
+        """(n^2,) direct light of each projector pixel on the sensor, over the calibration board [W m^-2]."""
+        settings = self.plan.settings
+        plan = replace(
+            self.plan,
+            settings=Settings(
+                self.bench.geometry.scene_distance,
+                settings.anchors,
+                effects=names(lambda effect: effect.in_truth) & settings.effects,
+                direct_samples=settings.direct_samples,
+            ),
+        )
+        board = self.bench.with_board(load_recipe().board_reflectance)
+        return trace_light(
+            board, plan, Lighting.uniform(board.n), self.seed, Sampling(purpose="board", by_pixel=False)
+        ).flux
+
+    @cached_property
+    def truth(self) -> FloatArray:
+        """(n, n) apparent reflectance: each projector pixel's flux toward the camera over that of the board.
+
+        The board is the session's: one of reflectance 0.99 counts as 1.
+        """
+        board = self.board_flux
+        ratio = np.divide(self.flux, board, out=np.zeros_like(board), where=board > 0)
+        return ratio.reshape(self.bench.n, self.bench.n)
+
 
 @single_threaded_blas()
 def make_plan(
-    bench: Bench,
-    labels: Labels,
-    weights: FloatArray,
-    accuracy: float,
-    seed: int,
-    forced: Mapping[str, bool] | None = None,
+    bench: Bench, lighting: Lighting, accuracy: float, seed: int, switches: Mapping[str, bool] | None = None
 ) -> Plan:
-    """Look at the scene for a moment and decide what to simulate; ``forced`` overrides effects by name."""
+    """Look at the scene for a moment and decide what to simulate.
+
+    Parameters
+    ----------
+    bench, lighting
+        the scene, and the family's pixels and shots.
+    accuracy
+        relative rms error of the expected frames.
+    seed
+        root of the pilot's random streams.
+    switches
+        effects that are switched on or off by name, whatever they are worth.
+    """
     check_accuracy(accuracy)
-    evidence = pilot.measure(bench, labels, weights, accuracy, seed)
-    return decide(accuracy, evidence, len(weights), scene_facts(bench), forced)
-
-
-def scene_facts(bench: Bench) -> SceneFacts:
-    """What the plan says of a bench's devices."""
-    geometry, projector = bench.geometry, bench.projector
-    fresnel = geometry.fresnel_number(projector.effective_wavelength_nm)
-    warnings = []
-    if bench.field_stop_cuts:
-        warnings.append(
-            "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred over "
-            "the anchors, so open it or accept an error there"
-        )
-    if geometry.wall_shift_features >= 1:
-        warnings.append(
-            f"mask_thickness {geometry.mask_thickness} mm shifts the far face by {geometry.wall_shift_features:.1f} "
-            "features at the field stop; the two-face model holds below 1"
-        )
-    longest = float(bench.spectrum.wavelengths_nm.max())
-    if geometry.mask_feature * 1e6 < longest:
-        warnings.append(
-            f"mask_feature {geometry.mask_feature:g} mm is below the wavelength of {longest:.0f} nm; scalar theory of "
-            "masks needs features above it, so the shadow is a guess"
-        )
-    return SceneFacts(
-        absent={
-            "mirrors": "no surface reflects or transmits light in single directions",
-            "ambient": "the projector is the only emitter",
-            "mask-thickness": "the mask is thin",
-            "pixel-response": "pixels are fully sensitive, whatever the angle",
-            "aperture": "the projector is a pinhole: sharp at all distances",
-            "blur": "the projector's pixels are sharp",
-            "black-level": "the projector's black is black",
-            "speckle": "the projector file gives no speckle contrast",
-        },
-        notes={
-            "diffraction": f"a mask feature's Fresnel number is {fresnel:.1f} at "
-            f"{projector.effective_wavelength_nm:.0f} nm, {len(bench.spectrum.weights)} line(s)",
-            "ambient": f"{len(bench.loaded.lamps)} emitter(s) beside the projector",
-        },
-        keystone=bench.loaded.pixels.keystone,
-        warnings=tuple(warnings),
-    )
+    evidence = pilot.measure(bench, lighting, accuracy, seed)
+    return decide(accuracy, evidence, len(lighting.weights), SceneFacts.of(bench), switches)
 
 
 @single_threaded_blas()
-def collect(
+def trace_light(
     bench: Bench,
     plan: Plan,
-    labels: Labels,
-    weights: FloatArray,
+    lighting: Lighting,
     seed: int,
+    sampling: Sampling | None = None,
     progress: Progress = silent,
-    purpose: str = "scene",
-    by_pixel: bool = True,
-    target: Target | None = None,
 ) -> Light:
-    """Trace until the Monte Carlo error of the frames meets the plan's target, or the limit of 2^32 paths.
+    """Trace until the Monte Carlo error of the frames meets its target, or the limit of 2^32 paths.
 
-    Each group gets the same number of samples; a few captures, evenly spread, are formed to see the error. ``purpose``
-    names the random streams: light for two purposes shares none. ``by_pixel`` keeps the light of every projector pixel
-    apart, for other families than this one. ``target`` gives the error to stop at from the frames seen so far, where
-    the plan's own is not wanted.
+    Each group gets the same number of samples; a few shots, evenly spread, are formed to see the error.
+
+    Parameters
+    ----------
+    bench, plan
+        what is traced.
+    lighting
+        whose frames are to meet the target.
+    seed
+        root of the random streams.
+    sampling
+        target, filing and streams.
+    progress
+        told how near the target is.
     """
+    sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
-    kept = np.arange(bench.n**2) if by_pixel else labels
-    chosen = np.unique(np.linspace(0, len(weights) - 1, min(len(weights), _CHECKED_CAPTURES)).astype(int))
-    groups = [_Group(simulation, kept, integer(seed, "transport", purpose, group)) for group in range(GROUPS)]
+    labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
+    shots = len(lighting.weights)
+    checked = lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, _CHECKED_SHOTS)).astype(int)))
+    streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
+    groups = [_Group(simulation, labels, stream) for stream in streams]
     rounds = _FIRST_ROUND
     while True:
         for group in groups:
@@ -166,21 +237,22 @@ def collect(
         light = Light(
             groups=tuple(group.light for group in groups),
             simulation=simulation,
-            labels=kept,
+            plan=plan,
+            seed=seed,
+            labels=labels,
             flux=np.asarray(sum(group.flux for group in groups) / GROUPS),
             paths=sum(group.paths for group in groups),
             sampling_error=math.inf,
             reached=False,
         )
-        expected = light.frames(labels, weights[chosen], seed)
+        expected = light.frames(checked, seed)
         error = relative_error(expected)
-        goal = target(expected) if target else plan.sampling_target
-        progress("transport", min(1.0, (goal / error) ** 2) if error > 0 else 1.0)
-        if error <= goal or light.paths >= _MOST_PATHS:
-            return replace(light, sampling_error=error, reached=error <= goal)
-        # Indirect light's error falls with the square root of the samples; direct light's falls faster.
-        rate = 1.6 if simulation.indirect or simulation.other else 1.2
-        rounds *= min(max(1.05 * (error / goal) ** rate, 1.1), _LARGEST_GROWTH)
+        target = sampling.target(expected) if sampling.target else plan.sampling_target
+        progress("transport", min(1.0, (target / error) ** 2) if error > 0 else 1.0)
+        if error <= target or light.paths >= _MOST_PATHS:
+            return replace(light, sampling_error=error, reached=error <= target)
+        rate = _FOLLOWED_RATE if simulation.indirect or simulation.from_camera else _DIRECT_RATE
+        rounds *= min(max(1.05 * (error / target) ** rate, 1.1), _LARGEST_GROWTH)
 
 
 class _Group:
@@ -197,14 +269,14 @@ class _Group:
     def sample(self, rounds: float) -> None:
         """Trace until this many times the samples that the plan predicted are done."""
         for name, stage in self.simulation.tracers().items():
-            wanted, seed = max(math.ceil(rounds * stage.predicted), 1), integer(self.seed, name)
+            wanted, seed = max(math.ceil(rounds * stage.predicted), 1), integer(self.seed, stage.stream)
             while (done := self.done.get(name, 0)) < wanted:
                 count = min(max(1, _LANES_AT_ONCE // stage.tracer.lanes), wanted - done)
-                found = stage.tracer.trace(seed, done, count)
-                light = stage.file(found, self.labels, 1)
+                deposits = stage.tracer.trace(seed, done, count)
+                light = stage.file(deposits, self.labels, 1)
                 self._sums[name] = self._sums[name] + light if name in self._sums else light
                 if name == "direct":
-                    self._flux += self.simulation.flux(found, 1)
+                    self._flux += self.simulation.flux(deposits, 1)
                 self.done[name] = done + count
                 self.paths += count * stage.tracer.lanes
 
@@ -219,16 +291,6 @@ class _Group:
         return self._flux / self.done["direct"]
 
 
-def speckle_of(bench: Bench, plan: Plan) -> float:
-    """Speckle contrast of frames under a plan; 0 where the effect is off."""
-    return bench.projector.speckle_contrast if "speckle" in plan.settings.effects else 0.0
-
-
-def uniform_light(n: int) -> tuple[Labels, FloatArray]:
-    """Labels and weights of one capture with every projector pixel fully lit."""
-    return np.zeros(n * n, dtype=np.int64), np.ones((1, 1))
-
-
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:
     """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
 
@@ -236,11 +298,11 @@ def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArra
     """
     settings = Settings(depth=bench.geometry.scene_distance)
 
-    def seen(which: Bench) -> FloatArray:
+    def view(which: Bench) -> FloatArray:
         simulation = Simulation(which, settings, pixels=2 * bench.n)
-        found = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
-        light = simulation.file(found, np.zeros(bench.n**2, dtype=np.int64), 1).fine[[0]].toarray()
-        return np.asarray(light).reshape(simulation.bundle.cells)
+        deposits = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
+        light = simulation.file_direct(deposits, np.zeros(bench.n**2, dtype=np.int64), 1).fine[[0]].toarray()
+        return np.asarray(light).reshape(simulation.fine.bundle.cells)
 
-    scene, board = seen(bench), seen(bench.with_board(board_reflectance))
+    scene, board = view(bench), view(bench.with_board(board_reflectance))
     return np.asarray(np.divide(scene, board, out=np.zeros(scene.shape), where=board > 0))

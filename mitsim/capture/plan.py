@@ -9,29 +9,51 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.capture.evidence import FOLLOWED, GROUPS, PHYSICAL, Evidence, Settings
-from mitsim.core.errors import MitsimError
+from mitsim.capture.effects import EFFECTS, Effect, names
+from mitsim.capture.evidence import GROUPS, Effort, Evidence, Settings
+from mitsim.core.errors import ArgumentError
+from mitsim.core.pictures import table
+
+if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench
+    from mitsim.capture.request import Request
+    from mitsim.core.resources import Cost
 
 State = Literal["exact", "approximate", "off"]
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
-SWITCHES = ("anchors", "layers", *PHYSICAL)
+"""Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
+worth its name."""
 _RESIDUAL = 0.5
+"""Part of the accuracy that one discretisation may leave: a quarter of its square."""
 _FLOOR = 0.7
-"""Sampling may always take this part of the accuracy, however much of it the rest has spent."""
+"""Lower bound of the sampling error budget, as a part of the accuracy: half of its square."""
 _SAMPLING_MARGIN = 0.95
+"""Sampling aims below its budget, because its error is itself known to a few percent from eight captures."""
 _FLAGGED = 1.5
-"""Every effect is held to the accuracy by itself; their sum is reported, and flagged above this much of it."""
+"""A systematic error above this much of the accuracy is flagged: each effect is held to the accuracy by itself, and two
+that just meet it add up to 1.41."""
 _FEWEST_DIRECT = 8.0
 """Samples a projector pixel: few are cheap, and a spectrum or a texture wants more than the frames' error tells."""
 _COARSE = 0.4
+"""Part of the accuracy that coarse cells may leave, below ``_RESIDUAL`` because they hold several kinds of light."""
 
 
 @dataclass(frozen=True)
-class Effect:
-    """One row of the plan; ``error_if_off`` is None where no prediction was made, ``seconds`` is the extra cost."""
+class PlanRow:
+    """One row of a plan.
+
+    Attributes
+    ----------
+    name, state, reason
+        of an effect or discretisation; a sentence.
+    error_if_off
+        relative change of the frames without it; None where no prediction was made.
+    seconds
+        what it adds.
+    """
 
     name: str
     state: State
@@ -44,64 +66,129 @@ class Effect:
 class Plan:
     """Settings of the factored estimator for one capture, with their reasons.
 
-    ``sampling_target`` is the relative Monte Carlo error at which sampling stops, ``systematic_error`` what everything
-    left out or made coarse is predicted to leave. ``warnings`` say why a result will be flagged.
+    Attributes
+    ----------
+    accuracy
+        relative error asked for.
+    effects
+        a row for each effect and discretisation.
+    predicted_seconds
+        of transport and optics.
+    settings
+        what is simulated, and how finely.
+    sampling_target
+        relative Monte Carlo error at which sampling stops.
+    systematic_error
+        what everything left out or made coarse is predicted to leave, relative.
+    warnings
+        why a result will be flagged.
+    request, cost
+        what it is for, and what that takes; None where it was decided without them.
     """
 
     accuracy: float
-    effects: tuple[Effect, ...]
+    effects: tuple[PlanRow, ...]
     predicted_seconds: float
     settings: Settings
     sampling_target: float
     systematic_error: float
     warnings: tuple[str, ...]
+    request: Request | None = None
+    cost: Cost | None = None
+
+    def block(self) -> dict[str, Any]:
+        """The plan as JSON holds it."""
+        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
+        own = replace(self, request=None, cost=None)
+        return {**{name: value for name, value in asdict(own).items() if value is not None}, "settings": settings}
+
+    def _repr_html_(self) -> str:
+        cells = [
+            (row.name, row.state, row.reason, _shown(row.error_if_off), f"{row.seconds:.2f}") for row in self.effects
+        ]
+        facts = [f"Predicted: {self.predicted_seconds:.2f} s, systematic error {self.systematic_error:.1e}"]
+        headings = ("effect", "state", "reason", "error if off", "seconds")
+        return table(f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.warnings))
+
+
+def _shown(error: float | None) -> str:
+    return "-" if error is None else f"{error:.1e}"
 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What the plan must know of the devices besides the pilot's evidence.
+    """What a plan says of a bench's devices besides the pilot's evidence.
 
-    ``absent`` gives the reason why an effect has nothing to act on; ``notes`` what to say of one that has.
+    Attributes
+    ----------
+    notes
+        what to say of an effect that the bench has, by name.
+    keystone
+        how far the projector's window is off a square [projector pixels].
+    warnings
+        what the model of the devices does not cover.
     """
 
-    absent: Mapping[str, str]
     notes: Mapping[str, str]
     keystone: float
     warnings: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, bench: Bench) -> SceneFacts:
+        """The facts of ``bench``."""
+        geometry, warnings = bench.geometry, []
+        if bench.field_stop_cuts:
+            warnings.append(
+                "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred "
+                "over the anchors, so open it or accept an error there"
+            )
+        if geometry.wall_shift_features >= 1:
+            warnings.append(
+                f"mask_thickness {geometry.mask_thickness} mm shifts the far face by "
+                f"{geometry.wall_shift_features:.1f} features at the field stop; the two-face model holds below 1"
+            )
+        longest = float(bench.spectrum.wavelengths_nm.max())
+        if geometry.mask_feature * 1e6 < longest:
+            warnings.append(
+                f"mask_feature {geometry.mask_feature:g} mm is below the wavelength of {longest:.0f} nm; scalar theory "
+                "of masks needs features above it, so the shadow is a guess"
+            )
+        notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
+        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings))
+
 
 def check_accuracy(accuracy: float) -> float:
-    """The accuracy, or MitsimError when it is outside what the estimator can promise."""
+    """``accuracy``, or ArgumentError when it is outside what the estimator can promise."""
     if not LOWEST_ACCURACY <= accuracy <= HIGHEST_ACCURACY:
-        raise MitsimError(
-            f"--accuracy {accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
+        raise ArgumentError(
+            "accuracy", f"{accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
         )
     return accuracy
 
 
-def parse_effects(text: str) -> dict[str, bool]:
-    """``+ambient,-diffraction`` as {name: on}; MitsimError for a name that is no effect, or a missing sign."""
-    chosen: dict[str, bool] = {}
-    for word in filter(None, (part.strip() for part in text.split(","))):
-        if word[0] not in "+-" or word[1:] not in SWITCHES:
-            raise MitsimError(
-                f"--effects {text!r}: {word!r} is not +NAME or -NAME; the names are {', '.join(SWITCHES)}"
-            )
-        if chosen.get(word[1:], word[0] == "+") != (word[0] == "+"):
-            raise MitsimError(f"--effects {text!r}: {word[1:]} is switched both on and off; keep one")
-        chosen[word[1:]] = word[0] == "+"
-    return chosen
-
-
 def decide(
-    accuracy: float, evidence: Evidence, captures: int, facts: SceneFacts, forced: Mapping[str, bool] | None = None
+    accuracy: float, evidence: Evidence, shots: int, facts: SceneFacts, switches: Mapping[str, bool] | None = None
 ) -> Plan:
-    """Choose effects, anchors, layers and cells for ``accuracy``; ``forced`` overrides effects by name."""
+    """Choose effects, anchors, layers and cells.
+
+    Parameters
+    ----------
+    accuracy
+        relative rms error of the expected frames.
+    evidence
+        what the pilot measured.
+    shots
+        frames of the family, for the time that forming them takes.
+    facts
+        what to say of the devices.
+    switches
+        effects that the user switches on or off, by name.
+    """
     check_accuracy(accuracy)
-    forced = forced or {}
-    on = frozenset(name for name in PHYSICAL if forced.get(name, evidence.effect_error.get(name, 0.0) > accuracy))
-    anchors = _count(evidence.anchor_error, accuracy, forced.get("anchors"))
-    layers = _count(evidence.layer_error, accuracy, forced.get("layers"))
+    switches = switches or {}
+    on = frozenset(name for name in EFFECTS if switches.get(name, evidence.effect_error.get(name, 0.0) > accuracy))
+    anchors = _count(evidence.anchor_error, accuracy, switches.get("anchors"))
+    layers = _count(evidence.layer_error, accuracy, switches.get("layers"))
     cells = next(
         (choice for choice, error in evidence.cell_error.items() if error <= _RESIDUAL * accuracy),
         min(evidence.cell_error, key=lambda choice: evidence.cell_error[choice]),
@@ -115,33 +202,32 @@ def decide(
     )
     coarse = _coarse(evidence, settings, accuracy)
     settings = replace(settings, coarse_cells=coarse.cells, coarse_layers=coarse.layers)
-    left_out = {name: error for name, error in evidence.effect_error.items() if name not in on}
-    left = math.hypot(
-        evidence.anchor_error[anchors],
-        evidence.layer_error[layers],
-        evidence.cell_error[cells],
-        coarse.error,
-        evidence.unresolved,
-        *left_out.values(),
-    )
-    target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - left**2, (_FLOOR * accuracy) ** 2))
-    cost = _Cost(evidence, settings, captures, target)
-    settings = cost.settings
-    effects = (
-        _anchors(anchors, evidence, accuracy, cost),
-        _layers(layers, evidence, accuracy, cost),
-        _cells(cells, evidence),
-        *(_physical(name, name in on, evidence, facts, accuracy, cost, forced) for name in PHYSICAL),
+    parts = {
+        f"anchors ({anchors}x{anchors})": evidence.anchor_error[anchors],
+        f"layers ({layers})": evidence.layer_error[layers],
+        f"cells ({cells}x{cells})": evidence.cell_error[cells],
+        "coarse cells": coarse.error,
+        "light over sharp lobes": evidence.unresolved,
+        **{f"{name} (off)": error for name, error in evidence.effect_error.items() if name not in on},
+    }
+    systematic = math.hypot(*parts.values())
+    target = _SAMPLING_MARGIN * math.sqrt(max(accuracy**2 - systematic**2, (_FLOOR * accuracy) ** 2))
+    cost = _Cost(evidence, allocate_samples(evidence, settings, target), shots)
+    rows = (
+        _anchors(evidence, accuracy, cost),
+        _layers(evidence, accuracy, cost),
+        _cells(evidence, settings),
+        *(_row(effect, accuracy, cost, facts, name in switches) for name, effect in EFFECTS.items()),
         *_fixed(facts),
     )
     return Plan(
         accuracy=accuracy,
-        effects=effects,
+        effects=rows,
         predicted_seconds=cost.total,
-        settings=settings,
+        settings=cost.settings,
         sampling_target=target,
-        systematic_error=left,
-        warnings=facts.warnings + _warnings(accuracy, left, evidence, left_out, anchors, layers, cells),
+        systematic_error=systematic,
+        warnings=facts.warnings + _warnings(accuracy, systematic, parts, evidence.unresolved),
     )
 
 
@@ -157,8 +243,8 @@ class _Coarse:
 def _coarse(evidence: Evidence, settings: Settings, accuracy: float) -> _Coarse:
     """The coarsest choice that fits: its error counts only for the part of the light that is filed in it."""
     part = evidence.anchor_error[1] if settings.anchors > 1 else 0.0
-    # Indirect and ambient light is seen from the sensor's centre alone.
-    seen = sum(evidence.effect_error.get(name, 0.0) for name in settings.effects & {"interreflection", "ambient"})
+    from_centre = settings.effects & names(lambda effect: effect.from_centre)
+    seen = sum(evidence.effect_error.get(name, 0.0) for name in EFFECTS if name in from_centre)
     centre = min(seen, 1.0) * evidence.anchor_error[1] / (evidence.direct_part or 1.0)
     if "interreflection" in settings.effects:
         part = math.hypot(part, evidence.effect_error["interreflection"])
@@ -169,159 +255,137 @@ def _coarse(evidence: Evidence, settings: Settings, accuracy: float) -> _Coarse:
         for layers in ((False, True) if count > 1 else (False,))
     ]
     best = min(choices, key=lambda choice: choice.error)
-    chosen = next((one for one in choices if one.error <= _COARSE * accuracy), best)
+    chosen = next((choice for choice in choices if choice.error <= _COARSE * accuracy), best)
     return replace(chosen, error=math.hypot(centre, chosen.error))
 
 
+def allocate_samples(evidence: Evidence, settings: Settings, target: float) -> Settings:
+    """``settings`` with the samples that ``evidence`` predicts for a relative Monte Carlo error ``target``.
+
+    The fewest paths for a sum of variances; not the least time, for settings must not depend on the pace.
+    """
+    paths = evidence.anchored.paths * settings.anchors**2 * (settings.anchors > 1)
+    efforts: dict[str, Effort] = {"direct": evidence.direct, "anchored": replace(evidence.anchored, paths=paths)}
+    if settings.effects & names(lambda effect: effect.followed):
+        efforts |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera}
+    parts = {name: math.sqrt(effort.variance * effort.paths) for name, effort in efforts.items()}
+    single, whole = target * math.sqrt(GROUPS), sum(parts.values())
+    samples = {
+        f"{name}_samples": max(
+            _FEWEST_DIRECT if name == "direct" else 1.0,
+            effort.noise.samples_for(single * math.sqrt(parts[name] / whole)) if parts[name] else 0.0,
+        )
+        for name, effort in efforts.items()
+    }
+    return replace(settings, **samples)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
 class _Cost:
     """Seconds of a capture with some settings, by the paces that the pilot measured."""
 
-    def __init__(self, evidence: Evidence, settings: Settings, captures: int, target: float) -> None:
-        self.evidence, self.captures = evidence, captures
-        many = settings.anchors > 1
-        efforts = {
-            "direct": evidence.direct,
-            "anchored": replace(evidence.anchored, paths=evidence.anchored.paths * settings.anchors**2 * many),
-        }
-        if settings.effects & FOLLOWED:
-            efforts |= {"indirect": evidence.indirect, "other": evidence.other}
-        # The fewest paths for a sum of variances; not the least time, for settings must not depend on the pace.
-        parts = {name: math.sqrt(effort.variance * effort.paths) for name, effort in efforts.items()}
-        single, whole = target * math.sqrt(GROUPS), sum(parts.values())
-        samples = {
-            f"{name}_samples": max(
-                _FEWEST_DIRECT if name == "direct" else 1.0,
-                effort.noise.samples_for(single * math.sqrt(parts[name] / whole)) if parts[name] else 0.0,
-            )
-            for name, effort in efforts.items()
-        }
-        self.settings: Settings = replace(settings, **samples)  # type: ignore[arg-type]
+    evidence: Evidence
+    settings: Settings
+    shots: int
 
     @property
     def total(self) -> float:
-        waves = "diffraction" in self.settings.effects
-        return (
-            self.evidence.connecting(self.settings, self.settings.anchors)
-            + self.evidence.following(self.settings)
-            + self.forming(self.settings.anchors, len(self.settings.depths), waves)
-        )
+        connecting = self.evidence.connecting(self.settings, self.settings.anchors)
+        return connecting + self.evidence.following(self.settings) + self.forming()
 
-    def forming(self, anchors: int, layers: int, waves: bool) -> float:
-        """Half of a frame's time goes with its rows of cells; anchors add rows in coarse cells (measured)."""
+    def forming(self, anchors: int | None = None, layers: int | None = None, waves: bool | None = None) -> float:
+        """Seconds of forming all frames, with a change where one is given.
+
+        Half of a frame's time goes with its rows of cells; anchors add rows in coarse cells (measured).
+        """
+        anchors = anchors or self.settings.anchors
+        layers = layers or len(self.settings.depths)
+        waves = bool(self.settings.effects & names(lambda effect: effect.in_shadow)) if waves is None else waves
         coarse = (layers if self.settings.coarse_layers else 1) * self.settings.coarse_cells
         parts = (anchors if anchors > 1 else 0) + ("interreflection" in self.settings.effects)
         rows = (1 + layers * self.settings.subdivision) / 2 + parts * coarse / 4
         terms = 1.0 if waves else 1 / self.evidence.terms
-        return self.captures * self.evidence.seconds_per_frame * rows * terms
+        return self.shots * self.evidence.seconds_per_frame * rows * terms
+
+    def of(self, effect: Effect) -> float:
+        """Seconds that an effect takes which is on."""
+        if effect.followed:
+            return self.evidence.following(self.settings)
+        return self.forming(waves=True) - self.forming(waves=False) if effect.in_shadow else 0.0
 
 
-def _count(errors: Mapping[int, float], accuracy: float, forced: bool | None) -> int:
+def _count(errors: Mapping[int, float], accuracy: float, switch: bool | None) -> int:
     """One if that is good enough, else the fewest that leave a part of the accuracy (failing that, the most known)."""
-    if forced is False or (forced is None and errors[1] <= accuracy):
+    if switch is False or (switch is None and errors[1] <= accuracy):
         return 1
     several = [count for count in sorted(errors) if count > 1]
     return next((count for count in several if errors[count] <= _RESIDUAL * accuracy), several[-1] if several else 1)
 
 
-def _anchors(anchors: int, evidence: Evidence, accuracy: float, cost: _Cost) -> Effect:
-    errors = evidence.anchor_error
+def _anchors(evidence: Evidence, accuracy: float, cost: _Cost) -> PlanRow:
+    errors, anchors = evidence.anchor_error, cost.settings.anchors
     if anchors == 1:
         reason = f"falloff, gloss and parallax over the sensor: one anchor leaves {errors[1]:.1e}"
-        return Effect("anchors", "off", f"{reason} of {accuracy:g} allowed", errors[1], 0.0)
+        return PlanRow("anchors", "off", f"{reason} of {accuracy:g} allowed", errors[1], 0.0)
     reason = f"falloff, gloss and parallax: {anchors}x{anchors} anchors leave {errors[anchors]:.1e}"
-    waves, layers = "diffraction" in cost.settings.effects, len(cost.settings.depths)
     seconds = evidence.connecting(cost.settings, anchors) - evidence.connecting(cost.settings, 1)
-    seconds += cost.forming(anchors, layers, waves) - cost.forming(1, layers, waves)
-    return Effect("anchors", "approximate", reason, errors[1], seconds)
+    return PlanRow("anchors", "approximate", reason, errors[1], seconds + cost.forming() - cost.forming(anchors=1))
 
 
-def _layers(layers: int, evidence: Evidence, accuracy: float, cost: _Cost) -> Effect:
-    errors = evidence.layer_error
+def _layers(evidence: Evidence, accuracy: float, cost: _Cost) -> PlanRow:
+    errors, layers = evidence.layer_error, len(cost.settings.depths)
     if layers == 1:
         reason = (
             f"the light is seen at {evidence.depth:.1f} mm; one layer leaves {errors[1]:.1e} of {accuracy:g} allowed"
         )
-        return Effect("layers", "off", reason, errors[1], 0.0)
-    far, near = evidence.layers[layers][0], evidence.layers[layers][-1]
+        return PlanRow("layers", "off", reason, errors[1], 0.0)
+    far, near = cost.settings.depths[0], cost.settings.depths[-1]
     reason = f"the light is seen from {near:.0f} to {far:.0f} mm; {layers} layers leave {errors[layers]:.1e}"
-    seconds = cost.forming(cost.settings.anchors, layers, "diffraction" in cost.settings.effects)
-    return Effect("layers", "approximate", reason, errors[1], seconds * (1 - 1 / layers))
+    return PlanRow("layers", "approximate", reason, errors[1], cost.forming() * (1 - 1 / layers))
 
 
-def _cells(cells: int, evidence: Evidence) -> Effect:
+def _cells(evidence: Evidence, settings: Settings) -> PlanRow:
+    cells = settings.subdivision
     reason = f"{cells}x{cells} cells of even light a projector pixel leave {evidence.cell_error[cells]:.1e}"
-    return Effect("cells", "approximate", reason, max(evidence.cell_error.values()), 0.0)
+    return PlanRow("cells", "approximate", reason, max(evidence.cell_error.values()), 0.0)
 
 
-def _physical(
-    name: str,
-    on: bool,
-    evidence: Evidence,
-    facts: SceneFacts,
-    accuracy: float,
-    cost: _Cost,
-    forced: Mapping[str, bool],
-) -> Effect:
-    error = evidence.effect_error.get(name)
-    if error is None:
-        reason = facts.absent.get(name, "nothing in the scene calls for it")
-        return Effect(name, "exact" if on else "off", reason, 0.0, 0.0)
-    note = facts.notes.get(name, "")
-    reason = f"left out, the frames change by {error:.1e}; {accuracy:g} allowed"
-    if name in forced:
-        reason = f"by --effects; {reason}"
-    if note:
-        reason = f"{note}; {reason}"
+def _row(effect: Effect, accuracy: float, cost: _Cost, facts: SceneFacts, by_user: bool) -> PlanRow:
+    on = effect.name in cost.settings.effects
     state: State = "exact" if on else "off"
-    return Effect(name, state, reason, error, _seconds(name, cost) if on else 0.0)
+    error = cost.evidence.effect_error.get(effect.name)
+    if error is None:
+        return PlanRow(effect.name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
+    said = [facts.notes.get(effect.name, ""), "switched by the user" if by_user else ""]
+    said.append(f"left out, the frames change by {error:.1e}; {accuracy:g} allowed")
+    return PlanRow(effect.name, state, "; ".join(filter(None, said)), error, cost.of(effect) if on else 0.0)
 
 
-def _seconds(name: str, cost: _Cost) -> float:
-    anchors, layers = cost.settings.anchors, len(cost.settings.depths)
-    if name in FOLLOWED:
-        return cost.evidence.following(cost.settings)
-    if name == "diffraction":
-        return cost.forming(anchors, layers, True) - cost.forming(anchors, layers, False)
-    return 0.0
-
-
-def _fixed(facts: SceneFacts) -> tuple[Effect, ...]:
+def _fixed(facts: SceneFacts) -> tuple[PlanRow, ...]:
     keystone = (
         f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
         if facts.keystone
         else "the projector faces the aligned plane squarely"
     )
+    spectrum = "one panchromatic reflectance; wavelengths differ in the mask's shadow only"
+    noise = "Poisson, full well, read noise and quantisation of each frame"
     return (
-        Effect("keystone", "exact", keystone, None, 0.0),
-        Effect(
-            "spectrum", "off", "one panchromatic reflectance; wavelengths differ in the mask's shadow only", None, 0.0
-        ),
-        Effect("sensor-noise", "exact", "Poisson, full well, read noise and quantisation of each frame", None, 0.0),
+        PlanRow("keystone", "exact" if facts.keystone else "off", keystone, None, 0.0),
+        PlanRow("spectrum", "off", spectrum, None, 0.0),
+        PlanRow("sensor-noise", "exact", noise, None, 0.0),
     )
 
 
-def _warnings(
-    accuracy: float,
-    left: float,
-    evidence: Evidence,
-    left_out: Mapping[str, float],
-    anchors: int,
-    layers: int,
-    cells: int,
-) -> tuple[str, ...]:
-    if left <= _FLAGGED * accuracy:
+def _warnings(accuracy: float, systematic: float, parts: Mapping[str, float], unresolved: float) -> tuple[str, ...]:
+    if systematic <= _FLAGGED * accuracy:
         return ()
-    if evidence.unresolved > accuracy:
+    if unresolved > accuracy:
         return (
-            f"{evidence.unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
+            f"{unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
             "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)",
         )
-    parts = {
-        f"{anchors}x{anchors} anchors": evidence.anchor_error[anchors],
-        f"{layers} layer{'s' if layers > 1 else ''}": evidence.layer_error[layers],
-        "cells": evidence.cell_error[cells],
-        **{f"no {name}": error for name, error in left_out.items()},
-    }
-    worst = sorted(parts, key=lambda name: -parts[name])[:2]
-    said = " and ".join(f"{name} ({parts[name]:.1e})" for name in worst)
-    return (f"what is left out or made coarse adds up to {left:.1e}, above the accuracy {accuracy:g}: mostly {said}",)
+    largest = max(parts, key=lambda name: parts[name])
+    return (
+        f"predicted systematic error {systematic:.1e} exceeds the requested {accuracy:g}; "
+        f"largest: {largest}, {parts[largest]:.1e}",
+    )

@@ -1,4 +1,4 @@
-"""`mitsim render`: one expected frame of a scene under its own light, by the reference or the factored estimator."""
+"""One expected frame of a scene under its own light: a bench in, irradiance and its error out, by either estimator."""
 
 from __future__ import annotations
 
@@ -8,51 +8,52 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
-from mitsim.capture.light import collect, make_plan, uniform_light
-from mitsim.core.arrays import FloatArray, Progress, silent
-from mitsim.core.environment import load_variant
-from mitsim.core.errors import MitsimError
+from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
-from mitsim.core.manifest import versions
-from mitsim.core.output import prepare_output
-from mitsim.core.resources import Cost, Limits
+from mitsim.core.job import Job
+from mitsim.core.resources import Cost
 from mitsim.core.seeds import integer
-from mitsim.scene.load import LoadedScene, load_scene
-from mitsim.transport import plugins
+from mitsim.core.versions import versions
+from mitsim.rig.patterns import Lighting
+
+if TYPE_CHECKING:
+    from mitsim.scene.load import LoadedScene
 
 ESTIMATORS = ("reference", "factored")
 _SAMPLES_A_PASS = 64
+"""Samples a pixel of one pass: 2^24 paths of a 512 x 512 sensor, which fit in memory."""
 _FEWEST_PASSES = 4
+"""Passes are compared to tell the noise; four tell it to 40 %."""
 _MOST_SAMPLES = 2**20
-
-
-@dataclass(frozen=True)
-class RenderResult:
-    """What `mitsim render` reports: mean irradiance [W m^-2], relative Monte Carlo error of the frame, wall time."""
-
-    estimator: str
-    spp: int | None
-    mean: float
-    mc_error: float
-    seconds: float
-    variant: str
-    seed: int
-    output: str
-    warnings: tuple[str, ...] = ()
+"""An error of a thousandth of one sample's: an hour a pixel row, beyond use."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Frame (pixels, pixels, channels) by the reference, and the standard error of each value."""
+    """One frame of irradiance [W m^-2].
+
+    Attributes
+    ----------
+    mean, error
+        (pixels, pixels, channels) irradiance, and its standard error.
+    facts
+        estimator, spp (None: factored), seconds, variant and seed.
+    warnings
+        why the frame is flagged.
+    """
 
     mean: FloatArray
     error: FloatArray
+    facts: Mapping[str, Any]
+    warnings: tuple[str, ...] = ()
 
     @property
     def mc_error(self) -> float:
@@ -61,27 +62,61 @@ class Rendered:
         energy = float(np.square(self.mean).sum()) - noise
         return math.sqrt(noise / energy) if energy > 0 else math.inf
 
+    def summary(self) -> dict[str, Any]:
+        """What the command line reports, but for the file's name."""
+        return {**self.facts, "mean": float(self.mean.mean()), "mc_error": self.mc_error, "warnings": self.warnings}
 
-def reference(
-    loaded: LoadedScene, spp: int, seed: int, progress: Progress = silent, limits: Limits | None = None
-) -> Rendered:
+    def save(self, path: Path | str) -> Path:
+        """Write the frame and its error to the OpenEXR file ``path``, which is replaced; returns it.
+
+        MitsimError when it cannot be written.
+        """
+        names = ("Y",) if self.mean.shape[2] == 1 else ("R", "G", "B")
+        channels = {name: self.mean[..., i].astype(np.float32) for i, name in enumerate(names)}
+        channels |= {f"error.{name}": self.error[..., i].astype(np.float32) for i, name in enumerate(names)}
+        facts = {key: self.facts[key] for key in ("estimator", "seed", "variant")}
+        write_frame(path, channels, {"unit": "W/m^2", **facts, **versions()})
+        return Path(path)
+
+    def _repr_html_(self) -> str:
+        from mitsim.core.pictures import card, scaled
+
+        fact = f"mean {self.mean.mean():.3e} W/m^2, relative noise {self.mc_error:.1e}"
+        return card(f"Rendered, {self.facts['estimator']}", {"irradiance": scaled(self.mean.mean(axis=2))}, (fact,))
+
+
+def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) -> tuple[FloatArray, FloatArray]:
     """Render with the scene's own integrator in independent passes, summed in float64.
+
+    Parameters
+    ----------
+    loaded
+        the scene.
+    spp
+        samples a pixel, at least 4: passes are compared to tell the noise.
+    seed
+        root of the passes' streams.
+    job
+        progress, and limits that the first pass is held against.
+
+    Returns
+    -------
+    (pixels, pixels, channels) irradiance [W m^-2] and its standard error.
 
     Raises
     ------
     MitsimError
-        for fewer than 4 samples a pixel: passes are compared to tell the noise; or when the first pass shows that all
-        of them would take longer than ``limits`` allow.
+        for too few or too many samples, an integrator that cannot render this sensor, or work beyond the job's limits.
     """
     import mitsuba as mi
 
     if not _FEWEST_PASSES <= spp <= _MOST_SAMPLES:
-        raise MitsimError(f"--spp {spp}: give at least {_FEWEST_PASSES} samples a pixel, at most {_MOST_SAMPLES}")
-    limits = limits or Limits()
+        raise ArgumentError("spp", f"{spp}: give at least {_FEWEST_PASSES} samples a pixel, at most {_MOST_SAMPLES}")
+    job = job or Job()
     passes = max(_FEWEST_PASSES, math.ceil(spp / _SAMPLES_A_PASS))
     each = math.ceil(spp / passes)
-    total: Any = 0.0
-    squares: Any = 0.0
+    total: FloatArray | float = 0.0
+    squares: FloatArray | float = 0.0
     started = time.perf_counter()
     for index in range(passes):
         child = integer(seed, "reference", index)
@@ -93,17 +128,17 @@ def reference(
                 "use path, direct or volpath"
             ) from None
         total, squares = total + image, squares + image**2
-        progress("reference", (index + 1) / passes)
+        job.progress("reference", (index + 1) / passes)
         if index == 0:
-            Cost(seconds=(time.perf_counter() - started) * passes).check(f"--spp {spp}", limits)
-    mean = total / passes
-    variance = np.maximum(squares / passes - mean**2, 0) / (passes - 1)
-    return Rendered(mean.reshape(*mean.shape[:2], -1), np.sqrt(variance).reshape(*mean.shape[:2], -1))
+            Cost(seconds=(time.perf_counter() - started) * passes).check(f"{spp} samples a pixel", job.limits)
+    mean = np.asarray(total) / passes
+    variance = np.maximum(np.asarray(squares) / passes - mean**2, 0) / (passes - 1)
+    return mean.reshape(*mean.shape[:2], -1), np.sqrt(variance).reshape(*mean.shape[:2], -1)
 
 
 @contextmanager
 def projected(bench: Bench, pattern: FloatArray) -> Iterator[None]:
-    """Show a pattern (n, n) of 0..1 on the scene's projector while the context lasts, for the reference estimator."""
+    """Show a ``pattern`` (n, n) of 0..1 on the ``bench``'s projector while the context lasts, for the reference."""
     import mitsuba as mi
 
     parameters = mi.traverse(bench.loaded.projector)
@@ -123,74 +158,52 @@ def projected(bench: Bench, pattern: FloatArray) -> Iterator[None]:
 
 
 def render(
-    scene: Path,
-    output: Path,
-    estimator: str = "reference",
-    spp: int = 64,
-    accuracy: float = 1e-3,
-    seed: int = 0,
-    variant: str = "llvm_ad_mono",
-    defines: Mapping[str, str] | None = None,
-    progress: Progress = silent,
+    bench: Bench,
+    estimator: str,
+    spp: int,
+    accuracy: float,
+    seed: int,
     effects: Mapping[str, bool] | None = None,
-    limits: Limits | None = None,
-    outside: bool = False,
-) -> RenderResult:
-    """Write one frame of irradiance [W m^-2] and its standard error to ``output``.
+    job: Job | None = None,
+) -> Rendered:
+    """One frame of a bench under its own light; see :meth:`mitsim.capture.bench.Bench.render`.
 
-    The reference works on any scene with a ``mitsim_lensless`` sensor and any integrator; the factored estimator needs
-    a projector too. ``outside`` allows files of the scene outside its folder.
+    Parameters
+    ----------
+    bench
+        what is rendered; the reference works on any scene with a ``mitsim_lensless`` sensor and any integrator, the
+        factored estimator needs a projector too.
+    estimator, spp, accuracy, seed, effects, job
+        as there.
 
     Raises
     ------
     MitsimError
-        for an unknown estimator, a scene that does not load, an output that cannot be written, or a frame that would
-        take more memory or time than ``limits`` allow.
+        as there.
     """
+    job = job or Job()
     if estimator not in ESTIMATORS:
-        raise MitsimError(f"--estimator {estimator!r}: use {' or '.join(ESTIMATORS)}")
-    path = prepare_output(output, overwrite=True, kind="file")
+        raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
     warnings: tuple[str, ...] = ()
+    started = time.perf_counter()
     if estimator == "reference":
-        mi = load_variant(variant)
-        mi.set_log_level(mi.LogLevel.Error)
-        plugins.register()
-        loaded = load_scene(scene, defines, needs_projector=False, outside=outside)
-        started = time.perf_counter()
-        frame = reference(loaded, spp, seed, progress, limits)
+        mean, error = reference(bench.loaded, spp, seed, job)
     else:
-        bench = open_bench(scene, variant, defines=defines, check_camera=False, outside=outside)
-        started = time.perf_counter()
-        uniform = uniform_light(bench.n)
-        plan = make_plan(bench, *uniform, accuracy, seed, effects)
-        frames_cost(bench, plan.settings, 1, 1, plan.predicted_seconds).check(str(scene), limits or Limits(), path)
-        light = collect(bench, plan, *uniform, seed, progress, by_pixel=False)
+        uniform = Lighting.uniform(bench.n)
+        plan = make_plan(bench, uniform, accuracy, seed, effects)
+        frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
+        light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
         warnings = plan.warnings
-        found = next(iter(light.frames(*uniform, seed)))
-        irradiance = found.irradiance[..., None]
-        frame = Rendered(irradiance, np.full_like(irradiance, math.sqrt(found.variance)))
-    seconds = time.perf_counter() - started
-    if not frame.mean.any():
+        frame = next(iter(light.frames(uniform, seed)))
+        mean = frame.irradiance[..., None]
+        error = np.full_like(mean, math.sqrt(frame.variance))
+    if not mean.any():
         warnings += ("the frame is wholly dark; check the scene's light, the mask and the field stop",)
-    names = ("Y",) if frame.mean.shape[2] == 1 else ("R", "G", "B")
-    channels = {name: frame.mean[..., i].astype(np.float32) for i, name in enumerate(names)}
-    channels |= {f"error.{name}": frame.error[..., i].astype(np.float32) for i, name in enumerate(names)}
-    metadata: dict[str, str | int | float] = {
-        "unit": "W/m^2",
+    facts = {
         "estimator": estimator,
+        "spp": spp if estimator == "reference" else None,
+        "seconds": time.perf_counter() - started,
+        "variant": bench.variant,
         "seed": seed,
-        "variant": variant,
-        **versions(),
     }
-    write_frame(path, channels, metadata)
-    return RenderResult(
-        estimator=estimator,
-        spp=spp if estimator == "reference" else None,
-        mean=float(frame.mean.mean()),
-        mc_error=frame.mc_error,
-        seconds=seconds,
-        variant=variant,
-        seed=seed,
-        output=str(path),
-        warnings=warnings,
-    )
+    return Rendered(mean, error, facts, warnings)

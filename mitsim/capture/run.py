@@ -1,12 +1,11 @@
-"""`mitsim capture`: from a bench and a pattern family to a folder of frames with everything needed to use them."""
+"""A capture: from a bench and a request to one noisy frame for each shot, in memory or in a folder as they are made."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from itertools import islice
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +14,22 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
-from mitsim.capture.folder import RunFolder, claimed, frame_name
-from mitsim.capture.light import Light, collect, make_plan, speckle_of, uniform_light
+from mitsim.capture.exposer import Exposer, NoiseTarget, in_chunks
+from mitsim.capture.light import Light, Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan
-from mitsim.core.arrays import FloatArray, Progress, silent
-from mitsim.core.clock import Clock
-from mitsim.core.errors import MitsimError
+from mitsim.capture.request import Request
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import ArgumentError
 from mitsim.core.framefile import Channel
-from mitsim.core.manifest import DECIDING, versions
+from mitsim.core.job import Job
+from mitsim.core.manifests import Digital as DigitalScale
+from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.core.resources import Limits
+from mitsim.core.runs import Capture, RunFolder, RunMemory, claimed, frame_name
+from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.rig.patterns import Capture, PatternFamily
+from mitsim.rig.patterns import Capture as Shot
+from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import Digital
 
@@ -38,138 +40,129 @@ Normal noise gives 0.8 once in 600 runs if it is the same in all pixels of all f
 """
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
-_OF_PROJECTOR = frozenset({"aperture", "blur", "pixel-response"})
 
 
-@dataclass(frozen=True)
-class CaptureResult:
-    """What `mitsim capture` reports; ``warnings`` make the run count as flagged.
+def plan_request(bench: Bench, request: Request) -> Plan:
+    """The plan of a capture, with the ``request`` that it is for and what it takes on this ``bench``.
 
-    ``heaviest_group`` is the largest part of the frames' Monte Carlo variance that one group of the light brings.
+    MitsimError when the request does not fit the bench, or no light of the projector reaches the camera.
     """
+    lighting = bench.family(request.patterns, request.seed).lighting
+    plan = make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
+    cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds)
+    return replace(plan, request=request, cost=cost)
 
-    frames: int
-    shape: tuple[int, int]
-    seconds: dict[str, float]
-    mc_error: float
-    variant: str
-    seed: int
-    output: str
-    exposure_s: float
-    mc_to_sensor_noise: float
-    sensor_noise: float
-    heaviest_group: float
-    plan: Plan
-    warnings: tuple[str, ...] = field(default=())
+
+def trace_request(bench: Bench, plan: Plan, job: Job | None = None) -> Light:
+    """Light of a ``bench`` by projector pixel, as a ``plan`` of it asks; MitsimError beyond the limits of ``job``."""
+    job, request = job or Job(), _request(plan)
+    if plan.cost:
+        plan.cost.check(request.patterns, job.limits)
+    lighting = bench.family(request.patterns, request.seed).lighting
+    with job.clock.stage("transport"):
+        return trace_light(bench, plan, lighting, request.seed, progress=job.progress)
+
+
+def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
+    """The request of a ``plan`` or a family's name, with ``changes`` by field.
+
+    MitsimError for a value that a field cannot have, or a change that would need another plan.
+    """
+    if isinstance(plan, str):
+        return Request.of(patterns=plan, **changes)
+    request = _request(plan).changed(**changes)
+    for name in ("patterns", "accuracy", "effects"):
+        if getattr(request, name) != getattr(_request(plan), name):
+            raise ArgumentError(
+                name, f"{changes[name]!r}: the plan was made for {getattr(plan.request, name)!r}; plan anew"
+            )
+    return request
+
+
+def _request(plan: Plan) -> Request:
+    if plan.request is None:
+        raise ArgumentError("plan", "was decided without a request; make it by bench.plan")
+    return plan.request
 
 
 @single_threaded_blas()
 def capture(
     bench: Bench,
-    patterns: str,
-    output: Path | str,
-    accuracy: float = 1e-3,
-    seed: int = 0,
-    exposure: Exposure | None = None,
+    request: Request,
+    job: Job | None = None,
+    output: Path | str | None = None,
     resume: bool = False,
-    progress: Progress = silent,
-    effects: Mapping[str, bool] | None = None,
-    noise_fraction: float | None = None,
-    limits: Limits | None = None,
-) -> CaptureResult:
-    """Render, expose and write every frame of a pattern family.
+    plan: Plan | None = None,
+    light: Light | None = None,
+) -> Capture:
+    """Render and expose every shot of a pattern family; see :meth:`mitsim.capture.bench.Bench.capture`.
 
-    Nothing is written before all input has been checked. ``resume`` keeps the frames of an interrupted run of the same
-    configuration and adds the missing ones, bit-equal to an uninterrupted run.
+    Nothing is written before all input has been checked.
+
+    Parameters
+    ----------
+    bench, request, job, output, resume
+        as there.
+    plan
+        made already.
+    light
+        traced already, by pixel or for this family.
 
     Raises
     ------
     MitsimError
-        for patterns that do not fit, an output that cannot be written or holds something else, or a run that would
-        take more memory, disk or time than ``limits`` allow.
+        as there.
     """
-    limits = limits or Limits()
-    exposure = exposure or Exposure()
-    exposure.check(bench)
-    if noise_fraction is not None and not 0 < noise_fraction <= 1:
-        raise MitsimError(f"--noise-fraction {noise_fraction}: give a part of the sensor's noise above 0, up to 1")
-    family = bench.family(patterns, seed)
-    labels, weights = family.classes()
-    size = weights.shape[1], len(weights)
-    there = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if resume else 0
-    first_look = frames_cost(bench, Settings(bench.geometry.scene_distance), *size, on_disk=there)
-    first_look.check(patterns, limits, Path(output))
-    configuration = {
-        **bench.provenance(),
-        **bench.identity(),
-        "patterns": patterns,
-        "accuracy": accuracy,
-        "seed": seed,
-        "exposure": asdict(exposure),
-        "effects": dict(effects or {}),
-        "noise_fraction": noise_fraction,
-        "versions": {name: version for name, version in versions().items() if name in DECIDING},
-    }
-    digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
-    clock = Clock()
-    with claimed(Path(output), digest, configuration, resume) as folder:
-        with clock.stage("plan"):
-            plan = make_plan(bench, labels, weights, accuracy, seed, effects)
-        cost = frames_cost(bench, plan.settings, *size, plan.predicted_seconds, there)
-        cost.check(patterns, limits, folder.path)
-        target = NoiseTarget(bench, exposure, noise_fraction, seed) if noise_fraction is not None else None
-        with clock.stage("transport"):
-            light = collect(bench, plan, labels, weights, seed, progress, by_pixel=False, target=target)
-        with clock.stage("truth"):
-            reflectance = truth(bench, plan, light, seed)
-        expected = light.frames(labels, weights, seed)
-        with clock.stage("optics"):
+    job = job or Job()
+    request.timing.check(bench)
+    family = bench.family(request.patterns, request.seed)
+    lighting = family.lighting
+    on_disk = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if output and resume else 0
+    place = Path(output) if output else None
+    first_look = frames_cost(bench, Settings(bench.geometry.scene_distance), lighting, on_disk=on_disk)
+    first_look.check(request.patterns, job.limits, place)
+    head = RunHead.of(_configuration(bench, request))
+    with _recorder(place, head, resume) as recorder:
+        if light is None:
+            with job.clock.stage("plan"):
+                plan = plan or make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
+            cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, on_disk)
+            cost.check(request.patterns, job.limits, place)
+        with job.clock.stage("transport"):
+            light = light or trace_light(bench, plan, lighting, request.seed, _sampling(bench, request), job.progress)
+        with job.clock.stage("truth"):
+            truth = light.truth
+        expected = light.frames(lighting, request.seed)
+        with job.clock.stage("optics"):
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
             totals = _Totals.of(expected)
-        exposer = Exposer(bench, exposure.choose(bench, totals.peak), seed, speckle_of(bench, plan))
-        folder.begin()
-        folder.write_truth(reflectance, load_recipe().board_reflectance)
-        writer = _Writer(family, folder, exposer)
-        writer.write_all(expected, clock, progress)
-        result = CaptureResult(
-            frames=len(family.captures),
-            shape=(bench.geometry.pixels, bench.geometry.pixels),
-            seconds=clock.seconds(),
-            mc_error=totals.mc_error,
-            variant=bench.variant,
-            seed=seed,
-            output=str(folder.path),
-            exposure_s=exposer.exposure_s,
-            mc_to_sensor_noise=writer.noise_ratio,
-            sensor_noise=writer.sensor_noise,
-            heaviest_group=totals.heaviest,
-            plan=plan,
-            warnings=plan.warnings + _warnings(accuracy, light, totals, writer),
-        )
-        folder.finish(_manifest(bench, family, result, light.paths))
-    return result
+        exposure_s = request.timing.choose(bench, totals.peak)
+        exposer = Exposer(bench, exposure_s, request.seed, light.simulation.physics.speckle)
+        recorder.begin()
+        recorder.write_truth(truth, load_recipe().board_reflectance)
+        shooting = _Shooting(family, recorder, exposer)
+        shooting.shoot(expected, job)
+        return recorder.finish(_manifest(head, bench, family, light, totals, shooting, job))
 
 
-@dataclass(frozen=True)
-class NoiseTarget:
-    """Monte Carlo error at which more sampling buys nothing: a part of the sensor's own relative noise."""
+def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
+    """All that decides the frames."""
+    deciding = {name: version for name, version in versions().items() if name in DECIDING}
+    return {**bench.provenance(), **bench.identity(), **request.model_dump(mode="json"), "versions": deciding}
 
-    bench: Bench
-    exposure: Exposure
-    fraction: float
-    seed: int
 
-    def __call__(self, expected: ExpectedFrames) -> float:
-        peak = max(float(frame.irradiance.max()) for frame in expected)
-        if peak <= 0:
-            return np.inf
-        exposer = Exposer(self.bench, self.exposure.choose(self.bench, peak), self.seed)
-        noise = energy = 0.0
-        for frame in expected:
-            electrons = exposer.electrons(frame)
-            noise += exposer.sensor_noise(electrons) ** 2 * electrons.size
-            energy += float(np.square(electrons).sum())
-        return self.fraction * float(np.sqrt(noise / energy))
+@contextmanager
+def _recorder(output: Path | None, head: RunHead, resume: bool) -> Iterator[RunFolder | RunMemory]:
+    if output is None:
+        yield RunMemory()
+        return
+    with claimed(output, head, resume) as folder:
+        yield folder
+
+
+def _sampling(bench: Bench, request: Request) -> Sampling:
+    fraction = request.noise_fraction
+    return Sampling(by_pixel=False, target=NoiseTarget(bench, request.timing, fraction) if fraction else None)
 
 
 @dataclass(frozen=True)
@@ -197,164 +190,129 @@ class _Totals:
         return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0)
 
 
-def _warnings(accuracy: float, light: Light, totals: _Totals, writer: _Writer) -> tuple[str, ...]:
-    found = []
-    if not light.reached:
-        found.append(f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached")
-    if totals.removed > accuracy:
-        found.append(f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for more")
-    if totals.heaviest > _FIREFLIES and totals.mc_error > _NEGLIGIBLE * accuracy:
-        found.append(
-            f"one of {GROUPS} groups of the light brings {totals.heaviest:.1%} of the Monte Carlo variance: a few "
-            "heavy paths (fireflies) make it, so mc_error may be far off; frames keep them unclipped, try another seed"
-        )
-    if writer.saturated:
-        found.append(f"{writer.saturated} frames have pixels at the full well or the ADC's end; shorten the exposure")
-    return tuple(found)
-
-
 @dataclass(frozen=True, eq=False)
 class _Exposed:
-    """One captured frame: expected electrons, digital numbers, and the two noises [electrons, rms]."""
+    """One exposed shot: expected electrons, digital numbers, and the two noises [electrons, rms]."""
 
     index: int
-    shown: Capture
+    shot: Shot
     electrons: FloatArray
     digital: Digital
     rendering_noise: float
     sensor_noise: float
 
 
-class _Writer:
-    """Turns expected frames into noisy ones and writes them; frames already there from the same run are kept."""
+class _Shooting:
+    """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept."""
 
-    def __init__(self, family: PatternFamily, folder: RunFolder, exposer: Exposer) -> None:
-        self.family, self.folder, self.exposer = family, folder, exposer
+    def __init__(self, family: PatternFamily, recorder: RunFolder | RunMemory, exposer: Exposer) -> None:
+        self.family, self.recorder, self.exposer = family, recorder, exposer
         self.saturated, self.noise_ratio = 0, 0.0
         self._noise_energy = self._energy = 0.0
 
     @property
     def sensor_noise(self) -> float:
         """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, from its closed form."""
-        return float(np.sqrt(self._noise_energy / self._energy)) if self._energy else 0.0
+        return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
 
-    def write_all(self, expected: ExpectedFrames, clock: Clock, progress: Progress) -> None:
-        """Expose and write in chunks, one thread a processor; stages are timed on the wall clock."""
-        numbered = enumerate(zip(self.family.captures, expected, strict=True))
+    def shoot(self, expected: ExpectedFrames, job: Job) -> None:
+        """Expose and record in chunks, one thread a processor; stages are timed on the wall clock."""
+        chunks = in_chunks(enumerate(zip(self.family.captures, expected, strict=True)))
         while True:
-            with clock.stage("optics"):
-                chunk = list(islice(numbered, FRAMES_AT_ONCE))
-            if not chunk:
+            with job.clock.stage("optics"):
+                chunk = next(chunks, None)
+            if chunk is None:
                 return
-            with clock.stage("sensor"):
+            with job.clock.stage("sensor"):
                 exposed = in_threads(self._expose, chunk)
-            with clock.stage("write"):
-                in_threads(self._write, exposed)
-            for frame in exposed:
-                if frame.rendering_noise:
-                    ratio = frame.rendering_noise / frame.sensor_noise if frame.sensor_noise else np.inf
+            with job.clock.stage("write"):
+                in_threads(self._record, exposed)
+            for shot in exposed:
+                if shot.rendering_noise:
+                    ratio = shot.rendering_noise / shot.sensor_noise if shot.sensor_noise else np.inf
                     self.noise_ratio = max(self.noise_ratio, ratio)
-                self.saturated += self.exposer.saturated(frame.digital, frame.electrons)
-                self._noise_energy += frame.sensor_noise**2 * frame.electrons.size
-                self._energy += float(np.square(frame.electrons).sum())
-            progress("frames", (chunk[-1][0] + 1) / len(expected))
+                self.saturated += self.exposer.saturated(shot.digital, shot.electrons)
+                self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
+                self._energy += float(np.square(shot.electrons).sum())
+            job.progress("frames", (chunk[-1][0] + 1) / len(expected))
 
-    def _expose(self, item: tuple[int, tuple[Capture, Frame]]) -> _Exposed:
-        index, (shown, frame) = item
-        electrons = self.exposer.lit(frame, *shown.names)
+    def _expose(self, item: tuple[int, tuple[Shot, Frame]]) -> _Exposed:
+        index, (shot, frame) = item
+        electrons = self.exposer.lit(frame, *shot.names)
         return _Exposed(
             index=index,
-            shown=shown,
+            shot=shot,
             electrons=electrons,
-            digital=self.exposer.digital(electrons, *shown.names),
+            digital=self.exposer.digital(electrons, *shot.names),
             rendering_noise=self.exposer.rendering_noise(frame),
             sensor_noise=self.exposer.sensor_noise(electrons),
         )
 
-    def _write(self, frame: _Exposed) -> None:
-        if self.folder.keeps(frame.index):
+    def _record(self, exposed: _Exposed) -> None:
+        if self.recorder.keeps(exposed.index):
             return
         metadata: dict[str, str | int | float] = {
-            "row": frame.shown.row,
-            "column": frame.shown.column,
-            "sign": frame.shown.sign,
+            "row": exposed.shot.row,
+            "column": exposed.shot.column,
+            "sign": exposed.shot.sign,
             "exposure_s": self.exposer.exposure_s,
-            "rendering_noise_e": frame.rendering_noise,
+            "rendering_noise_e": exposed.rendering_noise,
             "seed": self.exposer.seed,
         }
-        electrons = frame.electrons.astype(np.float32)
+        electrons = exposed.electrons.astype(np.float32)
         # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
-        whole = frame.digital.dtype == np.uint32
-        dn: Channel = frame.digital.astype(np.uint32) if whole else frame.digital.astype(np.float32)
-        self.folder.write_frame(frame.index, {"DN": dn, "electrons": electrons}, metadata)
+        whole = exposed.digital.dtype == np.uint32
+        dn: Channel = exposed.digital.astype(np.uint32) if whole else exposed.digital.astype(np.float32)
+        self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)
 
 
-def truth(bench: Bench, plan: Plan, light: Light, seed: int) -> FloatArray:
-    """(n, n) apparent reflectance: each projector pixel's flux toward the camera over that of the calibration board.
-
-    The board is the session's, so a board of reflectance 0.99 counts as 1 (DESIGN section 5).
-    """
-    reference = board_flux(bench, plan, seed)
-    ratio = np.divide(light.flux, reference, out=np.zeros_like(reference), where=reference > 0)
-    return ratio.reshape(bench.n, bench.n)
-
-
-def board_flux(bench: Bench, plan: Plan, seed: int) -> FloatArray:
-    """(n^2,) direct light of each projector pixel on the sensor, over the calibration board [W m^-2]."""
-    settings = Settings(
-        bench.geometry.scene_distance,
-        plan.settings.anchors,
-        effects=_OF_PROJECTOR & plan.settings.effects,
-        direct_samples=plan.settings.direct_samples,
+def _manifest(
+    head: RunHead,
+    bench: Bench,
+    family: PatternFamily,
+    light: Light,
+    totals: _Totals,
+    shooting: _Shooting,
+    job: Job,
+) -> RunManifest:
+    return RunManifest(
+        configuration=head.configuration,
+        configuration_sha256=head.configuration_sha256,
+        camera=bench.identity(),
+        digital=digital_scale(bench, shooting.exposer.exposure_s),
+        patterns=Patterns.of(family, [frame_name(index) for index in range(len(family.captures))]),
+        plan=light.plan.block(),
+        mc_error=totals.mc_error,
+        mc_to_sensor_noise=shooting.noise_ratio,
+        sensor_noise=shooting.sensor_noise,
+        heaviest_group=totals.heaviest,
+        paths=light.paths,
+        seconds=job.clock.seconds(),
+        warnings=light.plan.warnings + tuple(_warnings(light, totals, shooting)),
+        versions=versions(),
     )
-    board = bench.with_board(load_recipe().board_reflectance)
-    return collect(
-        board, replace(plan, settings=settings), *uniform_light(bench.n), seed, purpose="board", by_pixel=False
-    ).flux
 
 
-def pattern_block(family: PatternFamily, files: Sequence[str]) -> dict[str, Any]:
-    """What a solver must know of the patterns, as it stands in a manifest."""
-    return {
-        "family": family.name,
-        "n": family.n,
-        "P_L": family.left.tolist(),
-        "P_R": family.right.tolist(),
-        "captures": [
-            {"file": file, "row": c.row, "column": c.column, "sign": c.sign}
-            for file, c in zip(files, family.captures, strict=True)
-        ],
-    }
+def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
+    """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
+    return DigitalScale(
+        exposure_s=exposure_s,
+        black_level_dn=bench.sensor.superpixel_black_level_dn,
+        gain_dn_per_e=bench.sensor.gain_dn_per_e,
+        dark_current_e_per_s=bench.sensor.superpixel_dark_current_e_per_s,
+    )
 
 
-def plan_block(plan: Plan) -> dict[str, Any]:
-    """A plan as JSON."""
-    settings = {**asdict(plan.settings), "effects": sorted(plan.settings.effects)}
-    return {**asdict(plan), "settings": settings}
-
-
-def digital_block(bench: Bench, exposure_s: float) -> dict[str, float]:
-    """How digital numbers become electrons a second: (DN - black_level_dn) / gain / exposure - dark."""
-    return {
-        "exposure_s": exposure_s,
-        "black_level_dn": bench.sensor.superpixel_black_level_dn,
-        "gain_dn_per_e": bench.sensor.gain_dn_per_e,
-        "dark_current_e_per_s": bench.sensor.superpixel_dark_current_e_per_s,
-    }
-
-
-def _manifest(bench: Bench, family: PatternFamily, result: CaptureResult, paths: int) -> dict[str, Any]:
-    """What a solver and a reader of the run need, beside what the folder adds itself."""
-    return {
-        "camera": bench.identity(),
-        "digital": digital_block(bench, result.exposure_s),
-        "patterns": pattern_block(family, [frame_name(index) for index in range(result.frames)]),
-        "plan": plan_block(result.plan),
-        "mc_error": result.mc_error,
-        "mc_to_sensor_noise": result.mc_to_sensor_noise,
-        "heaviest_group": result.heaviest_group,
-        "paths": paths,
-        "seconds": result.seconds,
-        "warnings": result.warnings,
-        "versions": versions(),
-    }
+def _warnings(light: Light, totals: _Totals, shooting: _Shooting) -> Iterator[str]:
+    accuracy = light.plan.accuracy
+    if not light.reached:
+        yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
+    if totals.removed > accuracy:
+        yield f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for more"
+    if totals.heaviest > _FIREFLIES and totals.mc_error > _NEGLIGIBLE * accuracy:
+        yield (
+            f"one of {GROUPS} groups of the light brings {totals.heaviest:.1%} of the Monte Carlo variance: a few "
+            "heavy paths (fireflies) make it, so mc_error may be far off; frames keep them unclipped, try another seed"
+        )
+    if shooting.saturated:
+        yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"

@@ -14,16 +14,17 @@ import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
-from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
-from mitsim.capture.light import Light, collect, make_plan, speckle_of, uniform_light
+from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
+from mitsim.capture.light import Light, collect, make_plan, speckle_of
 from mitsim.capture.plan import Plan
+from mitsim.capture.request import Exposure
 from mitsim.core.arrays import FloatArray, Labels, Progress
-from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
+from mitsim.core.job import Clock
 from mitsim.core.parallel import in_threads
 from mitsim.core.resources import Limits
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.rig.patterns import hadamard_matrix
+from mitsim.rig.patterns import Lighting, hadamard_matrix
 from mitsim.rig.recipe import SessionRecipe
 
 SIDES = ("horizontal", "vertical")
@@ -68,7 +69,7 @@ class Session:
         with clock.stage("transport"):
             self.light: Light = collect(self.board, self.plan, *lines, seed, progress, "calibration").merged()
         with clock.stage("optics"):
-            self.white = next(iter(self.light.frames(*uniform_light(n), seed)))
+            self.white = next(iter(self.light.frames(Lighting.uniform(n), seed)))
             peak = float(self.white.irradiance.max())
             self.exposure_s = Exposure(None, recipe.exposure_fraction).choose(bench, peak)
 

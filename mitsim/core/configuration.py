@@ -1,9 +1,11 @@
 """Configuration files: a TOML path in, a checked pydantic model out; where the shipped ones lie."""
 
+import difflib
+import os
 import reprlib
 import sys
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import pydantic
 
@@ -72,3 +74,39 @@ def _shown(value: object) -> str:
         return cut(_SHORT.repr(value), 120)
     except (ValueError, RecursionError):  # a number of thousands of digits
         return f"a {type(value).__name__} too large to show"
+
+
+def locate(name: Path | str, shelf: Literal["scenes", "calibration"], ending: str) -> Path:
+    """The path of a file: that of a shipped one by its bare name, else ``name`` itself.
+
+    Parameters
+    ----------
+    name
+        a shipped file's name, or a path; a bare name that is shipped comes first, ``./name`` is always a path.
+    shelf
+        where shipped ones lie.
+    ending
+        what follows the name: a file in the folder ``name``, or a suffix.
+
+    Raises
+    ------
+    MitsimError
+        for a bare name that is neither shipped nor the name of a file here.
+    """
+    inside = not ending.startswith(".")
+    text, path = str(name), Path(name)
+    if (isinstance(name, str) and (os.sep in text or path.suffix)) or len(path.parts) != 1 or path.suffix:
+        return path / ending if inside and path.is_dir() else path
+    folder = shipped(shelf)
+    known = folder / text / ending if inside else folder / f"{text}{ending}"
+    if known.is_file():
+        return known
+    if path.exists():
+        return path / ending if inside and path.is_dir() else path
+    names = [place.parent.name for place in folder.glob(f"*/{ending}")] if inside else []
+    names = names or [place.stem for place in folder.glob(f"*{ending}")]
+    near = difflib.get_close_matches(text, names, 1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    raise MitsimError(
+        f"{name}: no such file, and none of that name is shipped; {hint}shipped are {', '.join(sorted(names))}"
+    )

@@ -16,6 +16,8 @@ from mitsim.core.llvm import candidates, find_llvm, probe, select_llvm
 
 __all__ = ["VARIANTS", "Check", "candidates", "doctor", "find_llvm", "load_variant", "probe", "select_llvm"]
 
+DEFAULT_VARIANT = "llvm_ad_mono"
+"""One panchromatic reflectance, as the factored estimator has it; the others cost time and change nothing else."""
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral")
 """Variants mitsim is tested with; `load_variant` takes any that the installed Mitsuba has."""
 

@@ -16,6 +16,17 @@ class MitsimError(Exception):
         super().__init__(cut(message, _LONGEST))
 
 
+class ArgumentError(MitsimError):
+    """A value that one argument cannot have; ``argument`` names it.
+
+    The message begins with the argument, as Python spells it; the command line writes it as its option.
+    """
+
+    def __init__(self, argument: str, message: str) -> None:
+        super().__init__(f"{argument} {message}")
+        self.argument = argument
+
+
 def cut(text: str, length: int = 60) -> str:
     """One printable line of at most ``length`` characters."""
     shown = "".join(letter if letter.isprintable() else " " for letter in text[: length + 1])

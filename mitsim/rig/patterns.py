@@ -8,7 +8,8 @@ measurement is the difference.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,31 @@ class Capture:
     def names(self) -> tuple[str, int, int, int]:
         """Names of the capture's random streams."""
         return ("capture", self.row, self.column, self.sign)
+
+
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """Which projector pixels are lit in which shot.
+
+    Attributes
+    ----------
+    labels
+        (n^2,) class of each pixel, row-major: pixels of a class are always lit alike.
+    weights
+        (shots, classes) part of full power that a class emits in each shot.
+    """
+
+    labels: npt.NDArray[np.int64]
+    weights: npt.NDArray[np.float64]
+
+    @classmethod
+    def uniform(cls, n: int) -> Lighting:
+        """One shot with all n x n pixels fully lit."""
+        return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
+
+    def shots(self, chosen: npt.ArrayLike) -> Lighting:
+        """The same classes in the ``chosen`` shots only."""
+        return replace(self, weights=self.weights[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +99,9 @@ class PatternFamily:
         pattern = np.outer(self.left[:, capture.row], self.right[:, capture.column]).astype(np.float64)
         return np.asarray(pattern if capture.sign == 0 else (1 + capture.sign * pattern) / 2)
 
-    def classes(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-        """Finest partition of the pixels whose members are always lit alike: labels (n * n,) and weights.
-
-        ``weights`` is (captures, C): the fraction of full power that class c emits in each capture.
-        """
+    @cached_property
+    def lighting(self) -> Lighting:
+        """The finest partition of the pixels whose members are always lit alike, and its shots."""
         _, row = np.unique(self.left, axis=0, return_inverse=True)
         _, column = np.unique(self.right, axis=0, return_inverse=True)
         label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
@@ -89,7 +113,7 @@ class PatternFamily:
         i, j = np.array([c.row for c in captures]), np.array([c.column for c in captures])
         sign = np.array([c.sign for c in captures])[:, None]
         pattern = self.left[first // self.n][:, i].T * self.right[first % self.n][:, j].T.astype(np.float64)
-        return labels, np.where(sign == 0, pattern, (1 + sign * pattern) / 2)
+        return Lighting(labels, np.where(sign == 0, pattern, (1 + sign * pattern) / 2))
 
 
 def shifting_dots(n: int, k: int) -> IntArray:

@@ -80,13 +80,19 @@ def load_scene(
         scale = float(np.array(mi.traverse(projector)["scale"]).ravel()[0])
         if scale < 0:
             raise MitsimError(f"{path}: the projector's scale: got {scale:g}; light is at least 0")
-    if not needs_projector:
-        return LoadedScene(path, files, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
-    if len(projectors) != 1:
+    if needs_projector and len(projectors) != 1:
         raise MitsimError(
             f'{path}: {len(projectors)} emitters of type "projector"; coded illumination needs exactly one'
         )
-    grid = locate_projector(str(path), projectors[0], cameras[0])
+    grid = None
+    if len(projectors) == 1:
+        try:
+            grid = locate_projector(str(path), projectors[0], cameras[0])
+        except MitsimError:
+            if needs_projector:
+                raise
+    if grid is None:
+        return LoadedScene(path, files, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
     return LoadedScene(path, files, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
 

@@ -23,10 +23,10 @@ import numpy as np
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Evidence, Settings
-from mitsim.capture.exposer import Exposure
-from mitsim.capture.light import Light, collect, scene_facts
-from mitsim.capture.plan import Plan, decide
+from mitsim.capture.light import Light, collect
+from mitsim.capture.plan import Plan, SceneFacts, decide
 from mitsim.capture.render import projected, reference
+from mitsim.capture.request import Exposure
 from mitsim.capture.run import NoiseTarget
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Progress, silent
@@ -167,7 +167,7 @@ class _Study:
 
     def __init__(self, bench: Bench, family: PatternFamily, seed: int, progress: Progress) -> None:
         self.bench, self.family, self.seed, self.progress = bench, family, seed, progress
-        self.labels, self.weights = family.classes()
+        self.labels, self.weights = family.lighting
         self.evidence: Evidence = pilot.measure(bench, self.labels, self.weights, min(ACCURACIES), seed)
         self.plans = {accuracy: self._plan(accuracy) for accuracy in ACCURACIES}
 
@@ -207,7 +207,7 @@ class _Study:
         )
 
     def _plan(self, accuracy: float) -> Plan:
-        return decide(accuracy, self.evidence, len(self.weights), scene_facts(self.bench))
+        return decide(accuracy, self.evidence, len(self.weights), SceneFacts.of(self.bench))
 
     def _finest(self, plan: Plan) -> Plan:
         """Everything on, and one step finer than ``plan`` in each number."""

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.exposer import Exposure
+from mitsim.capture.request import Exposure
 from mitsim.capture.run import digital_block
 from mitsim.capture.session import Session
 from mitsim.core.arrays import Progress, silent
-from mitsim.core.clock import Clock
 from mitsim.core.framefile import checksum, write_frame
+from mitsim.core.job import Clock
 from mitsim.core.manifest import versions, write_json
 from mitsim.core.output import output_folder
 from mitsim.core.resources import Limits

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.exposer import Exposer, Exposure
+from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
+from mitsim.capture.request import Exposure
 from mitsim.capture.run import board_flux
 from mitsim.core.arrays import FloatArray, Progress
 from mitsim.core.parallel import single_threaded_blas
@@ -105,7 +106,7 @@ class Comparison:
         return prepare(*factors, family.left, family.right, centre=self.bench.geometry.mask == "flatcam")
 
     def _expected(self, light: Light, family: PatternFamily) -> ExpectedFrames:
-        return light.merged().frames(*family.classes(), self.seed)
+        return light.merged().frames(family.lighting, self.seed)
 
     def _peak_time(self, expected: ExpectedFrames) -> float:
         return peak_time(self.bench, expected)

@@ -19,9 +19,9 @@ from mitsim.capture.light import collect, pinhole_view
 from mitsim.capture.plan import check_accuracy
 from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.arrays import FloatArray, Progress, silent
-from mitsim.core.clock import Clock
 from mitsim.core.configuration import shipped
 from mitsim.core.framefile import read_frame
+from mitsim.core.job import Clock
 from mitsim.core.manifest import read_json, versions, write_json
 from mitsim.core.output import output_folder, sweep
 from mitsim.reconstruct.calibration import Calibration
@@ -98,7 +98,7 @@ def _run(bench: Bench, folder: Path, accuracy: float, seed: int, progress: Progr
     calibrated, factors = calibrate(bench, folder / "calibration", accuracy, seed, progress=progress)
     clock.add(calibrated.seconds, "calibration ")
     with clock.stage("transport"):
-        light = collect(bench, captured.plan, *bench.family(MAIN, seed).classes(), seed)
+        light = collect(bench, captured.plan, bench.family(MAIN, seed).lighting, seed)
     truth = read_truth(folder / "run")
     comparison = Comparison(bench, light, factors, truth, captured.plan, seed, progress)
     with clock.stage("compare families"):

@@ -28,7 +28,7 @@ from mitsim.capture.run import board_flux, truth
 from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Progress
-from mitsim.core.clock import Clock
+from mitsim.core.job import Clock
 from mitsim.core.manifest import versions, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
@@ -145,7 +145,7 @@ def study_diffraction(
     # Only an earlier study is replaced.
     with output_folder(output, overwrite=(Path(output) / "diffraction.json").is_file()) as folder:
         families = [bench.family(name, seed) for name in dict.fromkeys((patterns, "uniform"))]
-        main = families[0].classes()
+        main = families[0].lighting
         plan = make_plan(bench, *main, ACCURACY, seed, {"diffraction": True})
         light = collect(bench, plan, *main, seed, progress)
         flux = float(board_flux(bench, plan, seed).mean())
@@ -211,7 +211,7 @@ def _rendered(
         found = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
         known = {ASSUMED: assumed, CALIBRATED: (found.left, found.right)}
         for family in families:
-            expected = scene.frames(*family.classes(), seed)
+            expected = scene.frames(family.lighting, seed)
             exposer = Exposer(bench, peak_time(bench, expected), seed, speckle_of(bench, plan))
             yield from _rows("rendered", bench.geometry.mask, name, exposer, family, expected, known, image)
 

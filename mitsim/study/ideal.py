@@ -32,14 +32,14 @@ def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Lig
     ``reflectance`` is (n, n) relative to the calibration board, ``board_flux`` the board's mean flux a projector pixel.
     """
     simulation = Simulation(bench, Settings(bench.geometry.scene_distance))
-    grid, pixels = simulation.bundle.grid, np.arange(bench.n**2)
+    grid, pixels = simulation.fine.bundle.grid, np.arange(bench.n**2)
     first = [
         round((w[0] - axis.start) / axis.size) for w, axis in zip(bench.windows, (grid.rows, grid.columns), strict=True)
     ]
     row, column = np.divmod(pixels, bench.n)
     places = (row + first[0]) * grid.columns.count + column + first[1]
     flux = reflectance.ravel() * board_flux
-    light = sparse.csr_array((flux, (pixels, places)), shape=(bench.n**2 + 1, simulation.bundle.size))
+    light = sparse.csr_array((flux, (pixels, places)), shape=(bench.n**2 + 1, simulation.fine.bundle.size))
     coarse, smooth = (
         sparse.csr_array((bench.n**2 + 1, which.size)) for which in (simulation.coarse, simulation.smooth)
     )
@@ -90,7 +90,7 @@ class IdealCamera:
     def frames(self, family: PatternFamily, flux: FloatArray, seed: int) -> ExpectedFrames:
         """Frames of a family when each projector pixel puts ``flux`` (n, n) [W m^-2] on the sensor without the mask."""
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
-        return ExpectedFrames(self._optics, (light,), *family.classes(), seed)
+        return ExpectedFrames(self._optics, (light,), family.lighting, seed)
 
     @cached_property
     def _optics(self) -> FrameOptics:

@@ -41,7 +41,9 @@ def at_once(_: ExpectedFrames) -> float:
 def sampled(settings: Settings, samples: int) -> Settings:
     """Settings under which the first round takes so many samples of a projector pixel and of a cell in each group."""
     each = 2.0 * samples
-    return replace(settings, direct_samples=each, anchored_samples=each / 8, indirect_samples=each, other_samples=each)
+    return replace(
+        settings, direct_samples=each, anchored_samples=each / 8, indirect_samples=each, from_camera_samples=each
+    )
 
 
 def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Iterator[Variant]:

@@ -334,12 +334,12 @@ def test_a_saturated_session_is_flagged(
     (That no frame is counted without cause: tests/unit/capture/test_session.py::test_the_folder.)
     """
     from mitsim.capture.bench import open_bench
-    from mitsim.capture.evidence import PHYSICAL
+    from mitsim.capture.effects import EFFECTS
     from mitsim.capture.light import make_plan
     from mitsim.study.calibration import calibrate
 
     def simple_plan(*arguments: object) -> object:
-        return make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
+        return make_plan(*arguments, forced=dict.fromkeys(EFFECTS, False))
 
     monkeypatch.setattr("mitsim.capture.session.make_plan", simple_plan)
     camera = tmp_path / "camera.toml"

@@ -22,13 +22,14 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.light import make_plan, uniform_light
+from mitsim.capture.light import make_plan
 from mitsim.capture.run import capture
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.patterns import Lighting
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.lobes import SharpLight, sharp_light
@@ -161,7 +162,7 @@ def test_sharp_lobes_are_found_from_the_surface(small_scene: Callable[..., Path]
 def test_a_lobe_that_would_be_missed_flags_the_plan(small_scene: Callable[..., Path], alpha: float, seen: bool) -> None:
     """At 1e-3 and below the frames would lack 95 % of the light, and no group would tell: the plan says so."""
     bench = open_bench(small_scene(**glossy(alpha)))
-    plan = make_plan(bench, *uniform_light(N), 2e-2, 1, {"diffraction": False})
+    plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
     said = [warning for warning in plan.warnings if "too sharp" in warning]
     assert bool(said) is not seen
     if not seen:
@@ -173,14 +174,14 @@ def test_a_lobe_that_would_be_missed_flags_the_plan(small_scene: Callable[..., P
 def test_a_perfect_mirror_is_exact(small_scene: Callable[..., Path]) -> None:
     """The limit: beams give the closed form of the mirrored projector, without noise (tests/physics/test_mirror.py)."""
     bench = open_bench(small_scene(mask="open", **glossy(None)))
-    frames = bench.mirror_light.frames(np.zeros(N * N, np.int64), bench.geometry, None)
+    frames = bench.glint.frames(np.zeros(N * N, np.int64), bench.geometry, None)
     # The sensor's corner lies 0.53 mm off: obliquity and distance change by 1e-6.
     assert np.abs(frames.irradiance.sum(axis=0) / GLINT - 1).max() < 1e-4
 
 
 def test_light_over_sharp_lobes_alone_flags_the_plan(small_scene: Callable[..., Path]) -> None:
     """No light but the lobe: connections find its tails alone, 1e-3 of it, and the plan says that all is missed."""
-    plan = make_plan(open_bench(small_scene(**glossy(1e-4, sheet=False))), *uniform_light(N), 1e-2, 1)
+    plan = make_plan(open_bench(small_scene(**glossy(1e-4, sheet=False))), Lighting.uniform(N), 1e-2, 1)
     assert plan.systematic_error > 0.9 and any("100% of the direct light" in warning for warning in plan.warnings)
 
 
@@ -198,7 +199,7 @@ def plane(shared_scene: Callable[..., Path], variant: str) -> Callable[..., Benc
         matrix = " ".join(f"{value:.17g}" for value in [*rows.ravel(), 0, 0, 0, 1])
         extra = plate(f'<matrix value="{matrix}"/>', matt(0.5))
         path = shared_scene(f"plane{next(count)}", extra=extra, **{"sheet_z": -500, **numbers})
-        return open_bench(path, variant, check_camera=False)
+        return open_bench(path, variant, for_render=True)
 
     return load
 
@@ -292,7 +293,7 @@ def test_a_scene_that_the_sensors_centre_cannot_see_is_refused(plane: Callable[.
     """The plane alone: the pilot looks from the centre, to which it is a line. Not silently black, and it says why."""
     bench = plane(np.array([0.0, 0.0, Z]), np.array([1.0, 0.0, 0.0]))
     with pytest.raises(MitsimError, match="edge-on") as caught:
-        make_plan(bench, *uniform_light(N), 1e-2, 1)
+        make_plan(bench, Lighting.uniform(N), 1e-2, 1)
     assert "\n" not in str(caught.value)
 
 
@@ -408,11 +409,11 @@ SCALED = Settings(depth=Z, subdivision=2, effects=frozenset({"interreflection"})
 
 def frame_at(write: Callable[..., Path], scale: float) -> np.ndarray:
     """One frame of direct and indirect light, geometric shadow, with the paths of seed 1."""
-    bench = open_bench(scaled_scene(write, scale), check_camera=False)
+    bench = open_bench(scaled_scene(write, scale), for_render=True)
     simulation = Simulation(bench, replace(SCALED, depth=Z * scale))
-    labels, weights = uniform_light(N)
-    found = simulation.file(simulation.direct.trace(1, 0, 64), labels, 64)
-    found = found + simulation.file_other(simulation.followed(1, 64), labels, 64)
+    labels, weights = Lighting.uniform(N)
+    found = simulation.file_direct(simulation.direct.trace(1, 0, 64), labels, 64)
+    found = found + simulation.file_followed(simulation.follow(1, 64), labels, 64)
     return next(iter(simulation.expected([found], np.arange(1), weights, 0))).irradiance
 
 
@@ -618,7 +619,7 @@ def test_a_capture_tells_of_fireflies(
     With seed 4 one does, and its group brings nearly 7/8 of the variance; with seed 2 it is shared among several.
     """
     bench = open_bench(small_scene(**glossy(1e-3)))
-    plan = make_plan(bench, *uniform_light(N), 2e-2, 1, {"diffraction": False})
+    plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
     plan = replace(plan, settings=Settings(Z, direct_samples=16), sampling_target=1e9, warnings=())
     monkeypatch.setattr("mitsim.capture.run.make_plan", lambda *_: plan)
     for seed, fireflies in ((4, True), (2, False)):

@@ -22,7 +22,7 @@ def used():
 bench = open_bench(shipped("scenes", sys.argv[1], "scene.xml"))
 before = used()
 result = run.capture(bench, sys.argv[2], Path(sys.argv[3]), float(sys.argv[4]))
-labels, weights = bench.family(sys.argv[2]).classes()
+labels, weights = bench.family(sys.argv[2]).lighting
 cost = frames_cost(bench, result.plan.settings, weights.shape[1], len(weights))
 written = sum(path.stat().st_size for path in Path(sys.argv[3]).glob("*.exr"))
 print(used() - before, cost.memory_bytes, written, cost.disk_bytes)

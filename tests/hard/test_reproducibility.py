@@ -36,7 +36,7 @@ import sys
 from mitsim.capture.bench import open_bench
 from mitsim.capture.run import capture
 effects = {"interreflection": True, "ambient": True}
-capture(open_bench(sys.argv[1], check_camera=False), sys.argv[2], sys.argv[3], float(sys.argv[4]), 3, effects=effects)
+capture(open_bench(sys.argv[1], for_render=True), sys.argv[2], sys.argv[3], float(sys.argv[4]), 3, effects=effects)
 """
 
 
@@ -81,7 +81,7 @@ def test_frames_do_not_depend_on_threads_or_process(
 ) -> None:
     """Direct, indirect and ambient light, sensor noise, plan: four thread counts, and a process of its own."""
     path = small_scene(extra=LAMP_AND_BOX)
-    found = runs(open_bench(path, check_camera=False), "hadamard:2", 5e-2, tmp_path, threads)
+    found = runs(open_bench(path, for_render=True), "hadamard:2", 5e-2, tmp_path, threads)
     command = [sys.executable, "-c", CHILD, str(path), "hadamard:2", str(tmp_path / "child"), "5e-2"]
     subprocess.run(command, check=True, capture_output=True, timeout=200)
     found.append(bits(tmp_path / "child"))
@@ -97,7 +97,7 @@ def test_neither_do_large_ones(
 ) -> None:
     """Arrays of more than 10 000 numbers, which BLAS shares among its threads; 49 classes mixed."""
     path = small_scene(extra=LAMP_AND_BOX, n=112, pixels=160)
-    found = runs(open_bench(path, check_camera=False), "hadamard:4", 2e-2, tmp_path, threads)
+    found = runs(open_bench(path, for_render=True), "hadamard:4", 2e-2, tmp_path, threads)
     for other in found[1:]:
         assert {name for name in other if other[name] != found[0][name]} == set()
 
@@ -138,8 +138,8 @@ def test_the_plan_does_not_depend_on_the_clock(
     small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Seconds are measured and predicted; what is simulated, and how finely, does not hang on them."""
-    bench = open_bench(small_scene(extra=LAMP_AND_BOX), check_camera=False)
-    family = bench.family("dots:2").classes()
+    bench = open_bench(small_scene(extra=LAMP_AND_BOX), for_render=True)
+    family = bench.family("dots:2").lighting
     plans = []
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -156,8 +156,8 @@ def test_light_does_not_depend_on_how_many_paths_are_held_at_once(
     small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The chunk is a constant, not the machine's; another one adds the same light in another order, to 1e-12."""
-    bench = open_bench(small_scene("chunks"), check_camera=False)
-    labels, weights = bench.family("dots:2").classes()
+    bench = open_bench(small_scene("chunks"), for_render=True)
+    labels, weights = bench.family("dots:2").lighting
     plan = make_plan(bench, labels, weights, 5e-2, 3, {"diffraction": False})
     found = []
     for lanes in (light._LANES_AT_ONCE, light._LANES_AT_ONCE, 300):

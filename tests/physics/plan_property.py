@@ -78,7 +78,7 @@ class Change:
 
 def measured(bench: Bench, patterns: str, captures: int, depth: float, seed: int, effort: Effort) -> dict[str, Change]:
     """Change of the frames by each effect that the scene has; ``depth`` [mm] is where one layer is put."""
-    labels, weights = bench.family(patterns).classes()
+    labels, weights = bench.family(patterns).lighting
     chosen = weights[np.linspace(0, len(weights) - 1, captures).round().astype(int)]
     names = frozenset(applicable(bench)) - {"speckle"}
     look = _Look(bench, labels, chosen, Settings(depth, effects=names), effort, seed)
@@ -98,7 +98,7 @@ class _Look:
     def _layers(self) -> tuple[float, ...]:
         """Depths over the whole range that light is seen at; none for a flat scene."""
         simulation, seed = Simulation(self.bench, self.full), integer(self.seed, "range")
-        near = np.append(simulation.direct.trace(seed, 0, 8).inverse_depth, simulation.followed(seed, 8).inverse_depth)
+        near = np.append(simulation.direct.trace(seed, 0, 8).inverse_depth, simulation.follow(seed, 8).inverse_depth)
         low, high = max(float(near.min()), 1e-4 / self.full.depth), float(near.max())
         return () if high < low * (1 + 1e-4) else tuple(1 / np.linspace(low, high, self.effort.layers))
 
@@ -123,7 +123,7 @@ class _Look:
                 if name == "black-level":
                     found[name].append(everything.black * (self._all_lit(everything, seed) - captures))
                 elif name == "interreflection":
-                    found[name].append(self._of_classes(everything.smooth_optics, light.smooth))
+                    found[name].append(self._of_classes(everything.smooth.optics, light.smooth))
                 else:
                     again = self._traced(simulation, seed) if name in _TRACED_ANEW else deposits
                     found[name].append(captures - self._formed(simulation, self._filed(simulation, again)))
@@ -139,7 +139,7 @@ class _Look:
     def _traced(self, simulation: Simulation, seed: int) -> tuple[Deposits, Deposits]:
         """Direct and other light of pixels that the captures show, and of lamps."""
         direct = simulation.direct.trace(integer(seed, "direct"), 0, self.effort.direct)
-        other = simulation.followed(integer(seed, "other"), self.effort.other)
+        other = simulation.follow(integer(seed, "other"), self.effort.other)
         return direct.where(self.shown[direct.source]), other.where(self.shown[other.source])
 
     def _filed(self, simulation: Simulation, deposits: tuple[Deposits, Deposits]) -> Estimate:
@@ -147,16 +147,16 @@ class _Look:
         direct, other = deposits
         if not simulation.lit_by_lamps:
             other = other.where(other.order != AMBIENT)
-        light = simulation.file(direct, self.labels, self.effort.direct)
-        return light + simulation.file_other(other, self.labels, self.effort.other)
+        light = simulation.file_direct(direct, self.labels, self.effort.direct)
+        return light + simulation.file_followed(other, self.labels, self.effort.other)
 
     def _formed(self, simulation: Simulation, light: Estimate) -> np.ndarray:
         """(captures, pixels, pixels) frames without the projector's black."""
         frames = self._of_classes(simulation.optics, light.fine)
-        frames += self._of_classes(simulation.smooth_optics, light.smooth)
+        frames += self._of_classes(simulation.smooth.optics, light.smooth)
         if simulation.lit_by_lamps:
-            frames += _products_of(simulation.ambient_optics, light.fine[[-1]])
-        mirrored = simulation.mirrored(self.labels)
+            frames += _products_of(simulation.ambient.optics, light.fine[[-1]])
+        mirrored = simulation.glint_frames(self.labels)
         if mirrored is not None:
             frames += np.tensordot(self.weights[:, mirrored.classes], mirrored.irradiance, 1)
         return frames
@@ -169,16 +169,16 @@ class _Look:
         tracer = simulation.anchored or simulation.direct
         found = tracer.trace(integer(seed, "anchors"), 0, _ANCHOR_SAMPLES)
         found = found.where(self.shown[found.source])
-        return self._of_classes(simulation.coarse_optics, simulation.coarse.file(found, self.labels, _ANCHOR_SAMPLES))
+        return self._of_classes(simulation.coarse.optics, simulation.coarse.file(found, self.labels, _ANCHOR_SAMPLES))
 
     def _all_lit(self, simulation: Simulation, seed: int) -> np.ndarray:
         """(pixels, pixels) frame of every projector pixel lit, from a few samples, whose noise all pixels average."""
         one = np.zeros_like(self.labels)
-        light = simulation.file(simulation.direct.trace(integer(seed, "direct"), 0, 2), one, 2)
-        light += simulation.file_other(simulation.followed(integer(seed, "other"), 8), one, 8)
+        light = simulation.file_direct(simulation.direct.trace(integer(seed, "direct"), 0, 2), one, 2)
+        light += simulation.file_followed(simulation.follow(integer(seed, "other"), 8), one, 8)
         frames = _products_of(simulation.optics, light.fine[[0]])
-        frames += _products_of(simulation.smooth_optics, light.smooth[[0]])
-        mirrored = simulation.mirrored(one)
+        frames += _products_of(simulation.smooth.optics, light.smooth[[0]])
+        mirrored = simulation.glint_frames(one)
         return np.asarray(frames[0] if mirrored is None else frames[0] + mirrored.irradiance.sum(axis=0))
 
 

@@ -16,10 +16,11 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
-from mitsim.capture.light import collect, make_plan, uniform_light
+from mitsim.capture.light import collect, make_plan
 from mitsim.capture.render import projected
 from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped
+from mitsim.rig.patterns import Lighting
 from tests.physics.radiosity import gauss, solid_angle
 from tests.physics.test_estimators_agree import (
     LIMIT,
@@ -54,8 +55,8 @@ def ambient_frame(bench: Bench, samples: int = 8, anchors: int = 3, interreflect
     on = {"ambient"} | ({"interreflection"} if interreflection else set())
     settings = Settings(depth=400.0, anchors=anchors, effects=frozenset(on))
     simulation = Simulation(bench, settings)
-    labels, weights = uniform_light(bench.n)
-    light = simulation.file_other(simulation.other.trace(5, 0, samples), labels, samples)
+    labels, weights = Lighting.uniform(bench.n)
+    light = simulation.file_followed(simulation.other.trace(5, 0, samples), labels, samples)
     return next(iter(simulation.expected([light], np.zeros(1, np.int64), 0 * weights, 0))).irradiance
 
 
@@ -231,7 +232,7 @@ def test_black_pixels_shine_by_one_over_the_contrast(shipped_bench: Callable[...
     """Contrast 100: every frame is 1 % of the uniform one and 99 % of its own, glints included."""
     sharp = shipped_bench("mirror")
     bench = replace(sharp, projector=sharp.projector.model_copy(update={"contrast_ratio": 100.0}))
-    labels, weights = bench.family("dots:3").classes()
+    labels, weights = bench.family("dots:3").lighting
     weights = np.concatenate([weights, np.ones((1, 9)), np.zeros((1, 9))])
     frames = {}
     for on in (True, False):

@@ -67,8 +67,8 @@ class Pair:
         groups = self.light.groups
         kinds = (
             (simulation.optics, [group.fine for group in groups]),
-            (simulation.coarse_optics, [group.coarse for group in groups]),
-            (simulation.smooth_optics, [group.smooth for group in groups]),
+            (simulation.coarse.optics, [group.coarse for group in groups]),
+            (simulation.smooth.optics, [group.smooth for group in groups]),
         )
         total = np.zeros_like(self.factored)
         for optics, parts in kinds:

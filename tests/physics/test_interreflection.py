@@ -58,7 +58,7 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
     from mitsim.capture.bench import open_bench
     from mitsim.capture.render import projected
 
-    bench = open_bench(scene, check_camera=False)
+    bench = open_bench(scene, for_render=True)
     family = bench.family(f"dots:{K}", 0)
     integrators = [mi.load_dict({"type": "path", "max_depth": depth}) for depth in (2, -1)]
     found = []
@@ -84,9 +84,9 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     from mitsim.capture.evidence import Settings
     from mitsim.capture.simulation import Simulation
 
-    bench = open_bench(scene, check_camera=False)
+    bench = open_bench(scene, for_render=True)
     family = bench.family(f"dots:{K}", 0)
-    labels, weights = family.classes()
+    labels, weights = family.lighting
     settings = Settings(depth=400.0, anchors=3, effects=frozenset({"interreflection"}))
     # Cells as narrow as a real projector's: the wide ones of 15 pixels would hide light lost at the field stop's rim.
     simulation = Simulation(bench, settings, pixels=8 * N)

@@ -186,7 +186,7 @@ def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)
-    groups = [simulation.file(simulation.direct.trace(seed, 0, 16), labels, 16) for seed in range(4)]
+    groups = [simulation.file_direct(simulation.direct.trace(seed, 0, 16), labels, 16) for seed in range(4)]
     return next(iter(simulation.expected(groups, labels, light.reshape(1, -1), 0))).irradiance
 
 

@@ -14,8 +14,9 @@ from functools import cache
 import pytest
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.effects import SWITCHES
 from mitsim.capture.light import make_plan
-from mitsim.capture.plan import SWITCHES, Plan
+from mitsim.capture.plan import Plan
 from tests.physics.plan_property import Change, Effort, measured
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -44,7 +45,7 @@ def verdict(change: Change, is_on: bool, accuracy: float) -> str:
 
 def check(bench: Bench, accuracy: float, changes: dict[str, Change]) -> None:
     """The property at one accuracy."""
-    plan = make_plan(bench, *bench.family(PATTERNS).classes(), accuracy, PLANNED)
+    plan = make_plan(bench, bench.family(PATTERNS).lighting, accuracy, PLANNED)
     planned = on(plan)
     nothing = Change(0.0, 0.0, 0.0)
     found = {name: (verdict(changes.get(name, nothing), name in planned, accuracy), name) for name in SWITCHES}
@@ -67,7 +68,7 @@ def changes(shipped_bench: Callable[..., Bench]) -> Callable[[str, Effort], dict
     @cache
     def measure(scene: str, effort: Effort) -> dict[str, Change]:
         bench = shipped_bench(scene)
-        plan = make_plan(bench, *bench.family(PATTERNS).classes(), 0.1, PLANNED)
+        plan = make_plan(bench, bench.family(PATTERNS).lighting, 0.1, PLANNED)
         return measured(bench, PATTERNS, CAPTURES, plan.settings.depth, MEASURED, effort)
 
     return measure

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mitsim.capture.plan import SWITCHES
+from mitsim.capture.effects import SWITCHES
 
 ROW = {"name", "state", "reason", "error_if_off", "seconds"}
 

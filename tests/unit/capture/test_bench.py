@@ -21,12 +21,12 @@ def test_a_camera_of_another_pitch_is_refused(small_scene: Callable[..., Path]) 
     with pytest.raises(MitsimError, match=r"11\.72 um, but .* has 10 um") as caught:
         open_bench(path)
     assert "imx249.toml" in str(caught.value) and str(path) in str(caught.value)
-    assert open_bench(path, check_camera=False).n == 16
+    assert open_bench(path, for_render=True).n == 16
 
 
 def test_identity_and_provenance(small_scene: Callable[..., Path]) -> None:
     path = small_scene()
-    bench = open_bench(path, defines={"albedo": "0.7"})
+    bench = open_bench(path, albedo="0.7")
     identity, provenance = bench.identity(), bench.provenance()
     assert identity["geometry"]["pixels"] == 64 and identity["projector"]["n"] == 16
     assert provenance["defines"] == {"albedo": "0.7"} and provenance["scene"] == str(path)
@@ -40,11 +40,11 @@ def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[...
     """Its light is that of a sheet of that reflectance on the aligned plane, even where the scene has none."""
     place = {} if rig is None else {"rig": rig}
     bench = open_bench(small_scene(sheet_z=330, **place))
-    sheet = open_bench(small_scene("sheet", **place), defines={"albedo": "0.9"})
+    sheet = open_bench(small_scene("sheet", **place), albedo="0.9")
 
     def light(which: Bench) -> np.ndarray:
         simulation = Simulation(which, Settings(depth=400.0, subdivision=2))
-        return simulation.file(simulation.direct.trace(4, 0, 4), np.arange(16**2), 4).fine.toarray()
+        return simulation.file_direct(simulation.direct.trace(4, 0, 4), np.arange(16**2), 4).fine.toarray()
 
     board, known = light(bench.with_board(0.9)), light(sheet)
     assert known.sum() > 0

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture import pilot
+from mitsim.capture import effects, pilot
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.evidence import PHYSICAL, Evidence, Settings
+from mitsim.capture.effects import EFFECTS
+from mitsim.capture.evidence import Evidence, Settings
+from mitsim.capture.pilot import direct
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
@@ -36,12 +38,12 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
     return open_bench(
         shared_scene("pilot", reflectance=print_, extra=EXTRA, pitch=0.375, mask_feature=0.3),
         variant,
-        check_camera=False,
+        for_render=True,
     )
 
 
 def measured(bench: Bench, seed: int, accuracy: float = 1e-3) -> Evidence:
-    return pilot.measure(bench, *parse_patterns("dots:4", N).classes(), accuracy, seed)
+    return pilot.measure(bench, parse_patterns("dots:4", N).lighting, accuracy, seed)
 
 
 @pytest.fixture(scope="module")
@@ -49,19 +51,20 @@ def evidence(bench: Bench) -> Evidence:
     return measured(bench, seed=3)
 
 
-def frames(bench: Bench, settings: Settings, direct: int = 64, other: int = 24) -> np.ndarray:
+def frames(bench: Bench, settings: Settings, many: int = 64, other: int = 24) -> np.ndarray:
     """(4, pixels, pixels) of the captures that the pilot looks at, from many samples."""
-    labels, weights = parse_patterns("dots:4", N).classes()
+    lighting = parse_patterns("dots:4", N).lighting.shots(SHOWN)
+    labels = lighting.labels
     made, counts = (
         Simulation(bench, settings),
-        {"direct": direct, "anchored": direct // 4, "indirect": 8 * other, "other": other},
+        {"direct": many, "anchored": many // 4, "indirect": 8 * other, "from_camera": other},
     )
     parts = [
         stage.file(stage.tracer.trace(integer(77, name), 0, counts[name]), labels, counts[name])
         for name, stage in made.tracers().items()
     ]
     light = sum(parts[1:], parts[0])
-    expected = made.expected([light], np.arange(16), weights[SHOWN], 0, made.mirrored(labels))
+    expected = made.expected([light], np.arange(16), lighting, 0)
     return np.stack([frame.irradiance for frame in expected])
 
 
@@ -75,18 +78,18 @@ def promised(found: float, actual: float) -> bool:
 
 def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert set(evidence.effect_error) == {"interreflection", "ambient", "diffraction", "black-level", "speckle"} & set(
-        pilot.applicable(bench)
+        effects.present(bench)
     )
-    assert set(evidence.effect_error) <= set(PHYSICAL)
-    assert {1, 2, 3, 5} <= set(evidence.anchor_error) <= set(pilot.ANCHOR_LADDER)
-    assert {1, 2, 3, 4} <= set(evidence.layer_error) <= set(pilot.LAYER_LADDER)
-    assert {1, 2, 4} <= set(evidence.cell_error) <= set(pilot.CELL_LADDER)
+    assert set(evidence.effect_error) <= set(EFFECTS)
+    assert {1, 2, 3, 5} <= set(evidence.anchor_error) <= set(direct.ANCHOR_LADDER)
+    assert {1, 2, 3, 4} <= set(evidence.layer_error) <= set(direct.LAYER_LADDER)
+    assert {1, 2, 4} <= set(evidence.cell_error) <= set(direct.CELL_LADDER)
     for errors in (evidence.anchor_error, evidence.layer_error):
         assert all(value >= 0 for value in errors.values()) and errors[1] > errors[max(errors)]
-    for pace in (evidence.direct.seconds, evidence.indirect.seconds, evidence.other.seconds):
+    for pace in (evidence.direct.seconds, evidence.indirect.seconds, evidence.from_camera.seconds):
         assert 0 < pace < 1e-3
     assert 0 < evidence.seconds_per_frame < 1
-    assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.other.paths
+    assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.from_camera.paths
     assert evidence.terms == len(bench.spectrum.weights)
 
 
@@ -103,7 +106,7 @@ def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
 
 @pytest.mark.parametrize("effect", ["interreflection", "ambient", "diffraction"])
 def test_effects_come_true(bench: Bench, evidence: Evidence, effect: str) -> None:
-    names = frozenset(pilot.applicable(bench)) - {"speckle"}
+    names = frozenset(effects.present(bench)) - {"speckle"}
     full = Settings(depth=evidence.depth, subdivision=2, effects=names)
     judge = frames(bench, full)
     actual = change(frames(bench, replace(full, effects=names - {effect})), judge)
@@ -113,7 +116,7 @@ def test_effects_come_true(bench: Bench, evidence: Evidence, effect: str) -> Non
 
 def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
     base = Settings(depth=evidence.depth, coarse_cells=2, subdivision=2)
-    every = frozenset(pilot.applicable(bench)) - {"speckle"}
+    every = frozenset(effects.present(bench)) - {"speckle"}
     light = np.linalg.norm(frames(bench, replace(base, effects=every)))
     judge = frames(bench, replace(base, anchors=5), 256)
     actual = np.linalg.norm(frames(bench, base, 256) - judge) / light
@@ -125,7 +128,7 @@ def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
 def test_cells_come_true(bench: Bench, evidence: Evidence) -> None:
     """Against cells twice as fine as the finest that the pilot tries."""
     base = Settings(depth=evidence.depth, effects=frozenset({"diffraction"}))
-    judge = frames(bench, replace(base, subdivision=2 * max(pilot.CELL_LADDER)), 1024)
+    judge = frames(bench, replace(base, subdivision=2 * max(direct.CELL_LADDER)), 1024)
     for cells in (1, 2):
         actual = change(frames(bench, replace(base, subdivision=cells), 1024), judge)
         assert actual > 4e-4
@@ -147,18 +150,19 @@ def test_layers_come_true(bench: Bench, evidence: Evidence) -> None:
 
 def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
     """Spread of six estimates of direct light with sixteen samples; and of other light with two."""
-    every = frozenset(pilot.applicable(bench)) - {"speckle"}
-    effects = {"direct": frozenset({"diffraction"}), "indirect": every, "other": every}
-    labels, weights = parse_patterns("dots:4", N).classes()
+    every = frozenset(effects.present(bench)) - {"speckle"}
+    switched = {"direct": frozenset({"diffraction"}), "indirect": every, "from_camera": every}
+    lighting = parse_patterns("dots:4", N).lighting.shots(SHOWN)
+    labels = lighting.labels
     everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=every))
-    for kind in effects:
-        made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=effects[kind]))
+    for kind in switched:
+        made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=switched[kind]))
         stage, noise = made.tracers()[kind], getattr(evidence, kind).noise
         samples = int(noise.samples)
         traced = [stage.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
         groups = [stage.file(found, labels, samples) for found in traced]
         found = [
-            np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), weights[SHOWN], 0)])
+            np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), lighting, 0)])
             for light in groups
         ]
         spread = np.sqrt(np.square(np.std(found, axis=0, ddof=1)).sum())
@@ -185,19 +189,19 @@ def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> N
     away = open_bench(small_scene(projector_turn='<rotate y="1" angle="180"/>'))
     with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
         measured(away, seed=0)
-    black = open_bench(small_scene("black"), defines={"albedo": "0"})
+    black = open_bench(small_scene("black"), albedo="0")
     with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
         measured(black, seed=0)
 
 
 def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    assert "ambient" in pilot.applicable(bench) and "mirrors" not in pilot.applicable(bench)
+    assert "ambient" in effects.present(bench) and "mirrors" not in effects.present(bench)
     projector = tmp_path / "projector.toml"
     projector.write_text('name = "ideal"\neffective_wavelength_nm = 562.0\n')
-    assert pilot.applicable(open_bench(small_scene(), projector=projector)) == ("interreflection", "diffraction")
+    assert effects.present(open_bench(small_scene(), projector=projector)) == ("interreflection", "diffraction")
     projector.write_text(
         'name = "all"\neffective_wavelength_nm = 562.0\ncontrast_ratio = 100.0\naperture_radius_mm = 1.0\n'
         "blur_pixels = 0.5\nspeckle_contrast = 0.01\n"
     )
-    found = pilot.applicable(open_bench(small_scene(), projector=projector))
+    found = effects.present(open_bench(small_scene(), projector=projector))
     assert found == ("interreflection", "diffraction", "aperture", "blur", "black-level", "speckle")

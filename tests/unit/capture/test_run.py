@@ -14,8 +14,9 @@ import pytest
 from mitsim.capture import run
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS
-from mitsim.capture.exposer import Exposer, Exposure
+from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import collect, make_plan
+from mitsim.capture.request import Exposure
 from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
@@ -106,7 +107,7 @@ def test_checksums_are_those_of_the_files(captured: CaptureResult) -> None:
 def test_the_monte_carlo_error_is_within_the_accuracy(captured: CaptureResult, bench: Bench) -> None:
     """Stated, and true: against light of another seed at a third of the error."""
     assert 0 < captured.mc_error <= ACCURACY and not captured.warnings
-    labels, weights = parse_patterns("dots:3", N).classes()
+    labels, weights = parse_patterns("dots:3", N).lighting
     light = collect(bench, replace(captured.plan, sampling_target=captured.mc_error / 3), labels, weights, seed=99)
     exposer = Exposer(bench, captured.exposure_s, 0)
     judge = np.stack([exposer.electrons(frame) for frame in light.frames(labels, weights, 0)])
@@ -215,7 +216,7 @@ def test_resume_of_a_changed_scene_is_refused(small_scene: Callable[..., Path], 
     path = small_scene()
     capture(open_bench(path), "uniform", tmp_path / "run", 2e-2)
     with pytest.raises(MitsimError, match="defines"):
-        capture(open_bench(path, defines={"albedo": "0.4"}), "uniform", tmp_path / "run", 2e-2, resume=True)
+        capture(open_bench(path, albedo="0.4"), "uniform", tmp_path / "run", 2e-2, resume=True)
     path.write_text(path.read_text() + "<!-- edited -->")
     with pytest.raises(MitsimError, match="scene_sha256"):
         capture(open_bench(path), "uniform", tmp_path / "run", 2e-2, resume=True)
@@ -271,7 +272,7 @@ def test_a_signed_family_is_captured_in_halves(bench: Bench, tmp_path: Path) -> 
 def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> None:
     """Difference of halves in electrons a second; its mean is the expected response within its noise."""
     family = parse_patterns("hadamard:2", N)
-    labels, weights = family.classes()
+    labels, weights = family.lighting
     plan = make_plan(bench, labels, weights, 2e-2, 0)
     expected = collect(bench, plan, labels, weights, 0).frames(labels, weights, 0)
     exposer = Exposer(bench, 0.01, seed=3)
@@ -321,7 +322,7 @@ def test_exposures_that_make_no_sense(settings: dict[str, float]) -> None:
 
 
 def test_sampling_stops_at_its_target(bench: Bench) -> None:
-    labels, weights = parse_patterns("dots:3", N).classes()
+    labels, weights = parse_patterns("dots:3", N).lighting
     plan = make_plan(bench, labels, weights, 1e-2, 0)
     targets = (1e-2, 1.5e-3)
     loose, tight = (collect(bench, replace(plan, sampling_target=t), labels, weights, 0) for t in targets)

@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.evidence import PHYSICAL
-from mitsim.capture.light import make_plan, uniform_light
+from mitsim.capture.effects import EFFECTS
+from mitsim.capture.light import make_plan
 from mitsim.capture.plan import Plan
 from mitsim.capture.session import Session
 from mitsim.core.arrays import silent
-from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
+from mitsim.core.job import Clock
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Calibration
 from mitsim.rig.camera import centred_edges
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import load_recipe
 from mitsim.study.calibration import CalibrationResult, calibrate
 
@@ -33,7 +34,7 @@ Done = tuple[Bench, CalibrationResult, Calibration]
 
 def geometric_plan(*arguments: object) -> Plan:
     """Direct light through a geometric mask."""
-    return make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
+    return make_plan(*arguments, forced=dict.fromkeys(EFFECTS, False))
 
 
 def recipe(mode: str, fraction: float = 0.01) -> object:
@@ -161,7 +162,7 @@ def test_a_used_folder_is_refused_before_any_work(
 def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[..., Path]) -> None:
     """Diffraction hardly changes a uniform frame, but single lines, and so the +-1 responses, by a tenth."""
     board = open_bench(shared_scene("separable16", n=16)).with_board(0.99)
-    uniform = make_plan(board, *uniform_light(16), 2e-2, 0)
+    uniform = make_plan(board, Lighting.uniform(16), 2e-2, 0)
     assert "diffraction" not in uniform.settings.effects
     session = Session(board, recipe("pair"), 2e-2, 0, Clock(), silent)
     assert "diffraction" in session.plan.settings.effects

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.evidence import PHYSICAL, Settings
+from mitsim.capture.effects import EFFECTS
+from mitsim.capture.evidence import Settings
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.frames import FrameOptics
 from mitsim.optics.shadow import Directions
+from mitsim.rig.patterns import Lighting
 from mitsim.transport.histogram import Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -54,9 +56,9 @@ def simulation(bench: Bench, *effects: str, **settings: object) -> Simulation:
 def uniform(made: Simulation, samples: int = 8, weight: float = 1.0) -> np.ndarray:
     """The frame of one capture with every pixel alike."""
     labels = np.zeros(N * N, dtype=np.int64)
-    light = made.file(made.direct.trace(3, 0, samples), labels, samples)
-    light = light + made.file_other(made.followed(3, 4), labels, 4)
-    (frame,) = made.expected([light], np.zeros(1, dtype=np.int64), np.array([[weight]]), 0)
+    light = made.file_direct(made.direct.trace(3, 0, samples), labels, samples)
+    light = light + made.file_followed(made.follow(3, 4), labels, 4)
+    (frame,) = made.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
     return frame.irradiance
 
 
@@ -77,35 +79,40 @@ def test_every_effect_off_is_the_geometric_model(bench: Bench) -> None:
     # One path in a thousand or so of the mirror's corner is missing: the board behind it (10 mm) is out of sight.
     found = uniform(simulation(bench), 256)
     assert np.linalg.norm(found - expected) < 2e-3 * np.linalg.norm(expected)
-    assert simulation(bench).geometry == plain
+    assert simulation(bench).physics.geometry == plain
 
 
 def test_neutral_parts(bench: Bench) -> None:
     off = simulation(bench)
-    assert off.source.ideal and off.black == 0 and off.other is off.indirect is off.anchored is None
-    assert not off.lit_by_lamps and not off.waves and off.mirrored(np.zeros(N * N, dtype=np.int64)) is None
+    assert off.physics.projector.ideal and off.physics.black_level == 0
+    assert off.from_camera is off.indirect is off.anchored is None
+    assert (
+        not off.physics.lamps
+        and off.physics.spectrum is None
+        and off.glint_frames(np.zeros(N * N, dtype=np.int64)) is None
+    )
     assert set(off.tracers()) == {"direct"}
 
 
-@pytest.mark.parametrize("effect", [name for name in PHYSICAL if name != "speckle"])
+@pytest.mark.parametrize("effect", [name for name in EFFECTS if name != "speckle"])
 def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
     on, off = simulation(bench, effect), simulation(bench)
     changed = {
-        "mask-thickness": on.geometry.mask_thickness == 0.05,
-        "pixel-response": (on.geometry.pixel_fill_factor, on.geometry.angular_exponent) == (0.6, 3.0),
-        "aperture": (on.source.aperture, on.source.focus) == (3.0, 300.0),
-        "blur": on.source.blur == 0.6,
-        "black-level": on.black == pytest.approx(BLACK),
-        "diffraction": on.waves,
-        "ambient": on.lit_by_lamps and on.other is not None and len(on.other.paths.emitters) == 1,
+        "mask-thickness": on.physics.geometry.mask_thickness == 0.05,
+        "pixel-response": (on.physics.geometry.pixel_fill_factor, on.physics.geometry.angular_exponent) == (0.6, 3.0),
+        "aperture": (on.physics.projector.aperture, on.physics.projector.focus) == (3.0, 300.0),
+        "blur": on.physics.projector.blur == 0.6,
+        "black-level": on.physics.black_level == pytest.approx(BLACK),
+        "diffraction": on.physics.spectrum is not None,
+        "ambient": bool(on.physics.lamps) and on.from_camera is not None and len(on.from_camera.paths.emitters) == 1,
         "interreflection": on.indirect is not None and on.indirect.interreflection,
-        "mirrors": on.indirect is not None and on.indirect.mirrors and on.other.paths.mirrors,
+        "mirrors": on.indirect is not None and on.indirect.mirrors and on.from_camera.paths.mirrors,
     }
     assert [name for name, holds in changed.items() if holds] == [effect]
     if effect not in ("mask-thickness", "pixel-response"):
-        assert on.geometry == off.geometry
+        assert on.physics.geometry == off.physics.geometry
     if effect not in ("aperture", "blur"):
-        assert on.source.ideal
+        assert on.physics.projector.ideal
 
 
 @pytest.mark.parametrize("effect", ["mask-thickness", "pixel-response", "diffraction", "black-level", "ambient"])
@@ -131,10 +138,10 @@ def test_ambient_light_is_in_a_dark_capture(bench: Bench) -> None:
 
 def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
     made = simulation(bench, "interreflection", "ambient", subdivision=2, coarse_cells=1)
-    assert made.bundle.cells == (2 * made.smooth.cells[0], 2 * made.smooth.cells[1])
+    assert made.fine.bundle.cells == (2 * made.smooth.bundle.cells[0], 2 * made.smooth.bundle.cells[1])
     labels = np.zeros(N * N, dtype=np.int64)
-    found = made.followed(1, 64)
-    light = made.file_other(found, labels, 64)
+    found = made.follow(1, 64)
+    light = made.file_followed(found, labels, 64)
     kinds = {order: found.value[found.order == order].sum() / 64 for order in (0, 2)}
     assert light.fine[[1]].sum() == pytest.approx(kinds[0], rel=0.02) and not light.fine[[0]].nnz
     assert light.smooth.sum() == pytest.approx(kinds[2], rel=0.02) and not light.coarse.nnz
@@ -144,7 +151,7 @@ def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
     """Weighed by the mean anchor weights, what is filed for single anchors adds up to nothing."""
     made = simulation(bench, anchors=2)
     light = made.file_anchored(made.anchored.trace(2, 0, 4), np.zeros(N * N, dtype=np.int64), 4).coarse
-    rows, columns = made.coarse.cells
+    rows, columns = made.coarse.bundle.cells
     found = light[[0]].toarray().reshape(2, rows, 2, columns)
     mean = np.einsum("a,b,ayby->", made.mean_weights, made.mean_weights, found[:, :1, :, :1])
     total = np.einsum("a,b,aybx->yx", made.mean_weights, made.mean_weights, found)

@@ -52,7 +52,7 @@ def test_number_of_captures(name: str) -> None:
 @pytest.mark.parametrize("name", FAMILIES)
 def test_classes_weigh_every_pixel_as_light_does(name: str, n: int) -> None:
     family = parse_patterns(name, n)
-    labels, weights = family.classes()
+    labels, weights = family.lighting
     assert labels.shape == (n * n,) and weights.shape[0] == len(family.captures)
     assert np.array_equal(np.unique(labels), np.arange(weights.shape[1])), "a class without pixels"
     for capture, row in zip(family.captures, weights, strict=True):
@@ -65,7 +65,7 @@ def test_dots_light_every_pixel_exactly_once(n: int, data: st.DataObject) -> Non
     k = data.draw(st.integers(1, n))
     family = parse_patterns(f"dots:{k}", n)
     assert np.array_equal(sum(family.light(capture) for capture in family.captures), np.ones((n, n)))
-    labels, weights = family.classes()
+    labels, weights = family.lighting
     assert weights.shape == (k * k, k * k)
     assert np.array_equal(weights.sum(axis=0), np.ones(k * k)), "each class belongs to one pattern"
     assert len(np.unique(labels)) == k * k

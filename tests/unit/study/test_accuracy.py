@@ -101,10 +101,10 @@ def test_what_is_written(study: AccuracyStudy, folder: Path) -> None:
 
 
 def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
-    labels, weights = bench.family(PATTERNS).classes()
+    labels, weights = bench.family(PATTERNS).lighting
     plan = make_plan(bench, labels, weights, 1e-3, SEED)
     evidence = pilot.measure(bench, labels, weights, 1e-3, SEED)
-    samples = {"direct_samples", "anchored_samples", "indirect_samples", "other_samples"}
+    samples = {"direct_samples", "anchored_samples", "indirect_samples", "from_camera_samples"}
     turned = {
         "samples": samples,
         "cells": {"subdivision"},
@@ -121,7 +121,7 @@ def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
 
 
 def test_sampled_fixes_the_number_of_samples(bench: Bench) -> None:
-    labels, weights = bench.family(PATTERNS).classes()
+    labels, weights = bench.family(PATTERNS).lighting
     plan = make_plan(bench, labels, weights, 1e-3, SEED)
     plan = replace(plan, settings=replace(plan.settings, anchors=1, effects=frozenset()))
     for samples in (1, 8):
@@ -130,7 +130,7 @@ def test_sampled_fixes_the_number_of_samples(bench: Bench) -> None:
 
 
 def test_without_names_each_effect_once(bench: Bench) -> None:
-    plan = make_plan(bench, *bench.family(PATTERNS).classes(), 1e-4, SEED)
+    plan = make_plan(bench, bench.family(PATTERNS).lighting, 1e-4, SEED)
     names = frozenset({"diffraction", "interreflection"})
     found = dict(without(plan.settings, names))
     assert names <= found.keys()

@@ -37,7 +37,7 @@ def study(
 def test_without_diffraction_it_is_the_papers_idealised_camera(bench: Bench) -> None:
     camera = IdealCamera(bench, bench.geometry.mask, None)
     image, family = np.random.default_rng(5).random((N, N)), bench.family("dots:2")
-    same = ideal_light(bench, image, 2.0).frames(*family.classes(), 0)
+    same = ideal_light(bench, image, 2.0).frames(family.lighting, 0)
     for one, other in zip(camera.frames(family, 2.0 * image, 0), same, strict=True):
         assert np.allclose(one.irradiance, other.irradiance, rtol=1e-12)
     factors = ideal_factors(bench, 4.0, 1.0)

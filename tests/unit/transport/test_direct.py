@@ -37,7 +37,7 @@ def white(shared_scene: Callable[..., Path], variant: str) -> Bench:
 @pytest.fixture(scope="module")
 def large(shared_scene: Callable[..., Path], variant: str) -> Bench:
     """A sensor of 40 mm (pixels of 0.625 mm): its anchors see the board from clearly different places."""
-    return open_bench(shared_scene("large", pitch=0.625, fov=30), variant, check_camera=False)
+    return open_bench(shared_scene("large", pitch=0.625, fov=30), variant, for_render=True)
 
 
 def falloff(tau_row: np.ndarray, tau_column: np.ndarray, row: float = 0.0, column: float = 0.0) -> np.ndarray:

@@ -1,10 +1,14 @@
-"""Where time goes: named stages in, seconds by stage out."""
+"""One piece of work: its clock, where its progress is told, and what it may take."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from mitsim.core.arrays import Progress, silent
+from mitsim.core.resources import Limits
 
 
 class Clock:
@@ -24,7 +28,7 @@ class Clock:
             self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - started
 
     def add(self, stages: Mapping[str, float], prefix: str = "") -> None:
-        """Take over the stages of another clock, except its total."""
+        """Take over the ``stages`` of another clock, except its total, with ``prefix`` before their names."""
         for name, seconds in stages.items():
             if name != "total":
                 self._stages[prefix + name] = self._stages.get(prefix + name, 0.0) + seconds
@@ -32,3 +36,12 @@ class Clock:
     def seconds(self) -> dict[str, float]:
         """Stages and ``total`` since the clock was made."""
         return {**self._stages, "total": time.perf_counter() - self._started}
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a long work is given beside its request."""
+
+    clock: Clock = field(default_factory=Clock)
+    progress: Progress = silent
+    limits: Limits = field(default_factory=Limits)

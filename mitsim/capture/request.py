@@ -1,0 +1,115 @@
+"""What is asked of a bench: one model for the command line's options, the arguments of Python, and the manifest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from mitsim.capture.effects import check_switches, parse_switches
+from mitsim.capture.plan import check_accuracy
+from mitsim.core.configuration import validated
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.sensor.chain import exposure_for_peak
+
+if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench
+
+_LEAST_NOISE = 1e-3
+"""Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
+
+
+_LONGEST_S = 1e6
+"""Twelve days: no dark current allows more."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure for a whole session: ``seconds`` by hand, or the brightest pixel at ``fraction`` of full well."""
+
+    seconds: float | None = None
+    fraction: float = 0.8
+
+    def __post_init__(self) -> None:
+        if self.seconds is not None and not 0 < self.seconds <= _LONGEST_S:
+            raise ArgumentError("exposure", f"{self.seconds:g}: give seconds above 0, up to {_LONGEST_S:g}, or auto")
+        if not 0 < self.fraction <= 1:
+            raise ArgumentError(
+                "exposure_fraction", f"{self.fraction:g}: give a part of the full well above 0, up to 1"
+            )
+
+    def check(self, bench: Bench) -> None:
+        """MitsimError when the time is to follow from a full well that the camera of ``bench`` does not have."""
+        if self.seconds is None and not np.isfinite(bench.sensor.full_well_e):
+            raise MitsimError(
+                f"camera {bench.camera_file}: full_well_e is inf, so there is no full well to fill; "
+                "give a finite one, or an exposure in seconds"
+            )
+
+    def choose(self, bench: Bench, peak_irradiance: float) -> float:
+        """Exposure time [s] on ``bench`` for frames whose brightest expected pixel has ``peak_irradiance`` [W m^-2]."""
+        if self.seconds is not None:
+            return self.seconds
+        wavelength = bench.projector.effective_wavelength_nm
+        return exposure_for_peak(peak_irradiance, self.fraction, bench.sensor, wavelength)
+
+
+class Request(BaseModel):
+    """Which shots of a scene are wanted, and how well."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    patterns: str = Field("dots:7", description="uniform, dots:K, hadamard:K or random:K")
+    accuracy: float = Field(1e-3, description="relative rms error of the expected frames")
+    seed: int = Field(0, description="root of every random stream")
+    exposure: float | Literal["auto"] = Field("auto", description="seconds a frame, or auto")
+    exposure_fraction: float = Field(0.8, description="brightest pixel, as a part of full well")
+    effects: dict[str, bool] = Field({}, description="effects switched on or off, whatever they are worth")
+    noise_fraction: float | None = Field(None, description="stop sampling at this part of the sensor's noise")
+
+    @classmethod
+    def of(cls, **values: object) -> Request:
+        """The request of these ``values``; effects may be written ``"+ambient,-diffraction"``.
+
+        Raises
+        ------
+        MitsimError
+            for a name that is no field, or a value that a field cannot have.
+        """
+        if isinstance(values.get("effects"), str):
+            values["effects"] = parse_switches(str(values["effects"]))
+        return validated(cls, values, "request")
+
+    def changed(self, **values: object) -> Request:
+        """The same request with other ``values``; MitsimError as :meth:`of`."""
+        return Request.of(**{**self.model_dump(), **values})
+
+    @field_validator("accuracy")
+    @classmethod
+    def _promised(cls, accuracy: float) -> float:
+        return check_accuracy(accuracy)
+
+    @field_validator("effects")
+    @classmethod
+    def _known(cls, effects: dict[str, bool]) -> dict[str, bool]:
+        return check_switches(effects)
+
+    @field_validator("noise_fraction")
+    @classmethod
+    def _worth_it(cls, fraction: float | None) -> float | None:
+        if fraction is not None and not _LEAST_NOISE <= fraction <= 1:
+            raise ArgumentError(
+                "noise_fraction", f"{fraction}: give a part of the sensor's noise from {_LEAST_NOISE:g} to 1"
+            )
+        return fraction
+
+    def model_post_init(self, _: object) -> None:
+        """MitsimError for an exposure that no camera has."""
+        self.timing  # noqa: B018 - checks itself
+
+    @property
+    def timing(self) -> Exposure:
+        """How the exposure time is found."""
+        return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
