@@ -21,7 +21,8 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.rig.patterns import Lighting
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import AMBIENT, INDIRECT, Deposits
 from mitsim.transport.lobes import SharpLight, sharp_light
@@ -338,8 +339,8 @@ class _Anchors:
     def _formed(self, simulation: Simulation, light: sparse.csr_array) -> FloatArray:
         """(captures, pixels, pixels) frames of light to every anchor."""
         rows = np.arange(self.family.weights.shape[1])
-        groups = [light[: len(rows)]]
-        frames = ExpectedFrames(simulation.coarse_optics, groups, rows, self.family.weights, 0)
+        filed = Filed(simulation.coarse_optics, (light[: len(rows)],))
+        frames = ExpectedFrames([filed], Lighting(rows, self.family.weights), 0)
         return np.stack([frame.irradiance for frame in frames])
 
 
@@ -387,7 +388,8 @@ def _pace(simulation: Simulation, found: Deposits, samples: int, family: _Family
     light = simulation.file(found, family.labels, samples)
     started = time.perf_counter()
     rows = np.arange(family.weights.shape[1])
-    list(ExpectedFrames(simulation.optics, [light.fine[: len(rows)]] * GROUPS, rows, family.weights, 0))
+    filed = Filed(simulation.optics, (light.fine[: len(rows)],) * GROUPS)
+    list(ExpectedFrames([filed], Lighting(rows, family.weights), 0))
     return (time.perf_counter() - started) / len(family.weights)
 
 

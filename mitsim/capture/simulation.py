@@ -20,6 +20,7 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Spectrum
 from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import CellGrid, aligned_grid
@@ -222,15 +223,14 @@ class Simulation:
         """Frames of the captures ``weights`` (captures, classes); ``rows`` maps the groups' rows to classes."""
         first = len(rows)
         emitted = self.black + (1 - self.black) * weights
-        more, ambient = [], []
+        lights, ambient = [Filed(self.optics, tuple(group.fine[:first] for group in groups))], []
         if self.settings.anchors > 1:
-            more.append(Filed(self.coarse_optics, tuple(group.coarse[:first] for group in groups)))
+            lights.append(Filed(self.coarse_optics, tuple(group.coarse[:first] for group in groups)))
         if "interreflection" in self.settings.effects:
-            more.append(Filed(self.smooth_optics, tuple(group.smooth[:first] for group in groups)))
+            lights.append(Filed(self.smooth_optics, tuple(group.smooth[:first] for group in groups)))
         if self.lit_by_lamps:
             ambient.append(Filed(self.ambient_optics, tuple(group.fine[first:] for group in groups)))
-        direct = [group.fine[:first] for group in groups]
-        return ExpectedFrames(self.optics, direct, rows, emitted, seed, more, ambient, exact)
+        return ExpectedFrames(lights, Lighting(rows, emitted), seed, ambient, exact)
 
     @property
     def lit_by_lamps(self) -> bool:

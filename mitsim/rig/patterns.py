@@ -46,7 +46,7 @@ class Lighting:
     Attributes
     ----------
     labels
-        (n^2,) class of each projector pixel, 0 to C - 1.
+        (n^2,) class of each projector pixel, 0 to C - 1; or of each row of light, where pixels share rows.
     weights
         (captures, C) fraction 0..1 of full power that each class emits in each capture.
     """
