@@ -89,8 +89,7 @@ class FrameOptics:
         anchors: int,
         spectrum: Spectrum | None = None,
     ) -> None:
-        edges = geometry.pixel_edges
-        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), (edges[:-1] + edges[1:]) / 2)
+        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), geometry.pixel_centres)
         self.anchors = anchors
         self.pixels = geometry.pixels
         self.cells = (len(rows.centres), len(columns.centres))

@@ -80,6 +80,12 @@ class CameraGeometry(BaseModel):
         """(pixels + 1,) pixel edges [mm]."""
         return centred_edges(self.pixels, self.pixel_pitch)
 
+    @property
+    def pixel_centres(self) -> FloatArray:
+        """(pixels,) centres [mm]."""
+        edges = self.pixel_edges
+        return np.asarray((edges[:-1] + edges[1:]) / 2)
+
     def build_mask(self) -> Mask:
         """The mask that these numbers describe."""
         return mls_mask(self.mask, self.mask_feature, self.mask_order)

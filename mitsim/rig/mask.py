@@ -20,8 +20,12 @@ MaskKind = Literal["separable", "flatcam", "open"]
 """How a plate is made from a code; see :class:`Mask`."""
 Term = tuple[float, FloatArray, FloatArray]
 """Weight, row profile (N,) and column profile (N,) of a separable part of a transmission."""
-_TAPS: dict[int, tuple[int, ...]] = {2: (1,), 3: (2,), 4: (3,), 5: (3,), 6: (5,), 7: (6,), 8: (7, 6, 1), 9: (5,)}
-_TAPS |= {10: (7,), 11: (9,), 12: (11, 10, 4), 13: (12, 11, 8), 14: (13, 12, 2), 15: (14,), 16: (15, 13, 4)}
+# fmt: off
+_TAPS = {
+    2: (1,), 3: (2,), 4: (3,), 5: (3,), 6: (5,), 7: (6,), 8: (7, 6, 1), 9: (5,), 10: (7,), 11: (9,), 12: (11, 10, 4),
+    13: (12, 11, 8), 14: (13, 12, 2), 15: (14,), 16: (15, 13, 4),
+}
+# fmt: on
 """Feedback taps by order: those of ``scipy.signal.max_len_seq``, so that masks are the papers'."""
 
 

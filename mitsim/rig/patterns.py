@@ -204,6 +204,7 @@ _SAME_BOTH_SIDES: dict[str, Callable[[int, int], PatternFactor]] = {
     "dots": _shifting_dots,
     "hadamard": _repeated_hadamard,
 }
+"""Families whose rows and columns show alike: from n and K to (n, K)."""
 
 
 def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:

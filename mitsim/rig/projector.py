@@ -52,6 +52,7 @@ class Spectrum:
 Nanometres = Annotated[float, Field(ge=1, le=1e6)]
 """Wavelength [nm]: from soft X-rays to a millimetre."""
 Share = Annotated[float, Field(ge=0, le=1)]
+"""Part of a whole."""
 
 
 class ProjectorModel(BaseModel):
