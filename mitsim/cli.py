@@ -1,4 +1,4 @@
-"""The command line: parse, call the Python face, print. No physics; heavy imports happen inside the verb that needs them.
+"""The command line: parse, call the Python face, print. No physics; heavy imports happen in the verb that needs them.
 
 Options that make up a request come from :class:`mitsim.capture.request.Request`, so that they are the same in Python.
 Errors of the library speak of arguments; :func:`_spoken` writes them as the options that they are here.

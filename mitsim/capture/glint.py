@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.arrays import Labels
 from mitsim.optics.beams import Beams, beam_frames
 from mitsim.optics.frames import ClassFrames
 from mitsim.optics.samplers import SeparableTerm, geometric_terms, wave_samplers
@@ -36,12 +36,7 @@ class Glint:
         return self._frames[key]
 
     def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
-        def response(row: FloatArray, column: FloatArray) -> FloatArray:
-            return geometry.pixel_fill_factor * geometry.angular_response(np.square(row) + np.square(column))
-
-        active = math.sqrt(geometry.pixel_fill_factor)
-        formed = beam_frames(self.beams, geometry, self._terms(geometry, spectrum), labels, response, active)
-        return ClassFrames(formed.classes, formed.irradiance)
+        return beam_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
 
     def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SeparableTerm]:
         """The mask for a virtual source at the beams' mean depth and direction."""

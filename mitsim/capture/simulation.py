@@ -245,16 +245,15 @@ class Simulation:
         first = len(rows)
         black = self.physics.black_level
         emitted = black + (1 - black) * lighting.weights
-        more, ambient = [], []
+        lights, ambient = [Filed(self.fine.optics, tuple(group.fine[:first] for group in groups))], []
         if self.settings.anchors > 1:
-            more.append(Filed(self.coarse.optics, tuple(group.coarse[:first] for group in groups)))
+            lights.append(Filed(self.coarse.optics, tuple(group.coarse[:first] for group in groups)))
         if self.physics.interreflection:
-            more.append(Filed(self.smooth.optics, tuple(group.smooth[:first] for group in groups)))
+            lights.append(Filed(self.smooth.optics, tuple(group.smooth[:first] for group in groups)))
         if self.physics.lamps:
             ambient.append(Filed(self.ambient.optics, tuple(group.fine[first:] for group in groups)))
-        direct = [group.fine[:first] for group in groups]
         glint = self.glint_frames(lighting.labels)
-        return ExpectedFrames(self.fine.optics, direct, rows, emitted, seed, more, ambient, glint)
+        return ExpectedFrames(lights, Lighting(rows, emitted), seed, ambient, glint)
 
 
 def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:

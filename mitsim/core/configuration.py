@@ -58,14 +58,34 @@ def validated(model: type[Model], data: dict[str, Any], where: str) -> Model:
         return model.model_validate(data)
     except pydantic.ValidationError as error:
         problems = error.errors(include_url=False)
-        first = problems[0]
+        # A mistyped name is both an unknown field and a missing one; the first tells more.
+        first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
         field = ".".join(cut(str(part)) for part in first["loc"]) or "contents"
         rule = first["msg"][0].lower() + first["msg"][1:]
-        known = ", ".join(model.model_fields)
-        hint = f"; known fields: {known}" if first["type"] in ("extra_forbidden", "missing") else ""
+        rule = "no such field" if first["type"] == "extra_forbidden" else rule.removeprefix("value error, ")
+        hint = _range(model, first["loc"])
+        if first["type"] in ("extra_forbidden", "missing"):
+            close = difflib.get_close_matches(str(first["loc"][-1]), model.model_fields, 1)
+            meant = f"did you mean {close[0]}? " if close and first["type"] == "extra_forbidden" else ""
+            hint = f"; {meant}known fields: {', '.join(model.model_fields)}"
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         value = "nothing" if first["type"] == "missing" else _shown(first["input"])
         raise MitsimError(f"{where}: {field}: got {value}, {rule}{hint}; correct this field{more}") from error
+
+
+def _range(model: Any, location: tuple[int | str, ...]) -> str:
+    """What a number at ``location`` of a model may be, where it has two ends."""
+    marks: list[Any] = []
+    for part in location:
+        field = getattr(model, "model_fields", {}).get(part)
+        if field is None:
+            return ""
+        model, marks = field.annotation, field.metadata
+    ends = {name: getattr(mark, name) for mark in marks for name in ("ge", "gt", "le", "lt") if hasattr(mark, name)}
+    if len(ends) != 2:
+        return ""
+    low, high = (f"{end:g}" for end in ends.values())
+    return f" (range: {'above ' if 'gt' in ends else ''}{low} to {'below ' if 'lt' in ends else ''}{high})"
 
 
 def _shown(value: object) -> str:

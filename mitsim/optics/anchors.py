@@ -11,7 +11,10 @@ from mitsim.core.errors import MitsimError
 
 
 def anchor_positions(count: int, half_width: float) -> FloatArray:
-    """(count,) sensor coordinates of the anchors [mm]: Chebyshev nodes, the near-best points for interpolation."""
+    """(``count``,) coordinates of anchors on a sensor of ``half_width``, in its unit.
+
+    Chebyshev nodes, the near-best points for interpolation. MitsimError for less than one.
+    """
     if count < 1:
         raise MitsimError(f"number of anchors a side is {count}; give at least 1")
     k = np.arange(count)
@@ -23,6 +26,6 @@ def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> Flo
     nodes = np.asarray(anchors, dtype=np.float64)
     weights = np.ones((len(at), len(nodes)))
     for j, node in enumerate(nodes):
-        for other in np.delete(nodes, j):
-            weights[:, j] *= (at - other) / (node - other)
+        for zero in np.delete(nodes, j):
+            weights[:, j] *= (at - zero) / (node - zero)
     return weights

@@ -12,22 +12,24 @@ mm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.optics.samplers import ProfileSampler, SeparableTerm, geometric_terms
+from mitsim.optics.frames import ClassFrames, IntArray
+from mitsim.optics.samplers import SeparableTerm
 from mitsim.rig.camera import CameraGeometry
 
-__all__ = ["Beams", "ProfileSampler", "SeparableTerm", "SpecularFrames", "beam_frames", "geometric_terms"]
-
-IntArray = npt.NDArray[np.int64]
-Response = Callable[[FloatArray, FloatArray], FloatArray]
 _BOXES_AT_ONCE = 2**18
+"""Boxes held at a time, some tens of MiB."""
+_POINT = 1e-9
+"""Part of a length that counts as none; chosen far above rounding, 1e-16, and far below what a pixel shows."""
+_ASKEW_BOXES = 2
+"""Further boxes a side, in those of an even beam, that an askew one gets; without them a moire of 1 % (measured)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +74,11 @@ class Beams:
 
 
 @dataclass(frozen=True, eq=False)
-class SpecularFrames:
+class SpecularFrames(ClassFrames):
     """Irradiance by mirrors, one frame for each class of projector pixels that reaches the sensor.
 
     Attributes
     ----------
-    classes
-        (c,) increasing class numbers; every other class's frame is zero.
-    irradiance
-        (c, pixels, pixels) [W m^-2].
     lit_pixels
         (p,) projector pixels whose light meets the sensor, behind the mask or not.
     flux
@@ -89,8 +87,6 @@ class SpecularFrames:
         flux left out because an edge cuts it, an estimate of the error; same unit.
     """
 
-    classes: IntArray
-    irradiance: FloatArray
     lit_pixels: IntArray
     flux: float
     unresolved: float
@@ -101,8 +97,6 @@ def beam_frames(
     geometry: CameraGeometry,
     terms: Sequence[SeparableTerm],
     labels: IntArray,
-    response: Response | None = None,
-    active_side: float = 1.0,
     boxes_per_pixel: int = 2,
 ) -> SpecularFrames:
     """Frames of the classes that mirrors bring to the sensor; memory is one frame for each of them.
@@ -111,14 +105,12 @@ def beam_frames(
     ----------
     beams
         from ``mitsim.transport.beams.trace_beams``.
+    geometry
+        the camera; irradiance is the mean over a pixel's active square, times the fill factor and the response.
     terms
         the mask, see the module; ``[]`` gives no light.
     labels
         (n * n,) class of each projector pixel.
-    response
-        factor for light at tan-angles (row, column), such as a pixel's angular response; 1 without it.
-    active_side
-        side of a pixel's light-sensitive square in pitches; the irradiance is the mean over that square.
     boxes_per_pixel
         boxes a sensor pixel's side, at least 2: a box turned by 45 degrees must not reach into a third
         pixel. Any number is exact where beams are aligned with the pixels' rows and columns.
@@ -126,16 +118,17 @@ def beam_frames(
     Raises
     ------
     MitsimError
-        for ``labels`` that do not cover the beams' projector pixels, no box, or an active side outside 0..1.
+        for ``labels`` that do not cover the beams' projector pixels, or fewer than two boxes.
     """
     labels = np.asarray(labels)
-    _check(beams, labels, active_side, boxes_per_pixel)
+    _check(beams, labels, boxes_per_pixel)
+    active_side = math.sqrt(geometry.pixel_fill_factor)
     reached = _on_sensor(beams, geometry)
     classes = np.unique(labels[beams.pixel[reached]])
     frames = np.zeros((len(classes), geometry.pixels, geometry.pixels))
     total, lit = 0.0, np.zeros(len(labels), dtype=bool)
     for cut in _cuts(beams, reached, geometry.pixel_pitch / boxes_per_pixel):
-        boxes = _boxes(beams, cut, geometry, response)
+        boxes = _boxes(beams, cut, geometry)
         pixels = beams.pixel[boxes.beam]
         total += _deposit(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms, active_side)
         lit[pixels] = True
@@ -169,11 +162,9 @@ class _Boxes:
     magnification: FloatArray
 
 
-def _check(beams: Beams, labels: IntArray, active_side: float, boxes_per_pixel: int) -> None:
+def _check(beams: Beams, labels: IntArray, boxes_per_pixel: int) -> None:
     if boxes_per_pixel < 2:
         raise MitsimError(f"boxes_per_pixel is {boxes_per_pixel}; give at least 2")
-    if not 0 < active_side <= 1:
-        raise MitsimError(f"active_side is {active_side} pixel pitches; give a number above 0 and at most 1")
     if len(beams) and int(beams.pixel.max()) >= len(labels):
         raise MitsimError(
             f"labels has {len(labels)} entries, but light leaves projector pixel {int(beams.pixel.max())}; "
@@ -198,7 +189,7 @@ def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
     sides = [np.diff(corners, axis=axis).reshape(len(reached), 2, 2) for axis in (1, 2)]
     length = np.stack([np.linalg.norm(side, axis=-1).max(axis=1) for side in sides], axis=1)
     askew = np.max([np.abs(side).min(axis=-1).max(axis=1) for side in sides], axis=0) / length.max(axis=1)
-    need = np.maximum(length / box * (1 + 2 * np.minimum(4 * askew, 1))[:, None], 1)
+    need = np.maximum(length / box * (1 + _ASKEW_BOXES * np.minimum(4 * askew, 1))[:, None], 1)
     quarter = 2 ** np.maximum(np.floor(np.log2(need)) - 2, 0)
     counts = (np.ceil(need / quarter) * quarter).astype(np.int64)
     for rows, columns in np.unique(counts, axis=0).tolist():
@@ -212,23 +203,24 @@ def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
                 yield _Cut(alike[start : start + step], a, b, (1 / rows, 1 / columns))
 
 
-def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry, response: Response | None) -> _Boxes:
+def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
     """The boxes of one cut that lie on the sensor and inside the field stop."""
     corners = beams.sensor[cut.beams]
     place, tangent = _bilinear(corners, cut.a, cut.b), _bilinear(beams.tangent[cut.beams], cut.a, cut.b)
     along, across = _gradients(corners, cut.a, cut.b)
     extent = np.hypot(along * cut.size[0], across * cut.size[1])
-    extent = np.maximum(extent, 1e-9 * geometry.pixel_pitch)
-    kept = (np.abs(place) < geometry.half_width + extent / 2).all(axis=-1)
-    kept &= (np.abs(tangent) <= geometry.tan_half_fov).all(axis=-1)
+    extent = np.maximum(extent, _POINT * geometry.pixel_pitch)
+    seen = (np.abs(place) < geometry.half_width + extent / 2).all(axis=-1)
+    seen &= (np.abs(tangent) <= geometry.tan_half_fov).all(axis=-1)
     throughput = _bilinear(beams.throughput[cut.beams][..., None], cut.a, cut.b)[..., 0]
-    flux = (beams.flux[cut.beams, None, None] * throughput)[kept] * (cut.size[0] * cut.size[1])
-    owner = np.broadcast_to(np.arange(len(cut.beams))[:, None, None], kept.shape)[kept]
-    place, extent, tangent = place[kept], extent[kept], tangent[kept]
-    if response is not None:
-        flux = flux * response(tangent[:, 0], tangent[:, 1])
+    flux = (beams.flux[cut.beams, None, None] * throughput)[seen] * (cut.size[0] * cut.size[1])
+    owner = np.broadcast_to(np.arange(len(cut.beams))[:, None, None], seen.shape)[seen]
+    place, extent, tangent = place[seen], extent[seen], tangent[seen]
+    response = geometry.pixel_fill_factor * geometry.angular_response(
+        np.square(tangent[:, 0]) + np.square(tangent[:, 1])
+    )
     magnification = 1 + geometry.mask_distance * _slope(corners, beams.tangent[cut.beams])
-    return _Boxes(cut.beams[owner], flux, place, extent, tangent, magnification[owner])
+    return _Boxes(cut.beams[owner], flux * response, place, extent, tangent, magnification[owner])
 
 
 def _deposit(
@@ -311,7 +303,7 @@ def _slope(sensor: FloatArray, tangent: FloatArray) -> FloatArray:
     middle = np.array([0.5])
     (ua, ub), (ta, tb) = ([g[:, 0, 0] for g in _gradients(c, middle, middle)] for c in (sensor, tangent))
     determinant = ua[:, 0] * ub[:, 1] - ua[:, 1] * ub[:, 0]
-    flat = np.abs(determinant) < 1e-9 * np.linalg.norm(ua, axis=1) * np.linalg.norm(ub, axis=1)
+    flat = np.abs(determinant) < _POINT * np.linalg.norm(ua, axis=1) * np.linalg.norm(ub, axis=1)
     row = ta[:, 0] * ub[:, 1] - tb[:, 0] * ua[:, 1]
     column = tb[:, 1] * ua[:, 0] - ta[:, 1] * ub[:, 0]
     safe = np.where(flat | (determinant == 0), np.inf, determinant)

@@ -23,6 +23,8 @@ clear aperture of both faces, propagated from the exit face: diffraction inside 
 
 from __future__ import annotations
 
+from itertools import chain, combinations
+
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
@@ -32,31 +34,35 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.optics.profile import Steps, sampled_box_means
-from mitsim.optics.shadow import Directions, SeparableTerms, Setting, both_axes
+from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
 from mitsim.rig.projector import Spectrum
 
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4
+"""Widest grid cell. It leaves 3.2e-4 of the anchor geometry's shadow, half of it 1.4e-4, twice 7e-4 (against an
+eighth; tests/physics/test_diffraction.py)."""
 _STEPS_PER_FRESNEL_LENGTH = 130
-"""Grid: a quarter micrometre, or this part of sqrt(lambda D) where that is finer. It leaves 3.2e-4 of the anchor
-geometry's shadow, half of it 1.4e-4, twice 7e-4 (against an eighth; tests/physics/test_diffraction.py)."""
+"""Grid cells in sqrt(lambda D) where that is finer: what :data:`_STEP_MM` is of the anchor geometry's."""
 _THICK_STEPS = 2
 """Grid of a thick mask, whose every direction needs fields of its own, in steps of the thin one's."""
 _LARGEST_GRID = 1 << 24
+"""Cells of a grid: 256 MiB for each of a few complex arrays."""
 
 
 class EdgeWaves:
-    """Fresnel fields of 1-D apertures on a grid; prepared once for a wavelength, a distance and a grid.
+    """Fresnel fields of 1-D apertures on a grid, prepared once; MitsimError for a grid that no memory holds.
 
-    Attributes
+    Parameters
     ----------
-    step_mm
-        width of a grid cell.
+    wavelength_nm, distance_mm
+        of the light, and effective distance D.
+    step_mm, count
+        width and number of a result's grid cells.
+    span_mm
+        the greatest distance from a result to an edge that matters.
     """
 
     def __init__(self, wavelength_nm: float, distance_mm: float, step_mm: float, count: int, span_mm: float) -> None:
-        """``distance_mm``: effective distance D; ``count``: grid cells of a result; ``span_mm``: the greatest
-        distance from a result to an edge that matters."""
         product = wavelength_nm * 1e-6 * distance_mm
         self.step_mm, self._count = step_mm, count
         fade = product / (2 * step_mm)
@@ -76,116 +82,129 @@ class EdgeWaves:
         self._kernel = fft.fft(np.concatenate((-wave[::-1], wave)), self._size)
 
     def field(self, aperture: Steps, start_mm: float) -> ComplexArray:
-        """(count,) field at the centres of the grid cells from ``start_mm`` on, 1 for an unbounded open mask."""
+        """(count,) field behind ``aperture`` at the centres of the cells from ``start_mm`` on, 1 without a mask."""
         reach, count = self._reach, self._count
         profile = aperture.cell_means(start_mm - reach * self.step_mm, self.step_mm, count + 2 * reach)
-        spectrum = fft.fft(np.diff(profile), self._size)
-        spectrum *= self._kernel
+        jumps = fft.fft(np.diff(profile), self._size)
+        jumps *= self._kernel
         # The first 2 reach - 1 values lack jumps on their left, or hold what wrapped around the end.
-        waves = fft.ifft(spectrum, overwrite_x=True)[2 * reach - 1 : 2 * reach - 1 + count]
+        waves = fft.ifft(jumps, overwrite_x=True)[2 * reach - 1 : 2 * reach - 1 + count]
         return np.asarray(waves + profile[reach : reach + count])
 
 
-def wave_terms(setting: Setting, rows: Directions, columns: Directions, spectrum: Spectrum) -> SeparableTerms:
+def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, spectrum: Spectrum) -> SeparableTerms:
     """Wave-optical shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left.
 
-    Wavelength by wavelength; the terms of one wavelength are in the order of the module's formula.
+    Parameters
+    ----------
+    shadow
+        sensor, mask and depth.
+    rows, columns
+        r and c directions.
+    spectrum
+        its lines one after the other; the terms of each are in the order of the module's formula.
     """
-    weights = _pair_weights(setting.weights())
-    means = _thick_means if setting.thickness_mm else _thin_means
-    found: SeparableTerms = []
+    weights = _pair_weights(shadow.weights())
+    means = _thick_means if shadow.thickness_mm else _thin_means
+    terms: SeparableTerms = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
 
         def axis(profiles: list[FloatArray], at: Directions, wavelength: float = float(wavelength)) -> FloatArray:
-            return means(setting, profiles, at, wavelength)
+            return means(shadow, profiles, at, wavelength)
 
-        left, right = both_axes(setting, rows, columns, axis)
-        found += [(share * weight * a, b) for weight, a, b in zip(weights, left, right, strict=True)]
-    return found
+        left, right = both_axes(shadow, rows, columns, axis)
+        terms += [(share * weight * a, b) for weight, a, b in zip(weights, left, right, strict=True)]
+    return terms
 
 
 def wave_profiles(
-    setting: Setting, wavelength_nm: float, low_mm: float, high_mm: float, tau: float
+    shadow: ShadowGeometry, wavelength_nm: float, low_mm: float, high_mm: float, tau: float
 ) -> tuple[list[tuple[float, FloatArray]], float, float]:
     """Intensity of a point source's shadow over the mask coordinate, before any averaging over pixel and cell.
 
-    Returns (weight, (cells,) profile) of each separable term, and the start and the step [mm] of the grid. ``tau`` is
-    the source's tan-angle; it matters to thick masks.
+    Parameters
+    ----------
+    shadow, wavelength_nm
+        sensor, mask and the source's depth; its light.
+    low_mm, high_mm
+        range of the mask coordinate.
+    tau
+        the source's tan-angle, which matters to thick masks.
+
+    Returns
+    -------
+    (weight, (cells,) profile) of each separable term, and the start and the step [mm] of the grid.
     """
-    waves = _prepare(setting, wavelength_nm, np.array([low_mm]), np.array([high_mm]))
-    start = _start(setting, waves.step_mm, low_mm)
-    rows = [profile for _, profile, _ in setting.mask.terms]
-    products = _products([waves.field(clear, start) for clear in setting.clear(rows, tau)])
-    return list(zip(_pair_weights(setting.weights()), products, strict=True)), start, waves.step_mm
+    waves = _prepare(shadow, wavelength_nm, np.array([low_mm]), np.array([high_mm]))
+    start = _start(shadow, waves.step_mm, low_mm)
+    rows = [profile for _, profile, _ in shadow.mask.terms]
+    products = _products([waves.field(clear, start) for clear in shadow.clear(rows, tau)])
+    return list(zip(_pair_weights(shadow.weights()), products, strict=True)), start, waves.step_mm
 
 
-def grid_step(setting: Setting, wavelength_nm: float) -> float:
-    """Width of a grid cell [mm]; a feature holds a whole number of them."""
-    fresnel_length = (wavelength_nm * 1e-6 * setting.distance_mm * setting.shrink) ** 0.5
-    feature = setting.mask.feature_mm
-    widest = min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH) * (_THICK_STEPS if setting.thickness_mm else 1)
+def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
+    """Width [mm] of a grid cell for ``shadow`` at ``wavelength_nm``; a feature holds a whole number of them."""
+    fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
+    feature = shadow.mask.feature_mm
+    widest = min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH) * (_THICK_STEPS if shadow.thickness_mm else 1)
     return feature / float(np.ceil(feature / widest))
 
 
-def _prepare(setting: Setting, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
+def _prepare(shadow: ShadowGeometry, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
     """Waves on a grid that holds each range of mask coordinates [mm], wherever the grid's start is rounded to."""
-    step = grid_step(setting, wavelength_nm)
+    step = grid_step(shadow, wavelength_nm)
     count = int(np.ceil((highs - lows).max() / step)) + 3
-    span = setting.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max())) + 3 * step
-    return EdgeWaves(wavelength_nm, setting.distance_mm * setting.shrink, step, count, span)
+    span = shadow.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max())) + 3 * step
+    return EdgeWaves(wavelength_nm, shadow.distance_mm * shadow.shrink, step, count, span)
 
 
-def _start(setting: Setting, step: float, low: float) -> float:
+def _start(shadow: ShadowGeometry, step: float, low: float) -> float:
     """A coordinate at least a cell below ``low`` from which the mask's edges fall between cells."""
-    first = -setting.mask.extent_mm / 2
+    first = -shadow.mask.extent_mm / 2
     return float(first + (np.floor((low - first) / step) - 1) * step)
 
 
 def _thin_means(
-    setting: Setting, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
+    shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
 ) -> FloatArray:
     """(pairs, m, c) mean products of fields; one grid serves all directions."""
-    crossings, half_cell = setting.crossings(directions), setting.half_cell(directions)
-    reach = setting.half_pixel + half_cell
+    crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
+    reach = shadow.half_pixel + half_cell
     low, high = crossings.min() - reach, crossings.max() + reach
-    waves = _prepare(setting, wavelength_nm, low, high)
-    start = _start(setting, waves.step_mm, float(low))
-    products = _products([waves.field(clear, start) for clear in setting.clear(profiles, 0.0)])
-    return sampled_box_means(products, start, waves.step_mm, crossings, setting.half_pixel, half_cell)
+    waves = _prepare(shadow, wavelength_nm, low, high)
+    start = _start(shadow, waves.step_mm, float(low))
+    products = _products([waves.field(clear, start) for clear in shadow.clear(profiles, 0.0)])
+    return sampled_box_means(products, start, waves.step_mm, crossings, shadow.half_pixel, half_cell)
 
 
 def _thick_means(
-    setting: Setting, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
+    shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
 ) -> FloatArray:
     """(pairs, m, c) mean products of fields; each direction sees an aperture of its own."""
-    crossings, half_cell = setting.crossings(directions), setting.half_cell(directions)
-    reach = setting.half_pixel + half_cell
+    crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
+    reach = shadow.half_pixel + half_cell
     lows, highs = crossings.min(axis=0) - reach, crossings.max(axis=0) + reach
-    waves = _prepare(setting, wavelength_nm, lows, highs)
+    waves = _prepare(shadow, wavelength_nm, lows, highs)
 
-    def one(j: int) -> FloatArray:
-        start = _start(setting, waves.step_mm, float(lows[j]))
-        clear = setting.clear(profiles, float(directions.centres[j]))
+    def toward(j: int) -> FloatArray:
+        start = _start(shadow, waves.step_mm, float(lows[j]))
+        clear = shadow.clear(profiles, float(directions.centres[j]))
         products = _products([waves.field(aperture, start) for aperture in clear])
-        return sampled_box_means(products, start, waves.step_mm, crossings[:, j], setting.half_pixel, half_cell)
+        return sampled_box_means(products, start, waves.step_mm, crossings[:, j], shadow.half_pixel, half_cell)
 
-    return np.stack(in_threads(one, range(crossings.shape[1])), axis=-1)
+    return np.stack(in_threads(toward, range(crossings.shape[1])), axis=-1)
 
 
 def _products(fields: list[ComplexArray]) -> FloatArray:
     """(pairs, n): |U_k|^2 of each field, then Re and Im of U_k U_l* for each k < l."""
-    found = [np.square(field.real) + np.square(field.imag) for field in fields]
-    for k, one in enumerate(fields):
-        for other in fields[k + 1 :]:
-            product = one * other.conj()
-            found += [product.real, product.imag]
-    return np.stack(found)
+    parts = [np.square(field.real) + np.square(field.imag) for field in fields]
+    for first, second in combinations(fields, 2):
+        product = first * second.conj()
+        parts += [product.real, product.imag]
+    return np.stack(parts)
 
 
 def _pair_weights(weights: list[float]) -> list[float]:
     """Weights of the intensity's separable terms, in the order of :func:`_products`."""
-    found = [weight**2 for weight in weights]
-    for k, one in enumerate(weights):
-        for other in weights[k + 1 :]:
-            found += [2 * one * other, -2 * one * other]
-    return found
+    pairs = [(2 * first * second, -2 * first * second) for first, second in combinations(weights, 2)]
+    return [*(weight**2 for weight in weights), *chain.from_iterable(pairs)]

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,24 +23,38 @@ from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Spectrum
 
 IntArray = npt.NDArray[np.int64]
 _AT_ONCE = 32
+"""Frames held at a time: enough to keep all processors busy; 64 MiB of a sensor of 512 pixels."""
 _LARGEST_BASIS = 256
+"""Classes whose frames are held to be mixed: 512 MiB of a sensor of 512 pixels."""
 _PROBES = 8
+"""Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`_probes`."""
 _SHADOWS = 24
+"""Shadows kept; chosen above what one plan asks for again, a few MiB each."""
 _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Expected irradiance (pixels, pixels) [W m^-2] of one capture, and its Monte Carlo variance, mean over pixels.
+    """What one capture casts on the sensor.
 
-    Interpolation between anchors can leave specks below zero where a pixel sees almost no light; they are set to zero,
-    and ``removed`` is their sum over the sum of the frame, so that nothing is hidden. ``heaviest`` is the largest part
-    of the variance that one group of the light brings: with one heavy path among G groups, (G - 1) / G.
+    Attributes
+    ----------
+    irradiance
+        (pixels, pixels) expected [W m^-2].
+    variance
+        its Monte Carlo variance, mean over pixels.
+    removed
+        Interpolation between anchors can leave specks below zero where a pixel sees almost no light; they are set to
+        zero, and this is their sum over the sum of the frame, so that nothing is hidden.
+    heaviest
+        largest part of the variance that one group of the light brings: with one heavy path among G groups,
+        (G - 1) / G.
     """
 
     irradiance: FloatArray
@@ -51,7 +64,21 @@ class Frame:
 
 
 class FrameOptics:
-    """Prepared once for a camera, directions, layers, anchors and a spectrum; applying it changes nothing."""
+    """The closed form, prepared once; applying it changes nothing.
+
+    Parameters
+    ----------
+    geometry
+        the camera.
+    rows, columns
+        directions of the cells along the two axes.
+    depths
+        [mm], one a layer.
+    anchors
+        points a side of the sensor from which light is seen.
+    spectrum
+        lines of a wave-optical shadow; None: geometric.
+    """
 
     def __init__(
         self,
@@ -62,9 +89,7 @@ class FrameOptics:
         anchors: int,
         spectrum: Spectrum | None = None,
     ) -> None:
-        """``depths`` [mm], one a layer; ``anchors`` a side; without a ``spectrum`` the mask's shadow is geometric."""
-        edges = geometry.pixel_edges
-        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), (edges[:-1] + edges[1:]) / 2)
+        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), geometry.pixel_centres)
         self.anchors = anchors
         self.pixels = geometry.pixels
         self.cells = (len(rows.centres), len(columns.centres))
@@ -79,7 +104,7 @@ class FrameOptics:
         ]
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
-        """(pixels, pixels) irradiance of sparse light: distinct flat indices into (layers, *shape), values [W m^-2]."""
+        """(pixels, pixels) irradiance of ``light`` [W m^-2] at distinct indices ``flat`` into (layers, *shape)."""
         total = np.zeros((self.pixels, self.pixels))
         for terms, (inside, places) in zip(self._layers, self._split(flat), strict=True):
             if not len(places):
@@ -94,9 +119,20 @@ class FrameOptics:
         return total
 
     def probe(self, flat: IntArray, lights: FloatArray, vectors: FloatArray) -> FloatArray:
-        """(pixels, groups * probes): the frames of ``lights`` (groups, len(flat)) times ``vectors`` (pixels, probes).
+        """Frames of several lights times some vectors; the frames, which would cost far more, are never formed.
 
-        The frames themselves, which would cost far more, are never formed.
+        Parameters
+        ----------
+        flat
+            (k,) distinct indices into (layers, *shape).
+        lights
+            (groups, k) values there [W m^-2].
+        vectors
+            (pixels, probes).
+
+        Returns
+        -------
+        (pixels, groups * probes).
         """
         total = np.zeros((self.pixels, len(lights) * vectors.shape[1]))
         for terms, (inside, places) in zip(self._layers, self._split(flat), strict=True):
@@ -109,7 +145,7 @@ class FrameOptics:
                 total += left[rows].T @ np.concatenate([block @ seen for _, _, block in parts], axis=1)
         return total
 
-    def _split(self, flat: IntArray) -> list[tuple[Any, IntArray]]:
+    def _split(self, flat: IntArray) -> list[tuple[slice | IntArray, IntArray]]:
         """For each layer: which entries of ``flat`` lie in it, and their places in (rows, columns)."""
         if len(self._layers) == 1:
             return [(slice(None), flat)]
@@ -131,7 +167,15 @@ class FrameOptics:
 
 @dataclass(frozen=True, eq=False)
 class ClassFrames:
-    """Frames of some classes at full power: classes (c,) and irradiance (c, pixels, pixels) [W m^-2]."""
+    """Frames of some classes at full power, without Monte Carlo error.
+
+    Attributes
+    ----------
+    classes
+        (c,) increasing class numbers; every other class's frame is zero.
+    irradiance
+        (c, pixels, pixels) [W m^-2].
+    """
 
     classes: IntArray
     irradiance: FloatArray
@@ -139,14 +183,22 @@ class ClassFrames:
 
 @dataclass(frozen=True, eq=False)
 class Filed:
-    """Independent estimates of light, (rows, cells) each, and the optics that fits the cells they are filed in."""
+    """Light and the optics that forms it.
+
+    Attributes
+    ----------
+    optics
+        fits the cells that the light is filed in.
+    groups
+        independent estimates of the light, (rows, cells) each; their mean is used.
+    """
 
     optics: FrameOptics
     groups: tuple[sparse.csr_array, ...]
 
 
 def frames_in_memory(classes: int, captures: int) -> int:
-    """Frames that :class:`ExpectedFrames` of so many classes and captures holds at once."""
+    """Frames that :class:`ExpectedFrames` of so many ``classes`` and ``captures`` holds at once."""
     return (classes if _mixes(classes, captures) else _AT_ONCE) + _AT_ONCE
 
 
@@ -164,35 +216,37 @@ class ExpectedFrames:
     The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``; with one group there is
     none to tell, and it is 0. Squared norms are estimated without bias from products with random signs (Hutchinson's
     estimator), because forming G times as many frames would cost more than the frames themselves.
+
+    Parameters
+    ----------
+    lights
+        light of the same rows (projector pixels, or classes of them), filed in one kind of cells or more; their groups
+        are paired.
+    lighting
+        class of each row, and the fraction of full power that each class emits in each capture.
+    seed
+        of the random signs.
+    ambient
+        light (1, cells) of every capture, its groups paired with those of ``lights``.
+    glint
+        frames to be added to those of some classes.
     """
 
     def __init__(
         self,
-        optics: FrameOptics,
-        groups: Sequence[sparse.csr_array],
-        labels: IntArray,
-        weights: FloatArray,
+        lights: Sequence[Filed],
+        lighting: Lighting,
         seed: int,
-        more: Sequence[Filed] = (),
         ambient: Sequence[Filed] = (),
-        exact: ClassFrames | None = None,
+        glint: ClassFrames | None = None,
     ) -> None:
-        """``groups``: independent estimates of the light, (rows, cells) each; their mean is used.
-
-        ``labels``: (rows,) class 0..C-1 of each row, a projector pixel or a class of them; ``weights``: (captures, C)
-        fraction of full power that each class emits; ``seed``: of the random signs; ``more``: further
-        light of the same rows in other cells, and ``ambient``: light (1, cells) of every capture, their groups paired
-        with these; ``exact``: frames of some classes without Monte Carlo error.
-        """
-        self._lights = (Filed(optics, tuple(groups)), *more)
-        self._seed = seed
-        classes, rows = weights.shape[1], labels.size
-        indicator = sparse.csr_array((np.ones(rows), (labels, np.arange(rows))), shape=(classes, rows))
-        self._mixed = _mixes(classes, len(weights))
-        self._shares = np.eye(classes) if self._mixed else weights
-        self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(weights) @ indicator)
-        self._weights = weights
-        self._ambient, self._exact = tuple(ambient), exact
+        self._lights, self._ambient, self._glint = tuple(lights), tuple(ambient), glint
+        self._seed, self._weights = seed, lighting.weights
+        (captures, classes), rows = lighting.weights.shape, lighting.labels.size
+        indicator = sparse.csr_array((np.ones(rows), (lighting.labels, np.arange(rows))), shape=(classes, rows))
+        self._mixed = _mixes(classes, captures)
+        self._shares = np.eye(classes) if self._mixed else self._weights
+        self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(self._weights) @ indicator)
         self._formed: tuple[FloatArray, FloatArray] | None = None
         self._always: tuple[FloatArray, FloatArray] | None = None
 
@@ -217,25 +271,24 @@ class ExpectedFrames:
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) deviations of their groups."""
-        chosen = self._basis[start:stop]
-        found = _formed(self._lights, chosen, self._seed)
-        if self._exact is not None:
-            shares = self._shares[start:stop][:, self._exact.classes]
-            for frame, share in zip(found[0], shares, strict=True):
+        frames, deviations = _formed(self._lights, self._basis[start:stop], self._seed)
+        if self._glint is not None:
+            shares = self._shares[start:stop][:, self._glint.classes]
+            for frame, share in zip(frames, shares, strict=True):
                 for index in np.flatnonzero(share):
-                    frame += share[index] * self._exact.irradiance[index]
-        return found
+                    frame += share[index] * self._glint.irradiance[index]
+        return frames, deviations
 
     def _frames(self, irradiance: FloatArray, deviation: FloatArray) -> Iterator[Frame]:
         if self._ambient and self._always is None:
             self._always = _formed(self._ambient, sparse.csr_array(np.ones((1, 1))), self._seed)
         count = len(self._lights[0].groups)
         pairs = count * (count - 1)
-        for frame, one in zip(irradiance, deviation, strict=True):
+        for frame, probed in zip(irradiance, deviation, strict=True):
             if self._always is not None:
-                frame, one = frame + self._always[0][0], one + self._always[1][0]
+                frame, probed = frame + self._always[0][0], probed + self._always[1][0]
             # Not a product of vectors: BLAS adds up in an order that hangs on its threads.
-            squared = np.square(one.reshape(frame.shape[0], count, -1)).sum(axis=(0, 2)) if pairs else np.zeros(1)
+            squared = np.square(probed.reshape(frame.shape[0], count, -1)).sum(axis=(0, 2)) if pairs else np.zeros(1)
             spread = float(squared.sum())
             variance = spread / pairs / frame.size if pairs else 0.0
             heaviest = float(squared.max()) / spread if spread else 0.0
@@ -294,7 +347,7 @@ def _mix(weights: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def relative_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
-    """Monte Carlo part of ||a - b|| / ||b|| over all frames and pixels (DESIGN section 6)."""
+    """Monte Carlo part of ||a - b|| / ||b|| over all pixels of all ``frames``."""
     variance = energy = 0.0
     for frame in frames:
         variance += frame.variance * frame.irradiance.size
@@ -302,12 +355,12 @@ def relative_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
     return float(np.sqrt(variance / energy)) if energy > 0 else 0.0
 
 
-def _row(matrix: sparse.csr_array, row: int) -> tuple[npt.NDArray[np.int64], FloatArray]:
+def _row(matrix: sparse.csr_array, row: int) -> tuple[IntArray, FloatArray]:
     inside = slice(matrix.indptr[row], matrix.indptr[row + 1])
     return matrix.indices[inside].astype(np.int64), matrix.data[inside]
 
 
-def _aligned(flat: npt.NDArray[np.int64], parts: Sequence[tuple[npt.NDArray[np.int64], FloatArray]]) -> FloatArray:
+def _aligned(flat: IntArray, parts: Sequence[tuple[IntArray, FloatArray]]) -> FloatArray:
     """(groups, len(flat)) values of each group at the places of their mean, which holds every place of each."""
     order = np.argsort(flat)
     values = np.zeros((len(parts), len(flat)))

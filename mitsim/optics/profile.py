@@ -16,7 +16,8 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 
 _FEW = 4
-"""Edges in the narrower box that are taken one by one; with more, the box is wide enough for a second difference."""
+"""Edges in the narrower box that are taken one by one; with more, the box is wide enough for a second difference to
+keep 1e-11 (measured in tests/unit/optics/test_profile.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,37 +37,59 @@ class Steps:
 
     @classmethod
     def of(cls, profile: npt.ArrayLike, feature_mm: float) -> Steps:
-        """The centred profile of features of one size, neighbours of equal value merged."""
+        """The centred ``profile`` (N,) of features of ``feature_mm``, neighbours of equal value merged."""
         values = np.asarray(profile, dtype=np.float64)
         edges = (np.arange(len(values) + 1) - len(values) / 2) * feature_mm
         starts = np.flatnonzero(np.diff(values, prepend=np.nan))
         return cls(np.append(edges[starts], edges[-1]), values[starts])
 
     def at(self, s: FloatArray) -> FloatArray:
-        """Values at points [mm]; at an edge, those of the interval that begins there."""
+        """Values at points ``s`` [mm]; at an edge, those of the interval that begins there."""
         padded = np.concatenate(([0.0], self.values, [0.0]))
         return np.asarray(padded[np.searchsorted(self.edges, s, side="right")])
 
-    def seen_through(self, other: Steps, scale: float, shift: float) -> Steps:
-        """The product ``self(s) * other(scale * s + shift)``, ``scale`` above 0."""
-        edges = np.unique(np.concatenate((self.edges, (other.edges - shift) / scale)))
+    def seen_through(self, far: Steps, scale: float, shift: float) -> Steps:
+        """The product ``self(s) * far(scale * s + shift)``.
+
+        Parameters
+        ----------
+        far
+            the second function.
+        scale, shift
+            above 0, and [mm].
+        """
+        edges = np.unique(np.concatenate((self.edges, (far.edges - shift) / scale)))
         middle = (edges[:-1] + edges[1:]) / 2
-        return Steps(edges, self.at(middle) * other.at(scale * middle + shift))
+        return Steps(edges, self.at(middle) * far.at(scale * middle + shift))
 
     def cell_means(self, start: float, step: float, count: int) -> FloatArray:
-        """(count,) means over cells of width ``step`` from ``start`` on; a cell with an edge in it gets its share."""
+        """(count,) means over equal cells; a cell with an edge in it gets its share.
+
+        Parameters
+        ----------
+        start, step, count
+            first edge and width [mm] of the cells, and their number.
+        """
         bounds = start + step * np.arange(count + 1)
         index = np.searchsorted(self.edges, bounds, side="right")
-        found = np.concatenate(([0.0], self.values, [0.0]))[index[:-1]]
+        means = np.concatenate(([0.0], self.values, [0.0]))[index[:-1]]
         # Only where an edge lies inside: a difference of large sums would lose digits everywhere.
         cut = np.flatnonzero(np.diff(index))
         covered = np.concatenate(([0.0], np.cumsum(self.values * np.diff(self.edges))))
         at = np.interp(bounds[[cut, cut + 1]], self.edges, covered)
-        found[cut] = (at[1] - at[0]) / step
-        return np.asarray(found)
+        means[cut] = (at[1] - at[0]) / step
+        return np.asarray(means)
 
     def box_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """Means over the two boxes around ``centres`` [mm], any shape."""
+        """Means over two boxes, one after the other.
+
+        Parameters
+        ----------
+        centres
+            of the boxes [mm], any shape, which the result has.
+        half_pixel, half_cell
+            their half-widths [mm].
+        """
         reach = half_pixel + half_cell
         low, high = centres.min() - reach, centres.max() + reach
         inside = self.edges[(self.edges > low) & (self.edges < high)]
@@ -80,7 +103,14 @@ def sampled_box_means(
 ) -> FloatArray:
     """(functions, *centres.shape) means over two boxes of functions that are constant on equal cells.
 
-    ``values``: (functions, n) on cells of width ``step`` from ``start`` on, which must hold every box.
+    Parameters
+    ----------
+    values
+        (functions, n) on cells that hold every box.
+    start, step
+        first edge and width of the cells [mm].
+    centres, half_pixel, half_cell
+        of the boxes, as in :meth:`Steps.box_means`.
     """
     edges = start + step * np.arange(values.shape[1] + 1)
     return _Antiderivative(edges, values, step).means(centres, half_pixel, half_cell)
@@ -127,14 +157,14 @@ class _Antiderivative:
         most = int((self._index(points + half) + 1 - first).max())
         if most > _FEW:
             return (self._at(points + half, order=2) - self._at(points - half, order=2)) / (2 * half)
-        found = self._at(points, order=1)
+        means = self._at(points, order=1)
         jumps = np.diff(self._values, axis=1, append=self._values[:, -1:])
         for edge in range(most):
             opened = np.minimum(first + edge, self._values.shape[1])
             corner = np.square(np.maximum(half - np.abs(points - self._edges[opened]), 0)) / (4 * half)
-            for jump, out in zip(jumps, found, strict=True):
+            for jump, out in zip(jumps, means, strict=True):
                 out += jump[opened - 1] * corner
-        return found
+        return means
 
     def _index(self, points: FloatArray) -> npt.NDArray[np.intp]:
         """The interval that holds each point."""
@@ -148,10 +178,10 @@ class _Antiderivative:
         """The antiderivative of that order at points, for each function."""
         index = self._index(points)
         beyond = points - self._edges[index]
-        found = np.empty((len(self._values), *points.shape))
-        for values, first, second, out in zip(self._values, self._first, self._second, found, strict=True):
+        result = np.empty((len(self._values), *points.shape))
+        for values, first, second, out in zip(self._values, self._first, self._second, result, strict=True):
             if order == 1:
                 out[...] = first[index] + values[index] * beyond
             else:
                 out[...] = second[index] + (first[index] + values[index] * (beyond / 2)) * beyond
-        return found
+        return result

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.diffraction import wave_profiles
-from mitsim.optics.terms import shadow_setting
+from mitsim.optics.shadow import ShadowGeometry
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
 
@@ -24,11 +24,19 @@ SeparableTerm = tuple[float, Sampler, Sampler]
 
 
 class ProfileSampler:
-    """Exact means of a piecewise constant mask profile, zero outside its features."""
+    """Exact means of a piecewise constant mask profile, zero outside its features.
+
+    Parameters
+    ----------
+    profile
+        (N,) transmission of each feature.
+    feature_mm
+        their size.
+    start_mm
+        where the first begins; None: centred on the axis.
+    """
 
     def __init__(self, profile: npt.ArrayLike, feature_mm: float, start_mm: float | None = None) -> None:
-        """``profile``: (N,) transmission of each feature from ``start_mm`` on (centred on the axis without it);
-        ``feature_mm``: their size [mm]."""
         values = np.asarray(profile, dtype=np.float64)
         self._values = np.concatenate(([0.0], values, [0.0]))
         self._sums = np.cumsum(self._values)
@@ -53,23 +61,30 @@ class ProfileSampler:
 def wave_samplers(
     geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: tuple[float, float]
 ) -> list[SeparableTerm]:
-    """The mask's wave-optical shadow of a (virtual) source at ``depth`` [mm] and tan-angles ``tau``, as samplers."""
-    edges = geometry.pixel_edges
-    setting = shadow_setting(geometry, depth)
-    reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + float(edges[1] - edges[0])
-    found: list[SeparableTerm] = []
+    """A mask's wave-optical shadow of a (virtual) source, as samplers.
+
+    Parameters
+    ----------
+    geometry, spectrum
+        the camera and the light.
+    depth, tau
+        of the source [mm], and its tan-angles along rows and columns.
+    """
+    shadow = ShadowGeometry.of(geometry, depth)
+    reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + geometry.pixel_pitch
+    terms: list[SeparableTerm] = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-        rows, start, step = wave_profiles(setting, float(wavelength), -reach, reach, tau[0])
-        columns, *_ = wave_profiles(setting, float(wavelength), -reach, reach, tau[1])
-        found += [
+        rows, start, step = wave_profiles(shadow, float(wavelength), -reach, reach, tau[0])
+        columns, *_ = wave_profiles(shadow, float(wavelength), -reach, reach, tau[1])
+        terms += [
             (float(share) * weight, ProfileSampler(row, step, start), ProfileSampler(column, step, start))
             for (weight, row), (_, column) in zip(rows, columns, strict=True)
         ]
-    return found
+    return terms
 
 
 def geometric_terms(geometry: CameraGeometry) -> list[SeparableTerm]:
-    """The mask's geometric shadow as separable terms for :func:`beam_frames`."""
+    """The geometric shadow of the mask of ``geometry``, as samplers."""
     mask = geometry.build_mask()
     return [
         (weight, ProfileSampler(rows, mask.feature_mm), ProfileSampler(columns, mask.feature_mm))

@@ -61,7 +61,7 @@ def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> flo
 
 
 def centred(terms: SeparableTerms) -> SeparableTerms:
-    """The operator of frames from which the means of rows and columns are taken: that of every factor's columns is."""
+    """``terms`` of frames from which the means of rows and columns are taken: that of every factor's columns is."""
     return [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
 
 

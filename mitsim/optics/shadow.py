@@ -30,11 +30,12 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.profile import Steps
+from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import Mask
 
 SeparableTerms = list[tuple[FloatArray, FloatArray]]
 _WIDE = 32
-"""Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel little."""
+"""Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel to 1e-11."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +72,14 @@ class Directions:
             raise MitsimError(f"cells of width {widths.min()} to {widths.max()} are not equal; give equal ones")
         return cls((array[:-1] + array[1:]) / 2, width)
 
-    def same_as(self, other: Directions) -> bool:
-        """Whether the other directions are these, so that one shadow serves both axes."""
-        return self is other or (self.width == other.width and np.array_equal(self.centres, other.centres))
+    def same_as(self, columns: Directions) -> bool:
+        """Whether ``columns`` are these, so that one shadow serves both axes."""
+        return self is columns or (self.width == columns.width and np.array_equal(self.centres, columns.centres))
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
-    """Sensor, mask and depth of one shadow.
+class ShadowGeometry:
+    """Sensor, mask and depth of one shadow; MitsimError for a depth that is not beyond the mask.
 
     Attributes
     ----------
@@ -101,6 +102,12 @@ class Setting:
     thickness_mm: float
     depth_mm: float
 
+    @classmethod
+    def of(cls, camera: CameraGeometry, depth_mm: float) -> ShadowGeometry:
+        """That of a ``camera`` toward points at ``depth_mm``."""
+        centres, side, mask = camera.pixel_centres, camera.active_side, camera.build_mask()
+        return cls(mask, centres, side, camera.mask_distance, camera.mask_thickness, depth_mm)
+
     def __post_init__(self) -> None:
         _require_beyond(self.depth_mm, self.distance_mm + self.thickness_mm)
 
@@ -115,11 +122,11 @@ class Setting:
         return self.active_mm * self.shrink / 2
 
     def half_cell(self, directions: Directions) -> float:
-        """Half a cell seen on the mask [mm]."""
+        """Half a cell of ``directions`` seen on the mask [mm]."""
         return self.distance_mm * directions.width / 2
 
     def crossings(self, directions: Directions) -> FloatArray:
-        """(m, c) mask coordinates [mm] of rays from pixel centres toward the directions."""
+        """(m, c) mask coordinates [mm] of rays from pixel centres toward ``directions``."""
         return self.shrink * self.pixel_centres_mm[:, None] + self.distance_mm * directions.centres[None, :]
 
     def weights(self) -> list[float]:
@@ -128,7 +135,7 @@ class Setting:
         return [a * b for a in weights for b in weights] if self.thickness_mm else weights
 
     def clear(self, profiles: Sequence[FloatArray], tau: float) -> list[Steps]:
-        """Clear profiles on the exit face toward ``tau``, in the order of :meth:`weights`."""
+        """What ``profiles`` (N,) of both faces leave clear toward ``tau``, in the order of :meth:`weights`."""
         faces = [Steps.of(profile, self.mask.feature_mm) for profile in profiles]
         if not self.thickness_mm:
             return faces
@@ -138,13 +145,21 @@ class Setting:
 
 
 def both_axes(
-    setting: Setting,
+    shadow: ShadowGeometry,
     rows: Directions,
     columns: Directions,
     axis: Callable[[list[FloatArray], Directions], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """``axis(profiles, directions)`` of rows and columns; equal axes share one computation."""
-    terms = setting.mask.terms
+    """A shadow along rows and along columns; equal axes share one computation.
+
+    Parameters
+    ----------
+    shadow, rows, columns
+        the mask, and directions along the two axes.
+    axis
+        gives the shadow of profiles toward directions.
+    """
+    terms = shadow.mask.terms
     row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
     left = axis(row_profiles, rows)
     if rows.same_as(columns) and np.array_equal(row_profiles, column_profiles):
@@ -152,32 +167,41 @@ def both_axes(
     return left, axis(column_profiles, columns)
 
 
-def geometric_terms(setting: Setting, rows: Directions, columns: Directions) -> SeparableTerms:
-    """Geometric shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left."""
-    means = _thick_means if setting.thickness_mm else _thin_means
-    left, right = both_axes(setting, rows, columns, lambda profiles, at: means(setting, profiles, at))
-    return [(weight * a, b) for weight, a, b in zip(setting.weights(), left, right, strict=True)]
+def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> SeparableTerms:
+    """Geometric shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left.
+
+    Parameters
+    ----------
+    shadow
+        sensor, mask and depth.
+    rows, columns
+        r and c directions.
+    """
+    means = _thick_means if shadow.thickness_mm else _thin_means
+    left, right = both_axes(shadow, rows, columns, lambda profiles, at: means(shadow, profiles, at))
+    return [(weight * a, b) for weight, a, b in zip(shadow.weights(), left, right, strict=True)]
 
 
-def _thin_means(setting: Setting, profiles: list[FloatArray], directions: Directions) -> FloatArray:
+def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
     """(terms, m, c) mean transmissions."""
-    feature = setting.mask.feature_mm
-    if setting.half_pixel + setting.half_cell(directions) > _WIDE * feature:
-        steps, crossings = [Steps.of(profile, feature) for profile in profiles], setting.crossings(directions)
-        return np.stack([one.box_means(crossings, setting.half_pixel, setting.half_cell(directions)) for one in steps])
-    centre = setting.crossings(directions) / feature
-    half_pixel, half_cell = np.array(setting.half_pixel / feature), np.array(setting.half_cell(directions) / feature)
+    feature = shadow.mask.feature_mm
+    if shadow.half_pixel + shadow.half_cell(directions) > _WIDE * feature:
+        steps, crossings = [Steps.of(profile, feature) for profile in profiles], shadow.crossings(directions)
+        boxes = crossings, shadow.half_pixel, shadow.half_cell(directions)
+        return np.stack([profile.box_means(*boxes) for profile in steps])
+    centre = shadow.crossings(directions) / feature
+    half_pixel, half_cell = np.array(shadow.half_pixel / feature), np.array(shadow.half_cell(directions) / feature)
     return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])
 
 
-def _thick_means(setting: Setting, profiles: list[FloatArray], directions: Directions) -> FloatArray:
+def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
     """(terms, m, c) mean transmissions through both faces."""
-    crossings, half_cell = setting.crossings(directions), setting.half_cell(directions)
-    found = np.empty((len(setting.weights()), *crossings.shape))
+    crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
+    means = np.empty((len(shadow.weights()), *crossings.shape))
     for j, tau in enumerate(directions.centres):
-        for term, clear in enumerate(setting.clear(profiles, float(tau))):
-            found[term, :, j] = clear.box_means(crossings[:, j], setting.half_pixel, half_cell)
-    return found
+        for term, clear in enumerate(shadow.clear(profiles, float(tau))):
+            means[term, :, j] = clear.box_means(crossings[:, j], shadow.half_pixel, half_cell)
+    return means
 
 
 def shadow_factor(
@@ -234,7 +258,15 @@ def scene_factor(
     mask_distance_mm: float,
     depth_mm: float,
 ) -> FloatArray:
-    """:func:`shadow_factor` for scene pixels: (c + 1,) edges [mm] on the plane at ``depth_mm``."""
+    """:func:`shadow_factor` for scene pixels.
+
+    Parameters
+    ----------
+    profile, feature_mm, pixel_edges_mm, mask_distance_mm, depth_mm
+        as there.
+    scene_edges_mm
+        (c + 1,) increasing edges of the scene's pixels on the plane at ``depth_mm``.
+    """
     _require_positive("scene depth", depth_mm)
     tan_edges = np.asarray(scene_edges_mm, dtype=np.float64) / depth_mm
     return shadow_factor(profile, feature_mm, pixel_edges_mm, tan_edges, mask_distance_mm, depth_mm)

@@ -15,7 +15,16 @@ from mitsim.core.errors import MitsimError
 
 
 def speckled(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
-    """Irradiance times a gamma field of mean 1 and standard deviation ``contrast`` (0..1); shape and unit are kept.
+    """Irradiance times a gamma field of mean 1.
+
+    Parameters
+    ----------
+    irradiance
+        any shape and unit, which the result has.
+    contrast
+        the field's standard deviation, 0 to 1.
+    rng
+        where the field is drawn from.
 
     Raises
     ------

@@ -3,22 +3,9 @@
 from __future__ import annotations
 
 from mitsim.optics.diffraction import wave_terms
-from mitsim.optics.shadow import Directions, SeparableTerms, Setting, geometric_terms
+from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
-
-
-def shadow_setting(geometry: CameraGeometry, depth: float) -> Setting:
-    """Sensor and mask of ``geometry`` and a ``depth`` [mm] of the scene, for one shadow."""
-    edges = geometry.pixel_edges
-    return Setting(
-        mask=geometry.build_mask(),
-        pixel_centres_mm=(edges[:-1] + edges[1:]) / 2,
-        active_mm=geometry.active_side,
-        distance_mm=geometry.mask_distance,
-        thickness_mm=geometry.mask_thickness,
-        depth_mm=depth,
-    )
 
 
 def shadow_terms(
@@ -40,8 +27,8 @@ def shadow_terms(
     spectrum
         wave-optical with one: each wavelength has terms of its own, weighted by its share. None: geometric.
     """
-    place = shadow_setting(geometry, depth)
-    terms = geometric_terms(place, rows, columns) if spectrum is None else wave_terms(place, rows, columns, spectrum)
+    shadow = ShadowGeometry.of(geometry, depth)
+    terms = geometric_terms(shadow, rows, columns) if spectrum is None else wave_terms(shadow, rows, columns, spectrum)
     if geometry.pixel_fill_factor == 1:
         return terms
     return [(geometry.pixel_fill_factor * left, right) for left, right in terms]

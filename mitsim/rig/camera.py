@@ -21,23 +21,35 @@ from mitsim.rig.mask import Mask, MaskKind, mls_mask
 class CameraGeometry(BaseModel):
     """Bare sensor under a coded mask; the defaults are the geometry of Zheng & Asif, section IV-A."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side (square sensor)")
+    """More than the largest square sensors, 10 560; a frame of it has 2 GiB."""
     pixel_pitch: float = Field(0.01172, ge=1e-6, le=1e3, description="sensor pixel pitch [mm]")
+    """A nanometre to a metre: shadows keep at least eight digits there (tests/hard/test_hard_optics.py)."""
     mask: MaskKind = Field("separable", description="mask construction")
     mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
+    """The orders of :func:`mitsim.rig.mask.mls_code`: 3 to 65 535 features a side."""
     mask_feature: float = Field(0.06, ge=1e-6, le=1e3, description="mask feature size [mm]")
-    mask_distance: float = Field(2.0, ge=1e-9, description="sensor to the mask's near face [mm]")
-    mask_thickness: float = Field(0.0, ge=0, description="mask thickness [mm]; 0 is a thin mask")
-    scene_distance: float = Field(400.0, gt=0, description="sensor to the plane that the rig is aligned to [mm]")
-    fov: float = Field(20.0, gt=0, lt=180, description="full angle of the square field stop [degrees]")
+    """As pixels; lithography ends at some 10 nm, masks of telescopes at some cm."""
+    mask_distance: float = Field(2.0, ge=1e-9, le=1e7, description="sensor to the mask's near face [mm]")
+    """A picometre, in contact, to 10 km; masks of gamma-ray telescopes stand 10 m away."""
+    mask_thickness: float = Field(0.0, ge=0, le=1e7, description="mask thickness [mm]; 0 is a thin mask")
+    """As the distance; a mask must end before the scene."""
+    scene_distance: float = Field(
+        400.0, ge=1e-6, le=1e10, description="sensor to the plane that the rig is aligned to [mm]"
+    )
+    """A nanometre, for masks in contact, to 10 000 km."""
+    fov: float = Field(20.0, ge=1e-3, lt=180, description="full angle of the square field stop [degrees]")
+    """3.6 seconds of arc, the width of a star's blur, to all that a plane can see."""
     pixel_fill_factor: float = Field(
-        1.0, gt=0, le=1, description="part of a pixel that is active, a centred square; 1 is the whole pixel"
+        1.0, ge=1e-4, le=1, description="part of a pixel that is active, a centred square; 1 is the whole pixel"
     )
+    """Pixels with a counter each fill some 1e-2."""
     angular_exponent: float = Field(
-        0.0, ge=0, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
+        0.0, ge=0, le=1000, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
     )
+    """1000 halves the response at 2 degrees, far less than any microlens."""
 
     @model_validator(mode="after")
     def _mask_lies_before_the_scene(self) -> CameraGeometry:
@@ -50,7 +62,7 @@ class CameraGeometry(BaseModel):
 
     @classmethod
     def checked(cls, where: str, **values: object) -> CameraGeometry:
-        """Build from loose values; a bad one raises MitsimError with one line that names ``where``."""
+        """Build from loose ``values``; a bad one raises MitsimError with one line that begins with ``where``."""
         return validated(cls, values, where)
 
     @property
@@ -68,12 +80,18 @@ class CameraGeometry(BaseModel):
         """(pixels + 1,) pixel edges [mm]."""
         return centred_edges(self.pixels, self.pixel_pitch)
 
+    @property
+    def pixel_centres(self) -> FloatArray:
+        """(pixels,) centres [mm]."""
+        edges = self.pixel_edges
+        return np.asarray((edges[:-1] + edges[1:]) / 2)
+
     def build_mask(self) -> Mask:
         """The mask that these numbers describe."""
         return mls_mask(self.mask, self.mask_feature, self.mask_order)
 
     def fresnel_number(self, wavelength_nm: float) -> float:
-        """a^2 / (lambda d) of one mask feature: well above 1 means that a geometric shadow is good."""
+        """a^2 / (lambda d) of one mask feature at ``wavelength_nm``: well above 1, a geometric shadow is good."""
         return self.mask_feature**2 / (wavelength_nm * 1e-6 * self.mask_distance)
 
     @property
@@ -90,12 +108,12 @@ class CameraGeometry(BaseModel):
         return self.pixel_pitch * math.sqrt(self.pixel_fill_factor)
 
     def angular_response(self, squared_tan: FloatArray) -> FloatArray:
-        """A pixel's response, relative to normal incidence, to rays of the given tan^2(theta): cos^n(theta)."""
+        """A pixel's response, relative to normal incidence, to rays of ``squared_tan``, tan^2(theta): cos^n(theta)."""
         return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
 
 
 def centred_edges(count: int, pitch: float) -> FloatArray:
-    """(count + 1,) edges of ``count`` equal cells centred on zero, in the unit of ``pitch``."""
+    """(count + 1,) edges of ``count`` equal cells centred on zero, in the unit of ``pitch``; MitsimError for none."""
     if count < 1 or not (np.isfinite(pitch) and pitch > 0):
         raise MitsimError(f"a grid of {count} cells of size {pitch} is empty; give at least 1 cell and a size above 0")
     return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)

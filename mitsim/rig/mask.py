@@ -1,4 +1,4 @@
-"""A coded mask: from a 0/1 code and a feature size to its transmission at any point of the mask plane.
+"""A coded mask: from a 0/1 code, a construction and a feature size to its transmission at any point of the mask plane.
 
 Coordinates are the project's index coordinates, ``s_row = -y`` and ``s_col = -x`` in mm, centred on the
 optical axis, so that an index grows with its coordinate. The mask is opaque outside its features.
@@ -7,22 +7,31 @@ optical axis, so that an index grows with its coordinate. The mask is opaque out
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import max_len_seq
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 
 MaskKind = Literal["separable", "flatcam", "open"]
+"""How a plate is made from a code; see :class:`Mask`."""
 Term = tuple[float, FloatArray, FloatArray]
+"""Weight, row profile (N,) and column profile (N,) of a separable part of a transmission."""
+# fmt: off
+_TAPS = {
+    2: (1,), 3: (2,), 4: (3,), 5: (3,), 6: (5,), 7: (6,), 8: (7, 6, 1), 9: (5,), 10: (7,), 11: (9,), 12: (11, 10, 4),
+    13: (12, 11, 8), 14: (13, 12, 2), 15: (14,), 16: (15, 13, 4),
+}
+# fmt: on
+"""Feedback taps by order: those of ``scipy.signal.max_len_seq``, so that masks are the papers'."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """An opaque plate with a square grid of features, each open or closed.
+    """An opaque plate with a square grid of features, each open or closed; MitsimError for values out of range.
 
     Attributes
     ----------
@@ -72,7 +81,7 @@ class Mask:
         return ((0.5, ones, ones), (0.5, signed, signed))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
-        """Transmission (0..1) at points of the mask plane [mm, index coordinates]; the arrays broadcast."""
+        """Transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm]; the arrays broadcast."""
         row, row_inside = self._feature(s_row)
         column, column_inside = self._feature(s_col)
         total = sum(weight * rows[row] * columns[column] for weight, rows, columns in self.terms)
@@ -86,11 +95,37 @@ class Mask:
         return np.where(inside, position, 0).astype(np.intp), inside
 
 
-def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int = 9) -> Mask:
-    """Mask of the code ``scipy.signal.max_len_seq(order)[0]``: 2**order - 1 features a side.
+@cache
+def mls_code(order: int) -> npt.NDArray[np.int8]:
+    """(2**order - 1,) bits of the maximum length sequence of an ``order`` from 2 to 16, read-only.
 
-    The polynomial and phase matter: another sequence moves the system's condition number by tens of percent.
+    The bits of ``scipy.signal.max_len_seq(order)[0]``, whose import alone takes a second: a linear feedback shift
+    register that starts with ones. Polynomial and phase matter: another sequence moves the system's condition number
+    by tens of percent. MitsimError for another order.
     """
-    if isinstance(order, bool) or not isinstance(order, int) or not 2 <= order <= 16:
+    if isinstance(order, bool) or not isinstance(order, int) or order not in _TAPS:
         raise MitsimError(f"mask order is {order!r}; give a whole number from 2 to 16 (2**order - 1 features a side)")
-    return Mask(kind, feature_mm, max_len_seq(order)[0].astype(np.int8))
+    bits = [1] * order
+    for start in range(2**order - 1 - order):
+        bit = bits[start]
+        for tap in _TAPS[order]:
+            bit ^= bits[start + tap]
+        bits.append(bit)
+    code = np.array(bits, dtype=np.int8)
+    code.flags.writeable = False
+    return code
+
+
+def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int = 9) -> Mask:
+    """The mask of :func:`mls_code`; the defaults are the paper's.
+
+    Parameters
+    ----------
+    kind
+        construction, see :class:`Mask`.
+    feature_mm
+        side of a feature [mm].
+    order
+        2 to 16: the mask has 2**order - 1 features a side.
+    """
+    return Mask(kind, feature_mm, mls_code(order))

@@ -15,10 +15,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import hadamard as sylvester
 
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 
-IntArray = npt.NDArray[np.int8]
+PatternFactor = npt.NDArray[np.int8]
+"""(n, K) of 0/1 or +-1: one side of K separable patterns."""
+_MOST_DIGITS = 9
+"""Digits of K that are read; no projector has 1e9 pixels a side."""
 
 
 @dataclass(frozen=True)
@@ -37,22 +41,22 @@ class Capture:
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Which projector pixels are lit in which shot.
+    """Which light belongs together, and how much of it each capture shows.
 
     Attributes
     ----------
     labels
-        (n^2,) class of each pixel, row-major: pixels of a class are always lit alike.
+        (n^2,) class of each projector pixel, 0 to C - 1; or of each row of light, where pixels share rows.
     weights
-        (shots, classes) part of full power that a class emits in each shot.
+        (captures, C) fraction 0..1 of full power that each class emits in each capture.
     """
 
-    labels: npt.NDArray[np.int64]
-    weights: npt.NDArray[np.float64]
+    labels: Labels
+    weights: FloatArray
 
     @classmethod
     def uniform(cls, n: int) -> Lighting:
-        """One shot with all n x n pixels fully lit."""
+        """One capture with each of ``n`` x ``n`` projector pixels fully lit."""
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
     def shots(self, chosen: npt.ArrayLike) -> Lighting:
@@ -73,8 +77,8 @@ class PatternFamily:
     """
 
     name: str
-    left: IntArray
-    right: IntArray
+    left: PatternFactor
+    right: PatternFactor
 
     @property
     def n(self) -> int:
@@ -94,21 +98,21 @@ class PatternFamily:
             Capture(i, j, sign) for i in range(self.left.shape[1]) for j in range(self.right.shape[1]) for sign in signs
         )
 
-    def light(self, capture: Capture) -> npt.NDArray[np.float64]:
-        """(n, n) fraction 0..1 of full power that each projector pixel emits in one capture."""
+    def light(self, capture: Capture) -> FloatArray:
+        """(n, n) fraction 0..1 of full power that each projector pixel emits in one ``capture``."""
         pattern = np.outer(self.left[:, capture.row], self.right[:, capture.column]).astype(np.float64)
         return np.asarray(pattern if capture.sign == 0 else (1 + capture.sign * pattern) / 2)
 
     @cached_property
     def lighting(self) -> Lighting:
-        """The finest partition of the pixels whose members are always lit alike, and its shots."""
+        """The finest partition of the pixels whose members are always lit alike, and every capture's light of it."""
         _, row = np.unique(self.left, axis=0, return_inverse=True)
         _, column = np.unique(self.right, axis=0, return_inverse=True)
         label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
-        _, first, found = np.unique(label, return_index=True, return_inverse=True)
+        _, first, sorted_label = np.unique(label, return_index=True, return_inverse=True)
         # Numbered by first appearance, so that shifting dots have one class a capture, in the same order.
-        order = np.argsort(first)
-        first, labels = first[order], np.argsort(order)[found.ravel()]
+        by_appearance = np.argsort(first)
+        first, labels = first[by_appearance], np.argsort(by_appearance)[sorted_label.ravel()]
         captures = self.captures
         i, j = np.array([c.row for c in captures]), np.array([c.column for c in captures])
         sign = np.array([c.sign for c in captures])[:, None]
@@ -116,17 +120,17 @@ class PatternFamily:
         return Lighting(labels, np.where(sign == 0, pattern, (1 + sign * pattern) / 2))
 
 
-def shifting_dots(n: int, k: int) -> IntArray:
-    """(n, k): column i lights every k-th pixel from i on; n need not be a multiple of k."""
+def _shifting_dots(n: int, k: int) -> PatternFactor:
+    """(n, k) of 0/1: column i lights every ``k``-th of ``n`` pixels from i on; n need not be a multiple of k."""
     return np.asarray(np.arange(n)[:, None] % k == np.arange(k)[None, :], dtype=np.int8)
 
 
-def repeated_hadamard(n: int, k: int) -> IntArray:
-    """(n, k): rows of the order-k Hadamard matrix, repeated down the grid."""
+def _repeated_hadamard(n: int, k: int) -> PatternFactor:
+    """(n, k) of +-1: the rows of the Hadamard matrix of order ``k``, repeated down ``n`` pixels."""
     return np.asarray(hadamard_matrix(k)[np.arange(n) % k])
 
 
-def random_binary(n: int, k: int, seed: int, side: str) -> IntArray:
+def _random_binary(n: int, k: int, seed: int, side: str) -> PatternFactor:
     """(n, k) fair coin flips, each pixel lit by at least one column: the union must cover the scene."""
     rng = stream(seed, "patterns", "random", side)
     bits = rng.integers(0, 2, size=(n, k), dtype=np.int8)
@@ -135,8 +139,8 @@ def random_binary(n: int, k: int, seed: int, side: str) -> IntArray:
     return bits
 
 
-def hadamard_matrix(order: int) -> IntArray:
-    """(order, order) matrix H of +-1 with H H^T = order I, first column all ones.
+def hadamard_matrix(order: int) -> PatternFactor:
+    """(``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones.
 
     Built from Sylvester's doubling (SciPy) and Paley's two constructions over prime fields (R. Paley, 1933), and their
     Kronecker products; :func:`hadamard_orders` lists what that covers (every multiple of 4 up to 48, then gaps).
@@ -195,32 +199,25 @@ def _is_prime(value: int) -> bool:
     return value > 1 and all(value % factor for factor in range(2, int(value**0.5) + 1))
 
 
-def _uniform(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
-    return np.ones((n, 1), dtype=np.int8), np.ones((n, 1), dtype=np.int8)
-
-
-def _dots(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
-    return shifting_dots(n, k), shifting_dots(n, k)
-
-
-def _hadamard(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
-    return repeated_hadamard(n, k), repeated_hadamard(n, k)
-
-
-def _random(n: int, k: int, seed: int) -> tuple[IntArray, IntArray]:
-    return random_binary(n, k, seed, "left"), random_binary(n, k, seed, "right")
-
-
-FAMILIES: dict[str, Callable[[int, int, int], tuple[IntArray, IntArray]]] = {
-    "uniform": _uniform,
-    "dots": _dots,
-    "hadamard": _hadamard,
-    "random": _random,
+_SAME_BOTH_SIDES: dict[str, Callable[[int, int], PatternFactor]] = {
+    "uniform": lambda n, k: np.ones((n, 1), dtype=np.int8),
+    "dots": _shifting_dots,
+    "hadamard": _repeated_hadamard,
 }
+"""Families whose rows and columns show alike: from n and K to (n, K)."""
 
 
 def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
-    """The family named ``uniform``, ``dots:K``, ``hadamard:K`` or ``random:K`` on an n x n projector.
+    """The family of a name.
+
+    Parameters
+    ----------
+    text
+        ``uniform``, ``dots:K``, ``hadamard:K`` or ``random:K``.
+    n
+        projector pixels a side.
+    seed
+        of the random family.
 
     Raises
     ------
@@ -228,12 +225,14 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
         for an unknown family, a K that is not a whole number, or K outside 1..n.
     """
     name, colon, size = text.partition(":")
-    if name not in FAMILIES or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
+    if name not in (*_SAME_BOTH_SIDES, "random") or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
         raise MitsimError(f"patterns {text!r}: use uniform, dots:K, hadamard:K or random:K")
-    if colon and not (size.isascii() and size.isdigit() and len(size) < 10):
+    if colon and not (size.isascii() and size.isdigit() and len(size) <= _MOST_DIGITS):
         raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {n}")
     k = int(size or 1)
     if not 1 <= k <= n:
         raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {n}, the projector's pixels a side")
-    left, right = FAMILIES[name](n, k, seed)
-    return PatternFamily(text, left, right)
+    if name == "random":
+        return PatternFamily(text, _random_binary(n, k, seed, "left"), _random_binary(n, k, seed, "right"))
+    factor = _SAME_BOTH_SIDES[name](n, k)
+    return PatternFamily(text, factor, factor)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -11,10 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 
+_UNIT = 1e-3
+"""How far shares may sum from 1: three written digits."""
+
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Wavelengths and the share of the photons at each.
+    """Wavelengths and the share of the photons at each; MitsimError for arrays that are none.
 
     Attributes
     ----------
@@ -45,22 +49,58 @@ class Spectrum:
             object.__setattr__(self, name, array)
 
 
-class ProjectorModel(BaseModel):
-    """What mitsim uses of a projector file; the rest of the file documents its sources."""
+Nanometres = Annotated[float, Field(ge=1, le=1e6)]
+"""Wavelength [nm]: from soft X-rays to a millimetre."""
+Share = Annotated[float, Field(ge=0, le=1)]
+"""Part of a whole."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+
+class ProjectorModel(BaseModel):
+    """A projector's light and lens, and where their numbers come from.
+
+    Ranges hold every device known, with room. The fields from ``luminous_flux_lm`` on are not simulated: from them
+    follows the power that scenes state, irradiance = flux / efficacy / area of the picture.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     name: str = Field(description="what the projector is called in reports")
-    effective_wavelength_nm: float = Field(
-        gt=0, allow_inf_nan=False, description="one wavelength that carries as many photons per watt [nm]"
+    effective_wavelength_nm: Nanometres = Field(description="one wavelength that carries as many photons per watt [nm]")
+    wavelengths_nm: tuple[Nanometres, ...] = Field(
+        (), strict=False, max_length=256, description="spectral lines [nm]; none: the effective wavelength"
     )
-    wavelengths_nm: tuple[float, ...] = Field((), description="spectral lines [nm]; none: the effective wavelength")
-    radiant_shares: tuple[float, ...] = Field((), description="part of the power in each line")
-    contrast_ratio: float = Field(math.inf, gt=1, description="light of a white pixel over that of a black one")
-    aperture_radius_mm: float = Field(0.0, ge=0, allow_inf_nan=False, description="radius of the lens [mm]; 0: pinhole")
-    focus_mm: float | None = Field(None, gt=0, description="distance of the sharp plane [mm]; none: scene_distance")
+    """A lamp's visible spectrum in steps of 2 nm has 200; each costs a shadow of its own."""
+    radiant_shares: tuple[Share, ...] = Field((), strict=False, description="part of the power in each line; sum 1")
+    contrast_ratio: float = Field(
+        math.inf, gt=1, allow_inf_nan=True, description="light of a white pixel over that of a black one"
+    )
+    """Without an upper end: inf is a black that is black."""
+    aperture_radius_mm: float = Field(0.0, ge=0, le=1000, description="radius of the lens [mm]; 0: pinhole")
+    """Lenses for the largest screens have some 100."""
+    focus_mm: float | None = Field(
+        None, ge=1, le=1e7, description="distance of the sharp plane [mm]; none: scene_distance"
+    )
+    """A millimetre, for microscopes, to 10 km."""
     speckle_contrast: float = Field(0.0, ge=0, le=1, description="of one sensor pixel's light; see docs/physics.md")
-    blur_pixels: float = Field(0.0, ge=0, allow_inf_nan=False, description="spot's standard deviation [pixels]")
+    """1 is speckle fully developed; more needs light that is not laser light."""
+    blur_pixels: float = Field(0.0, ge=0, le=16, description="spot's standard deviation [pixels]")
+    """16 leaves 0.7 % of the contrast of stripes of 16 pixels: a projector with fewer pixels than it says."""
+    luminous_flux_lm: float | None = Field(None, ge=1e-3, le=1e6, description="light of a white picture [lm]")
+    """The largest cinemas have 75 000."""
+    luminous_efficacy_lm_per_w: float | None = Field(None, ge=0, le=684, description="lumens per watt of light")
+    """683 at most, at 555 nm."""
+    radiant_flux_w: float | None = Field(None, ge=1e-9, le=1e5, description="power of a white picture's light [W]")
+    """The largest cinemas have some 300."""
+    throw_ratio: float | None = Field(None, ge=0.01, le=100, description="distance over width of the picture")
+    """0.2 beside the screen, 15 across a hall."""
+    columns: int | None = Field(None, ge=1, le=65536, description="pixels a row of the device's own raster")
+    rows: int | None = Field(None, ge=1, le=65536, description="rows of the device's own raster")
+    laser_class: Literal["1", "1C", "1M", "2", "2M", "3R", "3B", "4"] | None = Field(
+        None, description="class printed on the device (IEC 60825-1)"
+    )
+    assumed: tuple[str, ...] = Field((), strict=False, description="fields without a public measurement")
+    derived: tuple[str, ...] = Field((), strict=False, description="fields computed from others")
+    source: str = Field("", description="where the numbers come from")
 
     @model_validator(mode="after")
     def _lines_have_shares(self) -> ProjectorModel:
@@ -69,6 +109,15 @@ class ProjectorModel(BaseModel):
                 f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares; "
                 "give one share a line"
             )
+        if self.radiant_shares and abs(sum(self.radiant_shares) - 1) > _UNIT:
+            raise ValueError(f"radiant_shares sum to {sum(self.radiant_shares):g}; they must sum to 1")
+        return self
+
+    @model_validator(mode="after")
+    def _listed_fields_exist(self) -> ProjectorModel:
+        unknown = [name for name in (*self.assumed, *self.derived) if name not in type(self).model_fields]
+        if unknown:
+            raise ValueError(f"assumed and derived list fields of this file, and {unknown[0]!r} is none")
         return self
 
     @property

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import load_model, shipped
+from mitsim.rig.sensor import ExposureFraction
 
 
 class SessionRecipe(BaseModel):
-    """How a calibration session is run."""
+    """A session's board and exposure, and how signed patterns are taken."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    board_reflectance: float = Field(gt=0, le=1, description="diffuse reflectance of the white board")
-    exposure_fraction: float = Field(gt=0, le=1, description="brightest pixel's mean, as a part of the full well")
-    signed_capture: str = Field(pattern="^(pair|uniform)$", description="how a +-1 pattern is captured")
+    board_reflectance: float = Field(ge=0.01, le=1, description="diffuse reflectance of the white board")
+    """Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
+    exposure_fraction: ExposureFraction = Field(description="brightest pixel's mean, as a part of the full well")
+    signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern is captured")
     source: str = Field(description="where the numbers come from")
 
 
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:
-    """The calibration session's recipe, the shipped one without ``path``."""
+    """The recipe in the TOML file at ``path``, or the shipped one; MitsimError names the field that breaks a rule."""
     return load_model(Path(path) if path is not None else shipped("calibration", "session.toml"), SessionRecipe)

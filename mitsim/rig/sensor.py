@@ -4,12 +4,14 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mitsim.core.configuration import load_model
 
-Positive = Annotated[float, Field(ge=1e-12, le=1e12, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
+ExposureSeconds = Annotated[float, Field(strict=True, ge=1e-12, le=1e6, allow_inf_nan=False)]
+"""One exposure [s]. Gated avalanche diodes open for 1e-10 s; charge on a cooled CCD is collected for some 1e4 s."""
+ExposureFraction = Annotated[float, Field(strict=True, ge=1e-6, le=1, allow_inf_nan=False)]
+"""Mean of the brightest pixel as a part of the full well. A millionth is less than an electron of most wells."""
 _LARGEST_CODE = 2**32 - 1
 """What a frame's uint32 holds."""
 
@@ -22,21 +24,39 @@ class SensorModel(BaseModel):
     times b^2, gain unchanged, read noise times b (b^2 independent readings), black level and largest code
     times b^2 (the sum of b^2 codes needs more bits than one). The sum is rounded once where a camera rounds
     each pixel, which leaves out (b^2 - 1)/12 DN^2 of variance.
+
+    Ranges hold every device known, with room: what lies outside is a slip of the unit or of the keyboard.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     name: str = Field(description="what the sensor is called in reports")
-    pixel_pitch_um: Positive = Field(description="distance between centres of the square pixels, um")
+    pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="distance between centres of the square pixels, um")
+    """Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
     binning: int = Field(default=1, ge=1, le=64, description="pixels summed along each side of a superpixel")
-    full_well_e: float = Field(ge=1e-12, description="electrons a pixel holds; inf = no limit")
-    read_noise_e: NonNegative = Field(description="standard deviation of one pixel's reading, electrons")
-    dark_current_e_per_s: NonNegative = Field(default=0.0, description="electrons a second and pixel")
-    quantum_efficiency: float = Field(gt=0, le=1, description="electrons per photon, at source's wavelength")
-    gain_dn_per_e: Positive = Field(description="digital numbers per electron")
-    black_level_dn: NonNegative = Field(default=0.0, description="digital number of a pixel without charge")
+    """Cameras bin up to 16 x 16."""
+    full_well_e: float = Field(ge=0.1, allow_inf_nan=True, description="electrons a pixel holds; inf = no limit")
+    """An avalanche diode counts one; read-outs of infrared arrays integrate 1e8, so 1e12 is the most, or inf."""
+    read_noise_e: float = Field(ge=0, le=1e6, description="standard deviation of one pixel's reading, electrons")
+    """0.2 in the quietest cameras, some 1e4 in photodiode arrays."""
+    dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10, description="electrons a second and pixel")
+    """Warm infrared arrays have 1e8."""
+    quantum_efficiency: float = Field(ge=1e-6, le=1, description="electrons per photon, at source's wavelength")
+    """One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
+    gain_dn_per_e: float = Field(ge=1e-12, le=1e6, description="digital numbers per electron")
+    """1e-12 spreads the largest full well over one number; electron multiplication brings some 1e3."""
+    black_level_dn: float = Field(default=0.0, ge=0, lt=2**24, description="digital number of a pixel without charge")
+    """Below the largest ADC's last number."""
     bits: int | None = Field(default=None, ge=1, le=24, description="bits of the ADC; None = real output")
+    """Cameras have up to 16, laboratory converters 24."""
     source: str = Field(description="where the numbers come from")
+
+    @field_validator("full_well_e")
+    @classmethod
+    def _a_known_well_or_none(cls, electrons: float) -> float:
+        if 1e12 < electrons < math.inf:
+            raise ValueError("a full well is 0.1 to 1e+12 electrons, or inf for none")
+        return electrons
 
     @model_validator(mode="after")
     def _room_above_black(self) -> "SensorModel":
@@ -92,7 +112,7 @@ class SensorModel(BaseModel):
 
 
 def load_sensor(path: Path | str) -> SensorModel:
-    """The sensor in a TOML file. Raises MitsimError naming the file, field, value and rule."""
+    """The sensor in the TOML file at ``path``. MitsimError names the file, field, value and rule."""
     return load_model(path, SensorModel)
 
 
@@ -103,6 +123,15 @@ def paper_sensor(full_well_e: float, gain: float, dynamic_range_db: float) -> Se
     electrons, and the output is in the unit of Y. It neither clips at the full well nor quantises, so
     `full_well_e` is infinite here and F sets only gain and noise; expected electrons are `measurement /
     model.gain_dn_per_e`. The pitch is the binned one of the paper's camera and plays no part in the noise.
+
+    Parameters
+    ----------
+    full_well_e
+        F, electrons of the largest measurement.
+    gain
+        G, the largest measurement.
+    dynamic_range_db
+        R, of F over the read noise.
     """
     return SensorModel(
         name="paper noise model",

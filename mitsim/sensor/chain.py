@@ -11,23 +11,35 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.units import photon_energy
 from mitsim.rig.sensor import SensorModel
 
-Array = npt.NDArray[np.float64]
-Digital = npt.NDArray[np.float64] | npt.NDArray[np.uint32]
+Digital = FloatArray | npt.NDArray[np.uint32]
+"""Digital numbers: codes, or real values of a sensor without bits."""
 _MANY = 1e11
 """Electrons above which numpy's Poisson draw loses digits: its variance is 1 % off at 1e14, 100 times at 1e17."""
 
 
 def electrons_from_irradiance(
     irradiance: npt.ArrayLike, exposure_s: float, model: SensorModel, wavelength_nm: float
-) -> Array:
-    """Expected photoelectrons (without dark current) from irradiance in W/m^2, any shape.
+) -> FloatArray:
+    """Expected photoelectrons, without dark current.
 
-    mu_e = eta E A t / (h c / lambda), EMVA 1288 4.0, "sensitivity". Raises ValueError for negative or NaN
-    irradiance.
+    mu_e = eta E A t / (h c / lambda), EMVA 1288 4.0, "sensitivity". ValueError for negative or NaN irradiance or
+    exposure.
+
+    Parameters
+    ----------
+    irradiance
+        [W m^-2], any shape, which the result has.
+    exposure_s
+        0 or more.
+    model
+        the sensor.
+    wavelength_nm
+        of the light.
     """
     light = checked_light(irradiance, "irradiance")
     if not 0 <= exposure_s < math.inf:
@@ -36,9 +48,18 @@ def electrons_from_irradiance(
 
 
 def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorModel, wavelength_nm: float) -> float:
-    """Exposure time in seconds after which `peak_irradiance` (W/m^2), with dark current, fills `fraction`
-    of the full well in the mean. Raises MitsimError if there is no light, no full well, or the fraction is
-    not in (0, 1].
+    """Exposure [s] after which light and dark current fill a part of the full well in the mean.
+
+    MitsimError when there is no light or no full well, or the fraction is not in (0, 1].
+
+    Parameters
+    ----------
+    peak_irradiance, wavelength_nm
+        of the light [W m^-2].
+    fraction
+        of the full well.
+    model
+        the sensor.
     """
     if not 0 < fraction <= 1:
         raise MitsimError(f"exposure: got fraction {fraction} of full well; allowed is above 0, up to 1")
@@ -60,21 +81,28 @@ def expose(
     shot_rng: np.random.Generator,
     read_rng: np.random.Generator,
 ) -> Digital:
-    """One noisy frame from expected photoelectrons (any shape): uint32 DN, or float64 where the model has
-    no bits.
+    """One noisy frame: uint32 DN, or float64 where the model has no bits. ValueError for negative or NaN electrons.
 
-    Dark electrons of `exposure_s` are added here. `shot_rng` and `read_rng` must be streams of their own,
-    so that switching one noise off leaves the other's draw as it was. Raises ValueError for negative or NaN
-    electrons.
+    Parameters
+    ----------
+    expected_electrons
+        photoelectrons, any shape.
+    exposure_s
+        adds its dark electrons.
+    model
+        the sensor.
+    shot_rng, read_rng
+        streams of their own, so that switching one noise off leaves the other's draw as it was.
     """
     expected = add_dark_current(expected_electrons, exposure_s, model)
     electrons = clip_at_full_well(draw_electrons(expected, shot_rng), model)
     return quantise(amplify(add_read_noise(electrons, model, read_rng), model), model)
 
 
-def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> Array:
-    """What a user of frames does: (DN - black level) / gain, electrons, float64. Dark electrons stay in;
-    noise may make values negative, and they stay so.
+def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
+    """What a user of the frames ``dn`` of a ``model`` does: (DN - black level) / gain, in electrons.
+
+    Dark electrons stay in; noise may make values negative, and they stay so.
     """
     return (np.asarray(dn, dtype=np.float64) - model.superpixel_black_level_dn) / model.gain_dn_per_e
 
@@ -83,14 +111,22 @@ def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> Array:
 # -------------------------------------------------------------------------------------
 
 
-def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> Array:
-    """Expected photo- plus dark electrons, mu_e + mu_I t (EMVA 1288 4.0, "dark current"). Deterministic."""
+def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> FloatArray:
+    """Expected photo- plus dark electrons, mu_e + mu_I t (EMVA 1288 4.0, "dark current"). Deterministic.
+
+    Parameters
+    ----------
+    expected_electrons
+        photoelectrons, any shape; ValueError where negative or NaN.
+    exposure_s, model
+        time and sensor.
+    """
     expected = checked_light(expected_electrons, "expected_electrons")
     return expected + model.superpixel_dark_current_e_per_s * exposure_s
 
 
-def draw_electrons(expected: Array, rng: np.random.Generator) -> Array:
-    """Poisson electrons, float64; mean and variance are both `expected`.
+def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Poisson electrons from ``rng``, float64; mean and variance are both ``expected``.
 
     Above 1e11 by Cornish and Fisher's expansion, rounded, which is off by some 1/sqrt(mu) of an electron. Above 2^53 =
     9e15 not every whole number is a float64.
@@ -103,29 +139,36 @@ def draw_electrons(expected: Array, rng: np.random.Generator) -> Array:
     return np.where(many, np.rint(poisson_quantile(expected, z)), drawn)
 
 
-def poisson_quantile(expected: Array, z: Array | float) -> Array:
-    """Where a Poisson count's distribution equals that of a standard normal deviate z; Cornish and Fisher (1938)."""
+def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
+    """Count of mean ``expected`` as probable as the normal deviate ``z``; Cornish and Fisher (1938)."""
     return np.asarray(expected + np.sqrt(expected) * z + (np.square(z) - 1) / 6)
 
 
-def clip_at_full_well(electrons: Array, model: SensorModel) -> Array:
-    """Charge above the full well is lost: min(N, F). Moments: `moments.clipped_moments`."""
+def clip_at_full_well(electrons: FloatArray, model: SensorModel) -> FloatArray:
+    """``electrons`` less those above the ``model``'s full well: min(N, F). Moments: `moments.clipped_moments`."""
     return np.minimum(electrons, model.superpixel_full_well_e)
 
 
-def add_read_noise(electrons: Array, model: SensorModel, rng: np.random.Generator) -> Array:
-    """Normal noise of the superpixel's read noise; mean unchanged, variance plus sigma_d^2."""
+def add_read_noise(electrons: FloatArray, model: SensorModel, rng: np.random.Generator) -> FloatArray:
+    """Electrons with normal noise added; mean unchanged, variance plus sigma_d^2.
+
+    Parameters
+    ----------
+    electrons
+        any shape.
+    model, rng
+        whose read noise, and where it is drawn from.
+    """
     return electrons + model.superpixel_read_noise_e * rng.standard_normal(np.shape(electrons))
 
 
-def amplify(electrons: Array, model: SensorModel) -> Array:
-    """K (DN/e) electrons + black level, real-valued; mean times K plus black level, variance times K^2."""
+def amplify(electrons: FloatArray, model: SensorModel) -> FloatArray:
+    """``electrons`` times the ``model``'s gain K plus its black level, real-valued; variance times K^2."""
     return electrons * model.gain_dn_per_e + model.superpixel_black_level_dn
 
 
-def quantise(signal_dn: Array, model: SensorModel) -> Digital:
-    """The ADC: nearest code, saturating at 0 and at the largest code; passes real values through if bits is
-    None.
+def quantise(signal_dn: FloatArray, model: SensorModel) -> Digital:
+    """The ADC of ``model``: nearest code to ``signal_dn``, from 0 to the largest; without bits, the signal itself.
 
     Mean unchanged and variance plus 1/12 DN^2 (EMVA 1288 4.0, "noise model"), away from both ends and for
     noise above about half a code; elsewhere see `moments.frame_moments`.
@@ -139,7 +182,8 @@ def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
     return model.quantum_efficiency * model.superpixel_area_m2 / photon_energy(wavelength_nm)
 
 
-def checked_light(values: npt.ArrayLike, name: str) -> Array:
+def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:
+    """``values`` as float64; ValueError where one is negative or not finite, with their ``name``."""
     array = np.asarray(values, dtype=np.float64)
     if not np.all((array >= 0) & (array < np.inf)):
         raise ValueError(f"{name}: the range is {array.min()} to {array.max()}; all must be finite and 0 or more")

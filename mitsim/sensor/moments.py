@@ -10,21 +10,23 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from mitsim.core.arrays import FloatArray
 from mitsim.rig.sensor import SensorModel
-from mitsim.sensor.chain import Array, add_dark_current, amplify, checked_light, clip_at_full_well, poisson_quantile
+from mitsim.sensor.chain import add_dark_current, amplify, checked_light, clip_at_full_well, poisson_quantile
 
 _FEW = 64.0
-"""Electrons below which moments behind the ADC are summed count by count."""
+"""Electrons below which moments behind the ADC are summed count by count; chosen: some 150 counts hold all."""
 _SOME = 1e4
-"""Electrons below which they are summed over the counts that occur, on a grid of expected counts."""
+"""Electrons below which they are summed over the counts that occur, on a grid of expected counts; chosen: above, 129
+counts stand for all to 1 % of the variance (tests/hard/test_hard_sensor.py)."""
 _DITHERED = 0.8
 """Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
 _SMOOTH = 2.0
 """Standard deviation [DN] from which a sum over codes is an integral to 1e-4."""
 
 
-def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[Array, Array]:
-    """Mean and variance of min(N, F) for Poisson N with mean `expected` (any shape) and full well F.
+def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of min(N, F) for Poisson N with mean ``expected`` (any shape) and full well F, ``full_well_e``.
 
     With k P(N=k) = mu P(N=k-1), K = ceil(F), Q = P(N >= K), d = mu - F and e = mu P(N = K-1), the loss L = (N - F)^+
     has E[L] = d Q + e and E[L^2] = (d^2 + mu) Q + (mu + K - 2F) e. Below the full well, as L (F - min(N, F)) is 0,
@@ -40,7 +42,7 @@ def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[Array,
     return clipped, variance
 
 
-def _clipped(mean: Array, full_well_e: float) -> tuple[Array, Array]:
+def _clipped(mean: FloatArray, full_well_e: float) -> tuple[FloatArray, FloatArray]:
     """:func:`clipped_moments` without short cuts."""
     step = math.ceil(full_well_e)
     over = mean - full_well_e
@@ -55,7 +57,7 @@ def _clipped(mean: Array, full_well_e: float) -> tuple[Array, Array]:
     return np.where(dim, mean - loss, full_well_e - room), np.maximum(np.where(dim, low, high), 0.0)
 
 
-def _tails(count: int, mean: Array) -> tuple[Array, Array]:
+def _tails(count: int, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     """P(N >= count) and P(N < count) for Poisson N, each as a tail of its own, so that 1e-20 still has its digits.
 
     Large counts by Temme's uniform expansion (DLMF 8.12.8, one term: 1/count is left), because scipy's sums stop early
@@ -73,7 +75,7 @@ def _tails(count: int, mean: Array) -> tuple[Array, Array]:
     return np.maximum(above, 0.0), np.maximum(below, 0.0)
 
 
-def _poisson(count: int, mean: Array) -> Array:
+def _poisson(count: int, mean: FloatArray) -> FloatArray:
     """P(N = count) for Poisson N, by Loader's saddle point expansion (2000), which keeps its digits up to 1e15."""
     if count == 0:
         return np.exp(-mean)
@@ -86,9 +88,20 @@ def _poisson(count: int, mean: Array) -> Array:
         return np.asarray(np.exp(-remainder - count * (apart - np.log1p(apart))) / math.sqrt(2 * math.pi * count))
 
 
-def frame_moments(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> tuple[Array, Array]:
+def frame_moments(
+    expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
+) -> tuple[FloatArray, FloatArray]:
     """Mean (DN) and variance (DN^2) of `expose`'s output (EMVA 1288 4.0, photon transfer).
 
+    Parameters
+    ----------
+    expected_electrons
+        photoelectrons, any shape; ValueError where negative or NaN.
+    exposure_s, model
+        time and sensor.
+
+    Notes
+    -----
     Where an end of the ADC is within eight deviations, or too little noise dithers its codes, the moments are those of
     rounded and cut numbers: summed over the counts below 1e4 electrons, and averaged over 129 of them above.
     """
@@ -113,7 +126,7 @@ def frame_moments(expected_electrons: npt.ArrayLike, exposure_s: float, model: S
     return mean, total
 
 
-def _counted(expected: Array, model: SensorModel) -> tuple[Array, Array]:
+def _counted(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """:func:`frame_moments` as a sum over electron counts; `expected` (pixels,) of few electrons."""
     most = float(expected.max())
     counts = np.arange(int(most + 12 * math.sqrt(most)) + 20, dtype=np.float64)
@@ -127,7 +140,7 @@ def _counted(expected: Array, model: SensorModel) -> tuple[Array, Array]:
     return levels[0] + first, np.maximum(second - first**2, 0.0)
 
 
-def _summed(expected: Array, model: SensorModel) -> tuple[Array, Array]:
+def _summed(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """:func:`frame_moments` as a sum over the counts within 12 deviations, for some hundreds of electrons."""
     nodes = _grid(expected)
     reach = 12 * np.sqrt(nodes) + 20
@@ -146,7 +159,7 @@ def _summed(expected: Array, model: SensorModel) -> tuple[Array, Array]:
     return _between(expected, nodes, mean, variance)
 
 
-def _averaged(expected: Array, model: SensorModel) -> tuple[Array, Array]:
+def _averaged(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """:func:`frame_moments` as a mean over 129 electron counts, for many electrons."""
     nodes = _grid(expected)
     deviates = np.linspace(-8, 8, 129)
@@ -160,7 +173,7 @@ def _averaged(expected: Array, model: SensorModel) -> tuple[Array, Array]:
     return _between(expected, nodes, start + first, np.maximum(second - first**2, 0.0))
 
 
-def _grid(expected: Array) -> Array:
+def _grid(expected: FloatArray) -> FloatArray:
     """Expected counts at which moments are formed: those of the pixels, or fewer to interpolate between.
 
     Moments depend on the light alone, and smoothly: shot noise has a deviation of 1/2 in the root of the counts, and
@@ -171,14 +184,16 @@ def _grid(expected: Array) -> Array:
     return expected if count >= expected.size else np.square(np.linspace(roots.min(), roots.max(), count))
 
 
-def _between(expected: Array, nodes: Array, mean: Array, variance: Array) -> tuple[Array, Array]:
+def _between(
+    expected: FloatArray, nodes: FloatArray, mean: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     if nodes is expected:
         return mean, variance
     roots, places = np.sqrt(expected), np.sqrt(nodes)
     return np.interp(roots, places, mean), np.interp(roots, places, variance)
 
 
-def _read_out(electrons: Array, model: SensorModel) -> tuple[Array, Array]:
+def _read_out(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """Mean and variance [DN] of what the ADC makes of known electrons (pixels,), before the full well."""
     assert model.largest_dn is not None
     signal = amplify(clip_at_full_well(electrons, model), model)
@@ -186,7 +201,7 @@ def _read_out(electrons: Array, model: SensorModel) -> tuple[Array, Array]:
     return _rounded(signal, read, model.largest_dn)
 
 
-def _rounded(mean: Array, deviation: Array, largest: int) -> tuple[Array, Array]:
+def _rounded(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of a normal signal (pixels,) rounded to the codes 0 .. `largest`, all in DN."""
     first, second = np.empty_like(mean), np.empty_like(mean)
     wide = deviation >= _SMOOTH
@@ -196,7 +211,7 @@ def _rounded(mean: Array, deviation: Array, largest: int) -> tuple[Array, Array]
     return first, second
 
 
-def _cut_moments(mean: Array, deviation: Array, largest: int) -> tuple[Array, Array]:
+def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
     """:func:`_rounded` for deviations of at least 2 DN.
 
     The number is the sum over its codes of P(signal > code - 1/2), the midpoint rule for an integral in closed form:
@@ -217,7 +232,7 @@ def _cut_moments(mean: Array, deviation: Array, largest: int) -> tuple[Array, Ar
     return mean + first, np.maximum(second - first**2, 0.0)
 
 
-def _code_moments(mean: Array, deviation: Array, largest: int) -> tuple[Array, Array]:
+def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
     """:func:`_rounded` for deviations below 2 DN: code by code around the nearest one."""
     nearest = np.clip(np.rint(mean), 0, largest)
     if not deviation.any():

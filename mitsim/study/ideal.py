@@ -16,7 +16,7 @@ from mitsim.capture.evidence import Settings
 from mitsim.capture.light import Light
 from mitsim.capture.simulation import Estimate, Simulation
 from mitsim.core.arrays import FloatArray
-from mitsim.optics.frames import ExpectedFrames, FrameOptics
+from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
 from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
@@ -90,7 +90,7 @@ class IdealCamera:
     def frames(self, family: PatternFamily, flux: FloatArray, seed: int) -> ExpectedFrames:
         """Frames of a family when each projector pixel puts ``flux`` (n, n) [W m^-2] on the sensor without the mask."""
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
-        return ExpectedFrames(self._optics, (light,), family.lighting, seed)
+        return ExpectedFrames([Filed(self._optics, (light,))], family.lighting, seed)
 
     @cached_property
     def _optics(self) -> FrameOptics:

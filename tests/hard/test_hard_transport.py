@@ -26,7 +26,7 @@ from mitsim.capture.light import make_plan
 from mitsim.capture.run import capture
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
-from mitsim.optics.frames import ExpectedFrames, FrameOptics
+from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting
@@ -588,10 +588,8 @@ def heavy_frames(weight: float, seed: int = 0) -> tuple[ExpectedFrames, np.ndarr
     rng = np.random.default_rng(seed)
     groups = rng.normal(1, 0.05, (GROUPS, 1, 64))
     groups[3, 0, 20] += weight * 64
-    filed = [sparse.csr_array(group) for group in groups]
-    return ExpectedFrames(
-        FrameOptics(geometry, axis, axis, (Z,), 1), filed, np.zeros(1, int), np.ones((1, 1)), 0
-    ), groups
+    filed = Filed(FrameOptics(geometry, axis, axis, (Z,), 1), tuple(sparse.csr_array(group) for group in groups))
+    return ExpectedFrames([filed], Lighting.uniform(1), 0), groups
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.shadow import Directions, Setting, geometric_terms
+from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry, centred_edges
 from mitsim.rig.mask import Mask
@@ -19,10 +19,10 @@ from mitsim.rig.projector import Spectrum
 WIDTH, THICK = 0.06, 0.1
 
 
-def slit(depth: float, thickness: float = THICK) -> Setting:
+def slit(depth: float, thickness: float = THICK) -> ShadowGeometry:
     """One open feature 2 mm in front of 400 pixels of 0.01 mm, which see all of it."""
     edges = centred_edges(400, 0.01)
-    return Setting(Mask("open", WIDTH, np.ones(1)), (edges[:-1] + edges[1:]) / 2, 0.01, 2.0, thickness, depth)
+    return ShadowGeometry(Mask("open", WIDTH, np.ones(1)), (edges[:-1] + edges[1:]) / 2, 0.01, 2.0, thickness, depth)
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-3])

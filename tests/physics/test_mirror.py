@@ -14,7 +14,8 @@ import pytest
 from scipy.signal import max_len_seq
 
 from mitsim.capture.light import collect, make_plan
-from mitsim.optics.beams import SpecularFrames, beam_frames, geometric_terms
+from mitsim.optics.beams import SpecularFrames, beam_frames
+from mitsim.optics.samplers import geometric_terms
 from mitsim.rig.patterns import parse_patterns
 from mitsim.transport.aperture import aperture_scene_parts, register
 from mitsim.transport.beams import trace_beams

@@ -16,7 +16,8 @@ from mitsim.capture.pilot.halves import Halves, Sample, ladder, noise, norm
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.rig.patterns import Lighting
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import Deposits
 
@@ -102,7 +103,8 @@ class FineLight:
         light = simulation.file_direct(self._many[0], self.sample.lighting.labels, self.sample.fine)
         rows, weights = self.sample.rows, self.sample.lighting.weights
         started = time.perf_counter()
-        list(ExpectedFrames(simulation.fine.optics, [light.fine[: len(rows)]] * GROUPS, rows, weights, 0))
+        filed = Filed(simulation.fine.optics, (light.fine[: len(rows)],) * GROUPS)
+        list(ExpectedFrames([filed], Lighting(rows, weights), 0))
         return (time.perf_counter() - started) / len(weights)
 
 
@@ -154,8 +156,8 @@ class AnchoredLight:
     def _formed(self, simulation: Simulation, light: sparse.csr_array) -> FloatArray:
         """(shots, pixels, pixels) frames of light to every anchor."""
         rows = self.sample.rows
-        groups = [light[: len(rows)]]
-        frames = ExpectedFrames(simulation.coarse.optics, groups, rows, self.sample.lighting.weights, 0)
+        filed = Filed(simulation.coarse.optics, (light[: len(rows)],))
+        frames = ExpectedFrames([filed], Lighting(rows, self.sample.lighting.weights), 0)
         return np.stack([frame.irradiance for frame in frames])
 
 

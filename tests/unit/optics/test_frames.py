@@ -23,6 +23,7 @@ from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import Mask
+from mitsim.rig.patterns import Lighting
 
 Z, WINDOW = 40.0, (-0.13, 0.17)
 CAMERA = CameraGeometry(
@@ -223,6 +224,13 @@ def small_optics(pixels: int = 40) -> FrameOptics:
 
 
 LABELS = np.arange(PIXELS) % 4
+
+
+def expected_frames(optics, groups, labels, weights, seed, more=(), **others) -> ExpectedFrames:
+    """Frames of ``groups`` in the cells of ``optics``, and of light filed elsewhere."""
+    return ExpectedFrames([Filed(optics, tuple(groups)), *more], Lighting(labels, weights), seed, **others)
+
+
 FAMILIES = {
     "identity": np.eye(4),
     "permuted": np.eye(4)[::-1],
@@ -236,9 +244,9 @@ FAMILIES = {
 def test_mixing_classes_equals_weighing_every_pixel(family: str) -> None:
     weights, groups = FAMILIES[family], random_groups(3, 7, spread=0.1)
     optics = small_optics()
-    mixed = list(ExpectedFrames(optics, groups, LABELS, weights, 5))
+    mixed = list(expected_frames(optics, groups, LABELS, weights, 5))
     # Sixteen classes are more than the captures, so these frames are formed one by one.
-    direct = list(ExpectedFrames(optics, groups, np.arange(PIXELS), weights[:, LABELS], 5))
+    direct = list(expected_frames(optics, groups, np.arange(PIXELS), weights[:, LABELS], 5))
     assert len(mixed) == len(direct) == len(weights)
     mean = sum(groups[1:], groups[0]) / 3
     for one, other, row in zip(mixed, direct, weights, strict=True):
@@ -251,7 +259,7 @@ def test_mixing_classes_equals_weighing_every_pixel(family: str) -> None:
 
 def test_more_frames_than_one_block() -> None:
     weights = np.random.default_rng(2).random((70, 4))
-    expected = ExpectedFrames(small_optics(8), random_groups(2, 3, 0.1), LABELS, weights, 0)
+    expected = expected_frames(small_optics(8), random_groups(2, 3, 0.1), LABELS, weights, 0)
     frames = [frame.irradiance for frame in expected]
     assert len(frames) == len(expected) == 70
     again = [frame.irradiance for frame in expected]
@@ -272,10 +280,10 @@ def test_the_predicted_variance_is_the_actual_one(groups: int) -> None:
     G (G - 1) would be wrong by 1/2 and 1/4.
     """
     optics, weights, labels = small_optics(), np.eye(PIXELS), np.arange(PIXELS)
-    exact = [frame.irradiance for frame in ExpectedFrames(optics, random_groups(1, 0, 0.0), labels, weights, 0)]
+    exact = [frame.irradiance for frame in expected_frames(optics, random_groups(1, 0, 0.0), labels, weights, 0)]
     actual, predicted = [], []
     for seed in range(SEEDS):
-        found = list(ExpectedFrames(optics, random_groups(groups, 100 + seed, 0.2), labels, weights, seed))
+        found = list(expected_frames(optics, random_groups(groups, 100 + seed, 0.2), labels, weights, seed))
         assert all(frame.removed == 0 for frame in found)
         actual.append(sum(np.square(f.irradiance - e).sum() for f, e in zip(found, exact, strict=True)))
         predicted.append(sum(f.variance * f.irradiance.size for f in found))
@@ -292,14 +300,14 @@ def test_what_interpolation_leaves_below_zero_is_reported() -> None:
     light = sparse.csr_array(np.where(np.arange(CELLS**2) == 0, -1.0, 1.0)[None, :].repeat(PIXELS, 0))
     weights = np.array([[1.0, 0, 0, 0]])
     optics = small_optics()
-    (frame,) = ExpectedFrames(optics, [light, light], LABELS, weights, 0)
+    (frame,) = expected_frames(optics, [light, light], LABELS, weights, 0)
     raw = optics.frame(np.arange(CELLS**2), 4 * light.toarray()[0])
     assert (raw < 0).any() == (frame.removed > 0)
     assert np.array_equal(frame.irradiance, np.maximum(raw, 0))
     only = sparse.csr_array(-light * (np.arange(CELLS**2) == 0))
     dark = sparse.csr_array(light * (np.arange(CELLS**2) == 0))
     assert only.sum() == PIXELS and dark.sum() == -PIXELS
-    (frame,) = ExpectedFrames(optics, [dark, dark], LABELS, weights, 0)
+    (frame,) = expected_frames(optics, [dark, dark], LABELS, weights, 0)
     assert not frame.irradiance.any() and frame.removed == 0.0
 
 
@@ -330,8 +338,8 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     weights = weights.copy()
     weights[1] = 0
     optics, groups, lamps = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3)
-    plain = list(ExpectedFrames(optics, groups, labels, weights, 5))
-    lit = ExpectedFrames(optics, groups, labels, weights, 5, ambient=[Filed(optics, lamps)])
+    plain = list(expected_frames(optics, groups, labels, weights, 5))
+    lit = expected_frames(optics, groups, labels, weights, 5, ambient=[Filed(optics, lamps)])
     mean = np.asarray(sum(lamps[1:], lamps[0]).todense()).ravel() / 3
     expected = optics.frame(np.arange(CELLS**2), mean)
     for with_lamps, without in zip(lit, plain, strict=True):
@@ -339,16 +347,16 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     # The same as a projector pixel of its own that always shines.
     more = [sparse.vstack([group, lamp], format="csr") for group, lamp in zip(groups, lamps, strict=True)]
     always = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
-    alike(lit, ExpectedFrames(optics, more, np.append(labels, weights.shape[1]), always, 5))
+    alike(lit, expected_frames(optics, more, np.append(labels, weights.shape[1]), always, 5))
     assert next(iter(lit)).variance > 0 and plain[1].variance == 0
 
 
 def test_ambient_light_of_two_kinds() -> None:
     """Fine and coarse cells: their frames add, and so do the deviations of paired groups, before they are squared."""
     optics, groups, lamps, others = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3), ambient_groups(3, 32)
-    apart = ExpectedFrames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, lamps), Filed(optics, others)])
+    apart = expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, lamps), Filed(optics, others)])
     summed = tuple(a + b for a, b in zip(lamps, others, strict=True))
-    alike(apart, ExpectedFrames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, summed)]))
+    alike(apart, expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, summed)]))
 
 
 def test_ambient_light_has_a_shadow_of_its_own() -> None:
@@ -356,8 +364,8 @@ def test_ambient_light_has_a_shadow_of_its_own() -> None:
     edges = np.linspace(*WINDOW, CELLS + 1)
     other = cell_optics(CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15, "mask": "open"}), edges, edges)
     groups = random_groups(2, 7, 0.2)
-    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, ambient=[Filed(other, lamps)])
-    plain = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0)
+    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, ambient=[Filed(other, lamps)])
+    plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
     mean = np.asarray((lamps[0] + lamps[1]).todense()).ravel() / 2
     expected = other.frame(np.arange(CELLS**2), mean)
     assert np.allclose(next(iter(frames)).irradiance - next(iter(plain)).irradiance, expected, rtol=1e-9)
@@ -368,8 +376,8 @@ def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
     """Filed in the same cells it is as if it had been added; errors of one path go together, so they add first."""
     labels, weights = BESIDE[family]
     optics, groups, more = small_optics(), random_groups(3, 7, 0.2), random_groups(3, 8, 0.2)
-    apart = ExpectedFrames(optics, groups, labels, weights, 5, more=[Filed(optics, tuple(more))])
-    alike(apart, ExpectedFrames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
+    apart = expected_frames(optics, groups, labels, weights, 5, more=[Filed(optics, tuple(more))])
+    alike(apart, expected_frames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
 
 
 def test_more_light_in_cells_of_its_own() -> None:
@@ -378,8 +386,8 @@ def test_more_light_in_cells_of_its_own() -> None:
     coarse, optics = cell_optics(camera, edges, edges), small_optics()
     groups = random_groups(2, 7, 0.2)
     more = tuple(sparse.csr_array(np.random.default_rng(seed).random((PIXELS, 9))) for seed in (1, 2))
-    frames = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0, more=[Filed(coarse, more)])
-    plain = ExpectedFrames(optics, groups, LABELS, np.eye(4), 0)
+    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, more=[Filed(coarse, more)])
+    plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
     light = np.asarray((more[0] + more[1]).todense())[LABELS == 2].sum(axis=0) / 2
     difference = list(frames)[2].irradiance - list(plain)[2].irradiance
     assert np.allclose(difference, coarse.frame(np.arange(9), light), rtol=1e-9)
@@ -393,8 +401,8 @@ def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
     optics, groups = small_optics(8), random_groups(2, 7, 0.2)
     brought = np.random.default_rng(3).random((2, 8, 8))
     exact = ClassFrames(np.array([1, 3]), brought)
-    with_it = list(ExpectedFrames(optics, groups, labels, weights, 0, exact=exact))
-    without = list(ExpectedFrames(optics, groups, labels, weights, 0))
+    with_it = list(expected_frames(optics, groups, labels, weights, 0, glint=exact))
+    without = list(expected_frames(optics, groups, labels, weights, 0))
     assert len(with_it) == len(weights)
     for found, plain, row in zip(with_it, without, weights, strict=True):
         expected = plain.irradiance + row[1] * brought[0] + row[3] * brought[1]
@@ -403,6 +411,6 @@ def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
 
 
 def test_one_group_has_no_variance_to_tell() -> None:
-    frames = ExpectedFrames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
+    frames = expected_frames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
     assert all(frame.variance == 0 and frame.irradiance.any() for frame in frames)
     assert relative_error(frames) == 0

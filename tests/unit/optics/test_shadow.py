@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.shadow import Directions, Setting, geometric_terms, scene_factor, shadow_factor
+from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms, scene_factor, shadow_factor
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
 
@@ -127,7 +127,7 @@ def test_point_directions_average_over_the_pixel_alone():
     mask = mls_mask(order=5)
     pixels = centred_edges(40, 0.017)
     at = Directions([-0.31, 0.0, 0.0123], 0.0)
-    setting = Setting(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
+    setting = ShadowGeometry(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
     ((left, _),) = geometric_terms(setting, at, at)
     openings = (np.flatnonzero(mask.bits)[:, None] + [0, 1] - 31 / 2) * 0.06
     for j, tau in enumerate(at.centres):
@@ -139,7 +139,7 @@ def test_point_directions_average_over_the_pixel_alone():
 
 def test_narrow_cells_tend_to_points():
     mask, pixels = mls_mask(order=5), centred_edges(40, 0.017)
-    setting = Setting(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
+    setting = ShadowGeometry(mask, (pixels[:-1] + pixels[1:]) / 2, 0.017, 2.0, 0.0, 50.0)
     factors = [geometric_terms(setting, at, at)[0][0] for at in (Directions([0.02], w) for w in (0.0, 1e-6, 1e-300))]
     np.testing.assert_allclose(factors[1], factors[0], rtol=0, atol=1e-4)
     np.testing.assert_allclose(factors[2], factors[0], rtol=0, atol=1e-12)

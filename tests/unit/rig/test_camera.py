@@ -46,6 +46,12 @@ def test_pixel_edges_are_centred_and_one_pitch_apart() -> None:
         ("pixel_fill_factor", 1.5),
         ("angular_exponent", -1.0),
         ("fov", 180.0),
+        ("fov", 1e-6),
+        ("angular_exponent", 1e4),
+        ("pixel_fill_factor", 1e-9),
+        ("scene_distance", 1e12),
+        ("mask_thickness", True),
+        ("pixels", True),
         ("colour", 1),
     ],
 )

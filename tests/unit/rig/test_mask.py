@@ -1,11 +1,14 @@
 """The mask's code, its terms and its transmission at points agree with each other."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy.signal import max_len_seq
 
 from mitsim.core.errors import MitsimError
-from mitsim.rig.mask import Mask, mls_mask
+from mitsim.rig.mask import Mask, mls_code, mls_mask
 
 
 @pytest.mark.parametrize(("kind", "open_share"), [("separable", 0.25), ("flatcam", 0.5), ("open", 1.0)])
@@ -21,9 +24,16 @@ def test_open_share_and_pointwise_transmission(kind, open_share):
     assert plate.mean() == pytest.approx(open_share, abs=2 / 511)
 
 
-def test_code_is_the_stated_sequence_and_cannot_be_changed():
+@pytest.mark.parametrize("order", range(2, 17))
+def test_codes_are_scipys_to_the_last_bit(order):
+    code = mls_code(order)
+    assert code.dtype == np.int8 and not code.flags.writeable
+    np.testing.assert_array_equal(code, max_len_seq(order)[0])
+
+
+def test_a_mask_holds_its_code_and_cannot_be_changed():
     mask = mls_mask()
-    np.testing.assert_array_equal(mask.bits, max_len_seq(9)[0])
+    np.testing.assert_array_equal(mask.bits, mls_code(9))
     assert mask.extent_mm == pytest.approx(30.66)
     with pytest.raises(ValueError, match="read-only"):
         mask.bits[0] = 1
@@ -50,7 +60,13 @@ def test_bad_masks_are_refused_in_one_line(arguments):
         Mask(*arguments)
 
 
-@pytest.mark.parametrize("order", [1, 40, 9.0, True])
+def test_codes_do_without_scipys_signal_package():
+    """It takes a second to import, and only the code's register was needed."""
+    program = "import sys, mitsim.rig.mask as m; m.mls_mask(); assert 'scipy.signal' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize("order", [1, 17, 40, 9.0, True])
 def test_bad_order_is_refused(order):
     with pytest.raises(MitsimError, match="order"):
         mls_mask(order=order)

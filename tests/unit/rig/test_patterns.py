@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.rig import patterns
-from mitsim.rig.patterns import hadamard_matrix, hadamard_orders, parse_patterns
+from mitsim.rig.patterns import Lighting, hadamard_matrix, hadamard_orders, parse_patterns
 
 FAMILIES = [
     "uniform",
@@ -52,7 +51,7 @@ def test_number_of_captures(name: str) -> None:
 @pytest.mark.parametrize("name", FAMILIES)
 def test_classes_weigh_every_pixel_as_light_does(name: str, n: int) -> None:
     family = parse_patterns(name, n)
-    labels, weights = family.lighting
+    labels, weights = family.lighting.labels, family.lighting.weights
     assert labels.shape == (n * n,) and weights.shape[0] == len(family.captures)
     assert np.array_equal(np.unique(labels), np.arange(weights.shape[1])), "a class without pixels"
     for capture, row in zip(family.captures, weights, strict=True):
@@ -65,10 +64,17 @@ def test_dots_light_every_pixel_exactly_once(n: int, data: st.DataObject) -> Non
     k = data.draw(st.integers(1, n))
     family = parse_patterns(f"dots:{k}", n)
     assert np.array_equal(sum(family.light(capture) for capture in family.captures), np.ones((n, n)))
-    labels, weights = family.lighting
+    labels, weights = family.lighting.labels, family.lighting.weights
     assert weights.shape == (k * k, k * k)
     assert np.array_equal(weights.sum(axis=0), np.ones(k * k)), "each class belongs to one pattern"
     assert len(np.unique(labels)) == k * k
+
+
+def test_uniform_lighting_is_the_uniform_familys() -> None:
+    family, uniform = parse_patterns("uniform", 7), Lighting.uniform(7)
+    assert family.lighting is family.lighting, "found once"
+    assert np.array_equal(family.lighting.labels, uniform.labels)
+    assert np.array_equal(family.lighting.weights, uniform.weights)
 
 
 def test_dots_are_the_papers_grid_of_every_kth_pixel() -> None:
@@ -115,7 +121,7 @@ def test_random_is_seeded_and_covers_every_pixel() -> None:
 
 
 def test_random_is_a_fair_coin() -> None:
-    bits = patterns.random_binary(500, 40, seed=1, side="left")
+    bits = parse_patterns("random:40", 500, seed=1).left
     # 20 000 flips: standard deviation 0.0035; five of them. (Forced pixels: 500 x 2^-40, none.)
     assert abs(bits.mean() - 0.5) < 0.018
 

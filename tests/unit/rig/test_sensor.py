@@ -2,11 +2,11 @@ import math
 from pathlib import Path
 
 import pytest
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.rig.sensor import SensorModel, load_sensor, paper_sensor
+from mitsim.rig.sensor import ExposureSeconds, SensorModel, load_sensor, paper_sensor
 
 BASE = {
     "name": "test",
@@ -47,6 +47,16 @@ def test_without_binning_a_superpixel_is_a_pixel() -> None:
         ("read_noise_e", math.nan),
         ("quantum_efficiency", 1.01),
         ("quantum_efficiency", 0.0),
+        ("quantum_efficiency", 1e-9),
+        ("pixel_pitch_um", 1e5),
+        ("full_well_e", 1e13),
+        ("full_well_e", True),
+        ("read_noise_e", 1e7),
+        ("dark_current_e_per_s", 1e11),
+        ("gain_dn_per_e", 1e7),
+        ("black_level_dn", 2.0**24),
+        ("binning", 2.0),
+        ("bits", True),
         ("gain_dn_per_e", math.inf),
         ("bits", 0),
         ("colour", "red"),
@@ -55,6 +65,20 @@ def test_without_binning_a_superpixel_is_a_pixel() -> None:
 def test_a_value_out_of_range_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValidationError, match=field):
         SensorModel(**{**BASE, field: value})
+
+
+def test_whole_numbers_are_numbers() -> None:
+    assert SensorModel(**{**BASE, "full_well_e": 1000, "read_noise_e": 3}) == SensorModel(**BASE)
+
+
+@pytest.mark.parametrize(("seconds", "allowed"), [(1e-9, True), (3600, True), (0, False), (1e7, False), (True, False)])
+def test_exposures_last_as_long_as_cameras_can(seconds: float, allowed: bool) -> None:
+    exposure = TypeAdapter(ExposureSeconds)
+    if allowed:
+        assert exposure.validate_python(seconds) == seconds
+        return
+    with pytest.raises(ValidationError):
+        exposure.validate_python(seconds)
 
 
 def test_a_black_level_at_the_ceiling_is_refused() -> None:
@@ -67,16 +91,23 @@ def test_a_model_does_not_change() -> None:
         SensorModel(**BASE).read_noise_e = 0.0
 
 
-def test_a_bad_file_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("read_noise_e = -6.7", r"read_noise_e: got -6\.7, .* \(range: 0 to 1e\+06\); correct this field$"),
+        ("read_noise = 6.7", r"read_noise: got 6\.7, no such field; did you mean read_noise_e\? known fields: name, "),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path: Path, line: str, message: str) -> None:
     text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
-    (tmp_path / "a.toml").write_text(text.replace("read_noise_e = 6.7", "read_noise_e = -6.7"))
-    with pytest.raises(MitsimError, match=r"a\.toml: read_noise_e: got -6\.7"):
+    (tmp_path / "a.toml").write_text(text.replace("read_noise_e = 6.7", line))
+    with pytest.raises(MitsimError, match=rf"^file [^\n]*a\.toml: {message}[^\n]*"):
         load_sensor(tmp_path / "a.toml")
 
 
 def test_the_shipped_sensor_fills_its_adc_but_does_not_overflow_it() -> None:
     model = load_sensor(shipped("calibration", "imx249.toml"))
-    assert model.superpixel_pitch_um == pytest.approx(11.72)  # DESIGN: the paper's binned pitch
+    assert model.superpixel_pitch_um == pytest.approx(11.72)  # the paper's binned pitch
     assert model.largest_dn is not None
     top = model.superpixel_full_well_e * model.gain_dn_per_e + model.superpixel_black_level_dn
     assert 0.95 < top / model.largest_dn < 1

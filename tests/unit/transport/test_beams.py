@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.beams import beam_frames, geometric_terms
+from mitsim.optics.beams import beam_frames
+from mitsim.optics.samplers import geometric_terms
 from mitsim.transport.beams import has_specular, trace_beams
 from mitsim.transport.mirrors import MirrorTracer
 from mitsim.transport.pinhole import PinholeRays

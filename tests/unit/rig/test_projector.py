@@ -1,0 +1,80 @@
+"""Projector files: what is in them is checked, what is unknown is refused, and the spectrum counts photons."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.configuration import load_model, shipped, validated
+from mitsim.core.errors import MitsimError
+from mitsim.rig.projector import ProjectorModel, Spectrum
+
+BASE = {"name": "test", "effective_wavelength_nm": 550.0}
+
+
+def test_the_shipped_file_is_a_projector_with_its_sources() -> None:
+    model = load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel)
+    assert (model.luminous_flux_lm, model.columns, model.rows, model.laser_class) == (32.0, 1920, 720, "3R")
+    assert "wavelengths_nm" in model.assumed and "radiant_shares" in model.derived and model.source
+    assert model.black_level == pytest.approx(1 / 80_000)
+
+
+def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path) -> None:
+    """`blur_pixel = 3` was ignored, and the projector was sharp."""
+    path = tmp_path / "mine.toml"
+    path.write_text('name = "mine"\neffective_wavelength_nm = 550\nblur_pixel = 3\n')
+    with pytest.raises(MitsimError, match=r"mine\.toml: blur_pixel: got 3, no such field; did you mean blur_pixels\?"):
+        load_model(path, ProjectorModel)
+    path.write_text('name = "mine"\neffective_wavelenght_nm = 550\n')
+    with pytest.raises(MitsimError, match=r"effective_wavelenght_nm: [^;]*; did you mean effective_wavelength_nm\?"):
+        load_model(path, ProjectorModel)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "rule"),
+    [
+        ("blur_pixels", 300.0, "range: 0 to 16"),
+        ("blur_pixels", True, "range: 0 to 16"),
+        ("aperture_radius_mm", 1e4, "range: 0 to 1000"),
+        ("focus_mm", 0.0, r"range: 1 to 1e\+07"),
+        ("focus_mm", math.inf, "finite"),
+        ("speckle_contrast", 1.5, "range: 0 to 1"),
+        ("effective_wavelength_nm", 0.0, r"range: 1 to 1e\+06"),
+        ("contrast_ratio", 1.0, "greater than 1"),
+        ("luminous_efficacy_lm_per_w", 900.0, "range: 0 to 684"),
+        ("columns", 1920.0, "integer"),
+        ("laser_class", "5", "'3R'"),
+        ("derived", ["blur"], "'blur' is none"),
+        ("wavelengths_nm", [550.0], "one share a line"),
+    ],
+)
+def test_a_value_beyond_any_device_is_refused_with_its_range(field: str, value: object, rule: str) -> None:
+    with pytest.raises(MitsimError, match=rf"^here: ({field}|contents): got [^\n]*{rule}[^\n]*$"):
+        validated(ProjectorModel, {**BASE, field: value}, "here")
+
+
+def test_shares_are_parts_of_one() -> None:
+    """They were rescaled in silence."""
+    lines = {**BASE, "wavelengths_nm": [450.0, 600.0]}
+    with pytest.raises(MitsimError, match=r"radiant_shares sum to 0\.9; they must sum to 1"):
+        validated(ProjectorModel, {**lines, "radiant_shares": [0.5, 0.4]}, "here")
+    spectrum = validated(ProjectorModel, {**lines, "radiant_shares": [0.4, 0.6]}, "here").spectrum
+    assert spectrum.weights == pytest.approx([180 / 540, 360 / 540])
+    assert validated(ProjectorModel, BASE, "here").spectrum.wavelengths_nm.tolist() == [550.0]
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "weights"),
+    [
+        ([], []),
+        ([500.0], [0.5, 0.5]),
+        ([-1.0], [1.0]),
+        ([math.nan], [1.0]),
+        ([500.0], [0.9]),
+        ([1.0, 2.0], [2.0, -1.0]),
+    ],
+)
+def test_arrays_that_are_no_spectrum_are_refused(wavelengths: list[float], weights: list[float]) -> None:
+    with pytest.raises(MitsimError, match=r"^spectrum [^\n]+$"):
+        Spectrum(np.array(wavelengths), np.array(weights))
