@@ -266,20 +266,20 @@ def reconstruct(
 ) -> int:
     """Recover the image from frames and a calibration alone."""
     from mitsim.study.quality import reconstruct as run_reconstruct
-    from mitsim.study.quality import summary
 
     value: float | Literal["auto"] = _number("--lambda", lam, "auto", least=0.0) if lam != "auto" else "auto"  # type: ignore[assignment]
     output = output or run / "reconstruction"
     with _work(output, silent=True):
-        result = run_reconstruct(run, calibration, output, value, method)
-    lines = [result.status]
-    if result.psnr is not None and result.ssim is not None:
-        lines.append(f"PSNR {result.psnr:.2f} dB, SSIM {result.ssim:.3f}")
+        judged = run_reconstruct(run, calibration, output, value, method)
+    result = judged.reconstruction
+    lines = [str(result.status)]
+    if judged.psnr is not None:
+        lines.append(f"PSNR {judged.psnr:.2f} dB" + (f", SSIM {judged.ssim:.3f}" if judged.ssim is not None else ""))
     lines.append(
         f"lambda {result.lam:.3g}, rank {result.rank}, condition {result.condition:.3g}, "
-        f"residual {result.residual:.1e}: {result.output}"
+        f"residual {result.residual:.1e}: {judged.output}"
     )
-    return _finish(as_json, summary(result), lines, () if result.ok else (result.status,))
+    return _finish(as_json, judged.summary(), lines, () if result.ok else (str(result.status),))
 
 
 @app.command()

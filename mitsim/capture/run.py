@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -16,7 +14,6 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer, Exposure
-from mitsim.capture.folder import RunFolder, claimed, frame_name
 from mitsim.capture.light import Light, collect, make_plan, speckle_of, uniform_light
 from mitsim.capture.plan import Plan
 from mitsim.core.arrays import FloatArray, Progress, silent
@@ -24,8 +21,11 @@ from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel
 from mitsim.core.manifest import DECIDING, versions
+from mitsim.core.manifests import Digital as DigitalNumbers
+from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.resources import Limits
+from mitsim.core.runs import RunFolder, claimed, frame_name
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.rig.patterns import Capture, PatternFamily
 from mitsim.rig.recipe import load_recipe
@@ -94,6 +94,7 @@ def capture(
     if noise_fraction is not None and not 0 < noise_fraction <= 1:
         raise MitsimError(f"--noise-fraction {noise_fraction}: give a part of the sensor's noise above 0, up to 1")
     family = bench.family(patterns, seed)
+    shots = Patterns.of(family, [frame_name(index) for index in range(len(family.captures))])
     labels, weights = family.classes()
     size = weights.shape[1], len(weights)
     there = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if resume else 0
@@ -110,9 +111,9 @@ def capture(
         "noise_fraction": noise_fraction,
         "versions": {name: version for name, version in versions().items() if name in DECIDING},
     }
-    digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
+    head = RunHead.of(configuration)
     clock = Clock()
-    with claimed(Path(output), digest, configuration, resume) as folder:
+    with claimed(Path(output), head, resume) as folder:
         with clock.stage("plan"):
             plan = make_plan(bench, labels, weights, accuracy, seed, effects)
         cost = frames_cost(bench, plan.settings, *size, plan.predicted_seconds, there)
@@ -127,6 +128,7 @@ def capture(
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
             totals = _Totals.of(expected)
         exposer = Exposer(bench, exposure.choose(bench, totals.peak), seed, speckle_of(bench, plan))
+        digital_block(bench, exposer.exposure_s)
         folder.begin()
         folder.write_truth(reflectance, load_recipe().board_reflectance)
         writer = _Writer(family, folder, exposer)
@@ -146,7 +148,7 @@ def capture(
             plan=plan,
             warnings=plan.warnings + _warnings(accuracy, light, totals, writer),
         )
-        folder.finish(_manifest(bench, family, result, light.paths))
+        folder.finish(_manifest(head, bench, shots, result, light.paths))
     return result
 
 
@@ -313,48 +315,36 @@ def board_flux(bench: Bench, plan: Plan, seed: int) -> FloatArray:
     ).flux
 
 
-def pattern_block(family: PatternFamily, files: Sequence[str]) -> dict[str, Any]:
-    """What a solver must know of the patterns, as it stands in a manifest."""
-    return {
-        "family": family.name,
-        "n": family.n,
-        "P_L": family.left.tolist(),
-        "P_R": family.right.tolist(),
-        "captures": [
-            {"file": file, "row": c.row, "column": c.column, "sign": c.sign}
-            for file, c in zip(files, family.captures, strict=True)
-        ],
-    }
-
-
 def plan_block(plan: Plan) -> dict[str, Any]:
     """A plan as JSON."""
     settings = {**asdict(plan.settings), "effects": sorted(plan.settings.effects)}
     return {**asdict(plan), "settings": settings}
 
 
-def digital_block(bench: Bench, exposure_s: float) -> dict[str, float]:
-    """How digital numbers become electrons a second: (DN - black_level_dn) / gain / exposure - dark."""
-    return {
-        "exposure_s": exposure_s,
-        "black_level_dn": bench.sensor.superpixel_black_level_dn,
-        "gain_dn_per_e": bench.sensor.gain_dn_per_e,
-        "dark_current_e_per_s": bench.sensor.superpixel_dark_current_e_per_s,
-    }
+def digital_block(bench: Bench, exposure_s: float) -> DigitalNumbers:
+    """How digital numbers of a ``bench``'s camera become electrons a second at that exposure."""
+    return DigitalNumbers(
+        exposure_s=exposure_s,
+        black_level_dn=bench.sensor.superpixel_black_level_dn,
+        gain_dn_per_e=bench.sensor.gain_dn_per_e,
+        dark_current_e_per_s=bench.sensor.superpixel_dark_current_e_per_s,
+    )
 
 
-def _manifest(bench: Bench, family: PatternFamily, result: CaptureResult, paths: int) -> dict[str, Any]:
+def _manifest(head: RunHead, bench: Bench, shots: Patterns, result: CaptureResult, paths: int) -> RunManifest:
     """What a solver and a reader of the run need, beside what the folder adds itself."""
-    return {
-        "camera": bench.identity(),
-        "digital": digital_block(bench, result.exposure_s),
-        "patterns": pattern_block(family, [frame_name(index) for index in range(result.frames)]),
-        "plan": plan_block(result.plan),
-        "mc_error": result.mc_error,
-        "mc_to_sensor_noise": result.mc_to_sensor_noise,
-        "heaviest_group": result.heaviest_group,
-        "paths": paths,
-        "seconds": result.seconds,
-        "warnings": result.warnings,
-        "versions": versions(),
-    }
+    return RunManifest(
+        configuration=head.configuration,
+        configuration_sha256=head.configuration_sha256,
+        camera=bench.identity(),
+        digital=digital_block(bench, result.exposure_s),
+        patterns=shots,
+        plan=plan_block(result.plan),
+        mc_error=result.mc_error,
+        mc_to_sensor_noise=result.mc_to_sensor_noise,
+        heaviest_group=result.heaviest_group,
+        paths=paths,
+        seconds=result.seconds,
+        warnings=result.warnings,
+        versions=versions(),
+    )

@@ -247,7 +247,7 @@ def _rows(
             ssim=ssim(found.image, image),
             lam=found.lam,
             residual=found.residual,
-            status=found.status,
+            status=str(found.status),
         )
 
 

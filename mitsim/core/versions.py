@@ -1,0 +1,23 @@
+"""Versions of what computes: nothing in, names and versions of mitsim, Python and the packages that decide out."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+
+import mitsim
+
+DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
+"""Packages of which another version may give other frames from the same seed."""
+_PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
+
+
+def versions() -> dict[str, str]:
+    """Versions of mitsim, Python and the packages that decide the numbers, by name; imports none of them."""
+    by_name = {"mitsim": mitsim.__version__, "python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            by_name[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            by_name[name] = "not installed"
+    return by_name
