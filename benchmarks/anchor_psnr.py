@@ -79,7 +79,7 @@ def trial(
     for i, j, frame in clean:
         noisy = rng.poisson(gain * np.maximum(frame, 0)) + rng.normal(0, read_noise, frame.shape)
         sums.add(noisy / gain, i, j)
-    scale = prepared.spectrum(sums).scale
+    scale = prepared.problem(sums).scale
     oracle = max(psnr(prepared.solve(sums, scale * lam).image, image) for lam in np.logspace(-10, 0, 81))
     automatic = prepared.solve(sums, "auto")
     return {

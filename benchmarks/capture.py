@@ -23,7 +23,7 @@ from pathlib import Path
 from mitsim.capture.bench import open_bench
 from mitsim.capture.run import capture
 from mitsim.core.configuration import shipped
-from mitsim.core.manifest import versions
+from mitsim.core.versions import versions
 from mitsim.study.accuracy import study_accuracy
 
 SCENE = shipped("scenes", "photograph", "scene.xml")

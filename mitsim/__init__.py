@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mitsim.core.resources import Limits
     from mitsim.core.runs import Capture, load_run
     from mitsim.reconstruct.factors import Factors, load_calibration
-    from mitsim.reconstruct.image import Reconstruction, reconstruct
+    from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
     from mitsim.rig.recipe import load_recipe
     from mitsim.study.metrics import psnr, ssim
 
@@ -37,7 +37,7 @@ _HOMES = {
     "load_run": "core.runs",
     "load_calibration": "reconstruct.factors",
     "load_recipe": "rig.recipe",
-    "reconstruct": "reconstruct.image",
+    "reconstruct": "reconstruct.reconstruction",
     "psnr": "study.metrics",
     "ssim": "study.metrics",
     "Bench": "capture.bench",
@@ -46,7 +46,7 @@ _HOMES = {
     "Light": "capture.light",
     "Capture": "core.runs",
     "Factors": "reconstruct.factors",
-    "Reconstruction": "reconstruct.image",
+    "Reconstruction": "reconstruct.reconstruction",
     "Rendered": "capture.render",
     "Job": "core.job",
     "Clock": "core.job",

@@ -285,12 +285,12 @@ def reconstruct(
     quiet: Quiet = False,
 ) -> int:
     """Recover the image from frames and a calibration alone."""
-    from mitsim.study.quality import reconstruct_folder
+    from mitsim.study.quality import reconstruct as reconstruct_folder
 
     result = reconstruct_folder(
         run, calibration, output or run / "reconstruction", _number("lambda", lam), method, overwrite
     )
-    payload = result.payload()
+    payload = result.summary()
     lines = [payload["status"]]
     if payload["psnr"] is not None:
         lines.append(f"PSNR {payload['psnr']:.2f} dB, SSIM {payload['ssim']:.3f}")
@@ -298,7 +298,7 @@ def reconstruct(
         f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition']:.3g}, "
         f"residual {payload['residual']:.1e}: {payload['output']}"
     )
-    return _finish(as_json, payload, lines, () if result.ok else (payload["status"],))
+    return _finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
 
 
 @app.command()
@@ -482,7 +482,7 @@ def _print_plan(plan: Plan) -> None:
 def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
     """Print the result; exit status 1 when there are warnings."""
     if as_json:
-        from mitsim.core.jsonfile import plain
+        from mitsim.core.manifest import plain
 
         print(json.dumps(plain(payload), allow_nan=False))
     else:

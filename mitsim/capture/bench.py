@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mitsim.capture.render import Rendered
     from mitsim.core.job import Job
     from mitsim.core.runs import Capture
-    from mitsim.reconstruct.calibrated import Factors
+    from mitsim.reconstruct.factors import Factors
     from mitsim.rig.recipe import SessionRecipe
     from mitsim.scene.load import LoadedScene
     from mitsim.transport.source import Projector

@@ -102,6 +102,18 @@ class Plan:
         own = replace(self, request=None, cost=None)
         return {**{name: value for name, value in asdict(own).items() if value is not None}, "settings": settings}
 
+    def payload(self) -> dict[str, Any]:
+        """What the command line reports."""
+        keys = ("effects", "accuracy", "predicted_seconds", "settings", "warnings")
+        block = {**self.block(), "warnings": self.warnings}
+        cost = {"memory": self.cost.memory_bytes, "disk": self.cost.disk_bytes} if self.cost else {}
+        return {
+            **{key: block[key] for key in keys},
+            "sampling_target": self.sampling_target,
+            "systematic_error": self.systematic_error,
+            **{f"predicted_{what}_bytes": count for what, count in cost.items()},
+        }
+
     def _repr_html_(self) -> str:
         cells = [
             (row.name, row.state, row.reason, _shown(row.error_if_off), f"{row.seconds:.2f}") for row in self.effects

@@ -116,6 +116,7 @@ def capture(
     job = job or Job()
     request.timing.check(bench)
     family = bench.family(request.patterns, request.seed)
+    patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.captures))])
     lighting = family.lighting
     on_disk = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if output and resume else 0
     place = Path(output) if output else None
@@ -123,11 +124,11 @@ def capture(
     first_look.check(request.patterns, job.limits, place)
     head = RunHead.of(_configuration(bench, request))
     with _recorder(place, head, resume) as recorder:
-        if light is None:
-            with job.clock.stage("plan"):
-                plan = plan or make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
-            cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, on_disk)
-            cost.check(request.patterns, job.limits, place)
+        with job.clock.stage("plan"):
+            plan = light.plan if light else plan
+            plan = plan or make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
+        cost = frames_cost(bench, plan.settings, lighting, 0.0 if light else plan.predicted_seconds, on_disk)
+        cost.check(request.patterns, job.limits, place)
         with job.clock.stage("transport"):
             light = light or trace_light(bench, plan, lighting, request.seed, _sampling(bench, request), job.progress)
         with job.clock.stage("truth"):
@@ -138,11 +139,28 @@ def capture(
             totals = _Totals.of(expected)
         exposure_s = request.timing.choose(bench, totals.peak)
         exposer = Exposer(bench, exposure_s, request.seed, light.simulation.physics.speckle)
+        digital = digital_scale(bench, exposure_s)
         recorder.begin()
         recorder.write_truth(truth, load_recipe().board_reflectance)
         shooting = _Shooting(family, recorder, exposer)
         shooting.shoot(expected, job)
-        return recorder.finish(_manifest(head, bench, family, light, totals, shooting, job))
+        manifest = RunManifest(
+            configuration=head.configuration,
+            configuration_sha256=head.configuration_sha256,
+            camera=bench.identity(),
+            digital=digital,
+            patterns=patterns,
+            plan=plan.block(),
+            mc_error=totals.mc_error,
+            mc_to_sensor_noise=shooting.noise_ratio,
+            sensor_noise=shooting.sensor_noise,
+            heaviest_group=totals.heaviest,
+            paths=light.paths,
+            seconds=job.clock.seconds(),
+            warnings=light.plan.warnings + tuple(_warnings(light, totals, shooting)),
+            versions=versions(),
+        )
+        return recorder.finish(manifest)
 
 
 def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
@@ -264,33 +282,6 @@ class _Shooting:
         whole = exposed.digital.dtype == np.uint32
         dn: Channel = exposed.digital.astype(np.uint32) if whole else exposed.digital.astype(np.float32)
         self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)
-
-
-def _manifest(
-    head: RunHead,
-    bench: Bench,
-    family: PatternFamily,
-    light: Light,
-    totals: _Totals,
-    shooting: _Shooting,
-    job: Job,
-) -> RunManifest:
-    return RunManifest(
-        configuration=head.configuration,
-        configuration_sha256=head.configuration_sha256,
-        camera=bench.identity(),
-        digital=digital_scale(bench, shooting.exposer.exposure_s),
-        patterns=Patterns.of(family, [frame_name(index) for index in range(len(family.captures))]),
-        plan=light.plan.block(),
-        mc_error=totals.mc_error,
-        mc_to_sensor_noise=shooting.noise_ratio,
-        sensor_noise=shooting.sensor_noise,
-        heaviest_group=totals.heaviest,
-        paths=light.paths,
-        seconds=job.clock.seconds(),
-        warnings=light.plan.warnings + tuple(_warnings(light, totals, shooting)),
-        versions=versions(),
-    )
 
 
 def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:

@@ -5,7 +5,7 @@ import os
 import reprlib
 import sys
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import pydantic
 
@@ -18,15 +18,21 @@ else:
     import tomli as tomllib
 
 _MOST_BYTES = 1 << 16
+"""Ten times the longest file that is shipped."""
 _MOST_DOTS = 200
+"""The parser takes a tenth of a second for a name of that many parts."""
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 100
 Model = TypeVar("Model", bound=pydantic.BaseModel)
+LARGEST = 1e12
+"""Largest number of a device, and one over the smallest: far from any device, and products of a few stay finite."""
+Positive = Annotated[float, pydantic.Field(ge=1 / LARGEST, le=LARGEST, allow_inf_nan=False)]
+NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 
 
 def shipped(*parts: str) -> Path:
-    """A file or folder that comes with mitsim beside the package, for example `shipped("calibration",
-    "imx249.toml")`. Raises MitsimError when it is not there (mitsim installed without its source tree)."""
+    """The file or folder at ``parts``, which comes with mitsim beside the package, for example
+    ``shipped("calibration", "imx249.toml")``. MitsimError when it is not there."""
     path = Path(__file__).resolve().parents[2].joinpath(*parts)
     if not path.exists():
         raise MitsimError(f"{'/'.join(parts)}: not found at {path}; run mitsim from its source tree (`make setup`)")
@@ -34,7 +40,7 @@ def shipped(*parts: str) -> Path:
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:
-    """The table in a TOML file of at most 64 KiB. Raises MitsimError when it cannot be read or is not TOML."""
+    """The table in the TOML file ``path`` of at most 64 KiB. MitsimError when it cannot be read or is not TOML."""
     try:
         text = read_text(path, _MOST_BYTES)
         # The parser's time grows with the square of the parts of a dotted name.
@@ -48,29 +54,65 @@ def read_toml(path: Path | str) -> dict[str, Any]:
 
 
 def load_model(path: Path | str, model: type[Model]) -> Model:
-    """The TOML file `path` checked against `model`. Raises MitsimError naming field, value and rule."""
+    """The TOML file ``path`` as a ``model``. MitsimError naming field, value and rule when it breaks one."""
     return validated(model, read_toml(path), f"file {path}")
 
 
-def validated(model: type[Model], data: dict[str, Any], where: str) -> Model:
-    """`data` as a `model`; `where` opens the one-line MitsimError for the first field that breaks a rule."""
+def validated(model: type[Model], data: dict[str, Any], where: str, context: object = None) -> Model:
+    """A dictionary as a checked model.
+
+    Parameters
+    ----------
+    model
+        what to make of it.
+    data
+        names and values, as read from a file.
+    where
+        what the message begins with.
+    context
+        passed on to the model's validators.
+
+    Raises
+    ------
+    MitsimError
+        in one line, for the first field that breaks a rule: its value, the rule, and what to do.
+    """
     try:
-        return model.model_validate(data)
+        return model.model_validate(data, context=context)
     except pydantic.ValidationError as error:
         problems = error.errors(include_url=False)
         # A mistyped name is both an unknown field and a missing one; the first tells more.
         first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
-        field = ".".join(cut(str(part)) for part in first["loc"]) or "contents"
-        rule = first["msg"][0].lower() + first["msg"][1:]
-        rule = "no such field" if first["type"] == "extra_forbidden" else rule.removeprefix("value error, ")
-        hint = _range(model, first["loc"])
-        if first["type"] in ("extra_forbidden", "missing"):
-            close = difflib.get_close_matches(str(first["loc"][-1]), model.model_fields, 1)
-            meant = f"did you mean {close[0]}? " if close and first["type"] == "extra_forbidden" else ""
-            hint = f"; {meant}known fields: {', '.join(model.model_fields)}"
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        value = "nothing" if first["type"] == "missing" else _shown(first["input"])
-        raise MitsimError(f"{where}: {field}: got {value}, {rule}{hint}; correct this field{more}") from error
+        raise MitsimError(f"{where}: {_complaint(model, first)}{more}") from error
+
+
+def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
+    """Field, value and rule of one problem that pydantic found."""
+    field = ".".join(cut(str(part)) for part in problem["loc"])
+    if problem["type"] == "value_error":  # a validator of ours, whose text says all
+        return f"{field}: {problem['ctx']['error']}" if field else str(problem["ctx"]["error"])
+    rule = problem["msg"][0].lower() + problem["msg"][1:]
+    hint = _range(model, problem["loc"])
+    if problem["type"] in ("extra_forbidden", "missing"):
+        known = [*_holder(model, problem["loc"][:-1]).model_fields]
+        near = difflib.get_close_matches(str(problem["loc"][-1]), known, 1)
+        meant = f"did you mean {near[0]}? " if near and problem["type"] == "extra_forbidden" else ""
+        rule = "no such field" if problem["type"] == "extra_forbidden" else rule
+        hint = f"; {meant}known fields: {', '.join(known)}"
+    value = "nothing" if problem["type"] == "missing" else _shown(problem["input"])
+    return f"{field or 'contents'}: got {value}, {rule}{hint}; correct this field"
+
+
+def _holder(model: type[pydantic.BaseModel], place: tuple[str | int, ...]) -> type[pydantic.BaseModel]:
+    """The model of the part at ``place`` inside a ``model``."""
+    for name in place:
+        if isinstance(name, str) and name in model.model_fields:
+            kinds = [model.model_fields[name].annotation]
+            for kind in kinds:  # grows: a part may stand in a tuple, or be optional
+                kinds += get_args(kind)
+            model = next(kind for kind in kinds if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel))
+    return model
 
 
 def _range(model: Any, location: tuple[int | str, ...]) -> str:

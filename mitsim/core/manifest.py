@@ -1,30 +1,28 @@
-"""JSON files: plain data in, a complete file out, and back; versions of what computed it."""
+"""JSON files: plain data in, a complete file out, and back."""
 
-import importlib.metadata
 import json
 import math
 import os
-import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import mitsim
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.output import whole_file
 from mitsim.core.plainfile import read_text
+from mitsim.core.versions import DECIDING, versions
 
-DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
-"""Packages of which another version may give other frames from the same seed."""
-_MOST_BYTES = 16 << 20
-_PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
+__all__ = ["DECIDING", "parse_json", "plain", "read_json", "versions", "write_json"]
+
+_MOST_BYTES = 32 << 20
+"""A little more than the largest manifest that a capture writes: 65536 shots of 4096 x 256 patterns make 29 MB."""
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON can hold it: arrays become lists, paths text, pydantic models dictionaries, NaN and
-    infinities null (JSON has no such numbers). Raises TypeError for anything else."""
+    """``value`` as JSON can hold it: arrays become lists, paths text, pydantic models dictionaries, NaN and
+    infinities null (JSON has no such numbers). TypeError for anything else."""
     if hasattr(value, "model_dump"):
         value = value.model_dump()
     if isinstance(value, (np.ndarray, np.generic)):
@@ -43,15 +41,15 @@ def plain(value: Any) -> Any:
 
 
 def write_json(path: Path | str, obj: Any) -> None:
-    """Write `obj` (see `plain`) to `path` as indented JSON, all or nothing. Raises MitsimError when the file
-    cannot be written."""
+    """Write ``obj`` (see :func:`plain`) to ``path`` as indented JSON, all or nothing. MitsimError when the file cannot
+    be written."""
     text = json.dumps(plain(obj), indent=1, allow_nan=False) + "\n"
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def parse_json(text: str) -> Any:
-    """The object in a JSON text. ValueError when it is not JSON, has a key twice, or is nested too deep."""
+    """The object in a JSON ``text``. ValueError when it is not JSON, has a key twice, or is nested too deep."""
     try:
         return json.loads(text, object_pairs_hook=_once)
     except RecursionError:
@@ -59,29 +57,18 @@ def parse_json(text: str) -> Any:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    unique: dict[str, Any] = {}
     for key, value in pairs:
-        if key in found:
+        if key in unique:
             raise ValueError(f"key {cut(key)!r} is there twice")
-        found[key] = value
-    return found
+        unique[key] = value
+    return unique
 
 
 def read_json(path: Path | str) -> Any:
-    """The object in a JSON file of at most 16 MiB. Raises MitsimError when it cannot be read or is not JSON, or has a
+    """The object in the JSON file ``path`` of at most 32 MiB. MitsimError when it cannot be read, is not JSON, or has a
     key twice."""
     try:
         return parse_json(read_text(path, _MOST_BYTES))
     except ValueError as error:
         raise MitsimError(f"file {path}: not valid JSON ({error}); write or copy it again") from error
-
-
-def versions() -> dict[str, str]:
-    """Versions of mitsim, Python and the packages that decide the numbers, by name; imports none of them."""
-    found = {"mitsim": mitsim.__version__, "python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

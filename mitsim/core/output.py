@@ -1,5 +1,6 @@
 """Places to write to: checked before any work, held against other processes, and filled with whole files only."""
 
+import json
 import os
 import tempfile
 import threading
@@ -11,16 +12,19 @@ from typing import Literal
 from filelock import FileLock, Timeout
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.plainfile import read_text
 
 LOCK = ".mitsim.lock"
 """Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock."""
+_LONGEST_HEAD = 1 << 20
+"""An unfinished manifest is a few kB; what is larger is not looked into."""
 
 
 @contextmanager
 def whole_file(path: Path | str) -> Iterator[Path]:
     """A name beside ``path`` to write to; on leaving it takes the place of ``path``, and after an error it is removed.
 
-    Raises MitsimError when the file cannot be written.
+    MitsimError when the file cannot be written.
     """
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
@@ -37,19 +41,34 @@ def whole_file(path: Path | str) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed processes left half-written in a folder that this one holds."""
+    """Remove what killed processes left half-written in a ``folder`` that this one holds."""
     for part in folder.glob(".*.part"):
         part.unlink(missing_ok=True)
 
 
 def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> Path:
-    """Make sure, before any work, that output can be written to `path`; returns it as a Path.
+    """Make sure, before any work, that output can be written; nothing is deleted.
 
-    A folder is created if its parent exists. Nothing is deleted: `overwrite` only allows a folder that
-    holds files already, or an existing file. Raises MitsimError when the parent is missing, or the place is
-    not writable, is of the other kind, or holds something and `overwrite` is off.
+    Parameters
+    ----------
+    path
+        the place; a folder is created if its parent exists.
+    overwrite
+        whether it may be a folder that holds files already, or an existing file.
+    kind
+        ``folder`` or ``file``.
+
+    Raises
+    ------
+    MitsimError
+        when the parent is missing, or the place is not writable, is of the other kind, holds something and
+        ``overwrite`` is off, or has a name that is not UTF-8, which OpenEXR cannot open.
     """
     path = Path(path)
+    try:
+        os.fspath(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise MitsimError(f"output {path}: is not UTF-8 text; choose a folder with another name") from None
     if not path.parent.is_dir():
         raise MitsimError(f"output {path}: the folder {path.parent} does not exist; create it or choose another")
     if kind == "file":
@@ -61,8 +80,10 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
 
 @contextmanager
 def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """`prepare_output` for the time of a work, in which no other process may claim the folder; one made for nothing
-    is taken away when the work fails. Raises MitsimError also when another process holds it.
+    """The folder ``path`` for the time of a work, in which no other process may claim it; ``overwrite`` allows one that
+    holds files. If the work fails before writing, a new folder is removed.
+
+    MitsimError as for :func:`prepare_output`, and when another process holds the folder.
     """
     new = not Path(path).exists()
     folder = prepare_output(path, overwrite)
@@ -108,8 +129,22 @@ def _prepare_folder(path: Path, overwrite: bool) -> None:
     except OSError as error:
         raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
     if occupied and not overwrite:
-        raise MitsimError(f"output {path}: the folder holds files already; choose a new one or empty it")
+        raise MitsimError(
+            f"output {path}: the folder holds files already{_unfinished(path) or '; choose a new one or empty it'}"
+        )
     _try_writing(path, path)
+
+
+def _unfinished(folder: Path) -> str:
+    """What a killed capture or calibration left in the folder, and how to go on; nothing when there is none."""
+    try:
+        manifest = json.loads(read_text(folder / "manifest.json", _LONGEST_HEAD))
+    except (MitsimError, ValueError, RecursionError):
+        return ""
+    if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
+        return ""
+    frames = len(list(folder.glob("*.exr"))) - (folder / "truth.exr").is_file()
+    return f": an unfinished {manifest.get('kind')} with {frames} finished frames; go on with resume=True"
 
 
 def _try_writing(path: Path, folder: Path) -> None:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.factors import Side, Slab
+from mitsim.reconstruct.sides import Side, Slab
 
 _LARGEST = 1e100
 """Largest norm of a frame, and one over the smallest: its square, the energy, is then told from 0 and infinity."""

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.status import Status, Verdict
 
 SEPARABLE_RESIDUAL = 0.01
 """Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform
@@ -33,8 +34,9 @@ LARGEST_ERROR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """Estimated factors and how far to trust them.
+class Estimate:
+    """Factors as :func:`estimate_factors` found them, and how far to trust them; once they are those of a camera, with
+    its identity and in a file's precision, they are :class:`mitsim.reconstruct.factors.Factors`.
 
     Attributes
     ----------
@@ -53,8 +55,8 @@ class Calibration:
         relative error of (left, right), in the Frobenius norm, that independent noise of that size leaves.
     rank
         of (left, right): singular values that are more than rounding, and than that noise alone would make.
-    ok, status
-        False when the responses cannot be trusted; a sentence, and one with error, rank and condition.
+    status
+        not ok when the responses cannot be trusted; with error, rank and condition.
     """
 
     left: FloatArray
@@ -65,8 +67,12 @@ class Calibration:
     noise: float
     predicted_error: tuple[float, float]
     rank: tuple[int, int]
-    ok: bool
-    status: str
+    status: Status
+
+    @property
+    def ok(self) -> bool:
+        """Whether the factors can be used as they are."""
+        return self.status.ok
 
 
 @dataclass
@@ -85,7 +91,7 @@ def estimate_factors(
     centre: bool = False,
     uniform: npt.ArrayLike | None = None,
     noise: float | None = None,
-) -> Calibration:
+) -> Estimate:
     """Factors of a separable camera from its responses to striped light.
 
     Parameters
@@ -121,7 +127,7 @@ def estimate_factors(
     a, v = _rank_one_split(mean)
     left = _split(first[0], rows, "horizontal", v, signs.shape[1], centre)
     right = _split(first[1].T, columns, "vertical", a, signs.shape[1], centre)
-    return _calibration(left, right, a, v, signs, noise)
+    return _estimate(left, right, a, v, signs, noise)
 
 
 def _split(
@@ -145,9 +151,9 @@ def _split(
     return result
 
 
-def _calibration(
+def _estimate(
     left: _Split, right: _Split, a: FloatArray, v: FloatArray, signs: FloatArray, stated_noise: float | None
-) -> Calibration:
+) -> Estimate:
     count = signs.shape[1]
     phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
     energy = left.energy + right.energy
@@ -158,20 +164,17 @@ def _calibration(
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
     allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
-    condition = max(_squared_condition(phi[0]), _squared_condition(phi[1]))
+    condition = max(squared_condition(phi[0]), squared_condition(phi[1]))
     predicted, rank = [], []
-    for factor, other in ((phi[0], v), (phi[1], a)):
-        predicted.append(predicted_error(factor, noise, float(np.linalg.norm(other)), count))
+    for factor, common in ((phi[0], v), (phi[1], a)):
+        predicted.append(predicted_error(factor, noise, float(np.linalg.norm(common)), count))
         rank.append(_rank(factor, predicted[-1]))
-    ok, status = _verdict(
-        unexplained > allowed, unexplained, max(predicted), phi[0].shape[1] - rank[0], phi[1].shape[1] - rank[1]
-    )
     n = phi[0].shape[1], phi[1].shape[1]
-    extent = (
+    figures = (
         f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
         f"rank {rank[0]} of {n[0]} and {rank[1]} of {n[1]}, condition {condition:.1e}."
     )
-    return Calibration(
+    return Estimate(
         left=phi[0],
         right=phi[1],
         separability_residual=residual,
@@ -180,14 +183,26 @@ def _calibration(
         noise=noise,
         predicted_error=(predicted[0], predicted[1]),
         rank=(rank[0], rank[1]),
-        ok=ok,
-        status=f"{status} {extent}",
+        status=_status(unexplained > allowed, unexplained, max(predicted), (n[0] - rank[0], n[1] - rank[1]), figures),
     )
 
 
 def predicted_error(factor: FloatArray, noise: float, common_norm: float, count: int) -> float:
-    """Relative Frobenius error of a factor (m, n) when every datum has independent noise of that size.
+    """Relative Frobenius error of a factor when every datum has independent noise.
 
+    Parameters
+    ----------
+    factor
+        Phi (m, n) [square root of the frames' unit].
+    noise
+        standard deviation of a datum [frame unit].
+    common_norm
+        |v|, the norm of what all responses of this side share [as ``factor``].
+    count
+        N, the responses.
+
+    Notes
+    -----
     u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, and U H^T / N averages N of them with signs,
     so the factor has variance noise^2 / (N |v|^2). The error of v itself enters at second order and as a
     common scale of order noise / (|a| |v|), and is left out. Infinite for a factor that is zero.
@@ -197,23 +212,30 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
 
 
-def _verdict(inseparable: bool, residual: float, error: float, lost_rows: int, lost_columns: int) -> tuple[bool, str]:
+def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, int], figures: str) -> Status:
     if inseparable:
-        return False, (
-            f"Responses are not separable: {residual:.1%} of them is left over; for a FlatCam mask centre "
-            "them, otherwise look for ambient light or a rotated part, or raise the exposure."
+        return Status(
+            Verdict.NOT_SEPARABLE,
+            f"Responses are not separable: {residual:.1%} of them is left over",
+            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure",
+            figures,
         )
     if error > LARGEST_ERROR:
-        return False, (
-            f"Factors are mostly noise: an error of {error:.0%} is expected of them, allowed are {LARGEST_ERROR:.0%}; "
-            "raise the exposure or average captures."
+        return Status(
+            Verdict.MOSTLY_NOISE,
+            f"Factors are mostly noise: an error of {error:.0%} is expected of them, allowed are {LARGEST_ERROR:.0%}",
+            "raise the exposure or average captures",
+            figures,
         )
-    if lost_rows or lost_columns:
-        return False, (
-            f"Factors are rank deficient: {lost_rows} directions of scene rows and {lost_columns} of columns are not "
-            "above noise and rounding; use fewer scene pixels, a larger distance from sensor to mask or more exposure."
+    if any(lost):
+        return Status(
+            Verdict.RANK_DEFICIENT,
+            f"Factors are rank deficient: {lost[0]} directions of scene rows and {lost[1]} of columns are not above "
+            "noise and rounding",
+            "use fewer scene pixels, a larger distance from sensor to mask or more exposure",
+            figures,
         )
-    return True, "Calibrated: responses are separable."
+    return Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
 
 
 def _rank(phi: FloatArray, error: float) -> int:
@@ -237,7 +259,8 @@ def _singular(phi: FloatArray) -> tuple[FloatArray, float]:
     return singular, float(singular[0] * max(phi.shape) * np.finfo(np.float64).eps)
 
 
-def _squared_condition(phi: FloatArray) -> float:
+def squared_condition(phi: FloatArray) -> float:
+    """cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
     singular, cut = _singular(phi)
     if phi.shape[0] < phi.shape[1] or singular[-1] <= cut:
         return float("inf")

@@ -1,262 +1,201 @@
-"""One side of the model factorised: from a factor Phi and its pattern columns P to singular values and slabs.
-
-With K patterns p_i, the stacked matrix B = [Phi diag(p_1); ...; Phi diag(p_K)] (m K, n) holds all that one
-side contributes: the paper's A = Phi^T Phi o P P^T (arXiv 2111.12862, eq. 7) is B^T B. Forming A squares the
-condition number, so B itself is factorised, B = U S V^T, and row block i of U is kept as *slab* i: what
-frames of pattern i are projected on.
-
-Where P P^T vanishes between groups of scene pixels, B falls apart into *blocks* that are factorised alone,
-and slab i touches only the blocks that pattern i lights.
-"""
+"""The two factors of a calibrated camera: arrays or a CAL folder in, the linear operator of any pattern family out."""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
-from scipy.sparse.csgraph import connected_components
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut
+from mitsim.core.framefile import checksum, read_frame, write_frame
+from mitsim.core.manifests import CalibrationManifest, read_manifest, write_manifest
+from mitsim.core.output import output_folder
+from mitsim.core.pictures import card, scaled
+from mitsim.core.runs import Capture, finite_channel, verify
+from mitsim.reconstruct.accumulator import centred_columns
+from mitsim.reconstruct.calibration import Estimate, squared_condition
+from mitsim.reconstruct.status import Status, Verdict
+from mitsim.rig.patterns import PatternFamily, parse_patterns
 
-IndexArray = npt.NDArray[np.intp]
-Method = Literal["svd", "gram"]
-Structure = Literal["auto", "block", "full"]
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import LinearOperator
 
-
-@dataclass(frozen=True, eq=False)
-class Group:
-    """Scene pixels factorised together, and their pattern rows as ``weights psi^T`` where they are of rank one.
-
-    ``pixels`` (c,), ``patterns`` (c, K), ``shared`` is (weights (c,), psi (K,)) or None.
-    """
-
-    pixels: IndexArray
-    patterns: FloatArray
-    shared: tuple[FloatArray, FloatArray] | None
-
-    def lights(self, index: int) -> bool:
-        """Whether pattern ``index`` lights any of these pixels."""
-        return bool(self.patterns[:, index].any() if self.shared is None else self.shared[1][index])
+_FILES = ("left", "right")
 
 
 @dataclass(frozen=True, eq=False)
-class Slab:
-    """What one pattern index contributes: ``matrix`` (m, c) and the ``columns`` (c of them) it fills in W."""
-
-    columns: slice | IndexArray
-    matrix: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Side:
-    """Factorised side of the model.
+class Factors:
+    """A camera's factors, as a CAL folder holds them: a frame under pattern P is Phi_L (P o X) Phi_R^T.
 
     Attributes
     ----------
-    basis
-        (n, r) right singular vectors V of B (for ``gram``: eigenvectors of A).
-    singular
-        (r,) singular values of B, numerically zero ones set to exactly 0. r = min(n, rows of B) over the
-        blocks.
-    slabs
-        one a pattern index.
-    projected
-        True: slabs are rows of U. False (``gram``): slabs are Phi diag(p_i), and W is the paper's Q.
-    n_blocks, pattern_count, sensor_size, scene_size, data_rows
-        number of blocks; K; m; n; independent data rows, m K (less K once frames are centred).
+    left, right
+        Phi_L (m, n), Phi_R (m', n') [sqrt(electrons / s)], numbers of single precision, so that factors from memory and
+        from disk are the same.
+    manifest
+        of which camera they are, and how they are used.
+    status
+        what the estimator thought of them.
+    name
+        the folder, or what messages call factors in memory.
+    estimate
+        what they were fitted as, with residual and predicted error; None for factors from a folder.
     """
 
-    basis: FloatArray
-    singular: FloatArray
-    slabs: tuple[Slab, ...]
-    projected: bool
-    n_blocks: int
-    pattern_count: int
-    sensor_size: int
-    scene_size: int
-    data_rows: int
+    left: FloatArray
+    right: FloatArray
+    manifest: CalibrationManifest
+    status: Status
+    name: str = "in memory"
+    estimate: Estimate | None = None
 
-    @property
-    def rank(self) -> int:
-        """Number of singular values above the rank cut."""
-        return int(np.count_nonzero(self.singular))
+    @classmethod
+    def of(cls, estimate: Estimate, manifest: CalibrationManifest) -> Factors:
+        """The factors of an ``estimate``, of the camera that the ``manifest`` names."""
+        left, right = (side.astype(np.float32).astype(np.float64) for side in (estimate.left, estimate.right))
+        update = {"estimate": str(estimate.status), "verdict": estimate.status.verdict.value}
+        return cls(left, right, manifest.model_copy(update=update), estimate.status, estimate=estimate)
 
-    @property
+    @cached_property
     def condition(self) -> float:
-        """cond(A): (largest / smallest singular value of B)**2; inf when rank deficient."""
-        if self.rank < self.scene_size:
-            return float("inf")
-        return float((self.singular.max() / self.singular.min()) ** 2)
+        """The larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient."""
+        return max(squared_condition(self.left), squared_condition(self.right))
 
     @property
-    def accumulated_size(self) -> int:
-        """Length of this side of W."""
-        return len(self.singular) if self.projected else self.scene_size
+    def ok(self) -> bool:
+        """Whether the factors can be used as they are: a good status, and no warnings."""
+        return self.status.ok and not self.warnings
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the calibration is flagged."""
+        return self.manifest.warnings
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 that equal factors share, in memory or on disk."""
+        centre = str(self.manifest.centre).encode()
+        return hashlib.sha256(self.left.tobytes() + self.right.tobytes() + centre).hexdigest()
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the CAL folder that `mitsim calibrate` writes, to a new or empty ``folder``; returns it.
+
+        MitsimError when it holds something, or cannot be written.
+        """
+        with output_folder(folder) as place:
+            return self.write(place)
+
+    def write(self, folder: Path) -> Path:
+        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`)."""
+        metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
+        if self.manifest.board_reflectance is not None:
+            metadata["reflectance"] = self.manifest.board_reflectance
+        for name, factor in zip(_FILES, (self.left, self.right), strict=True):
+            write_frame(folder / f"{name}.exr", {"factor": factor.astype(np.float32)}, metadata)
+        checksums = {f"{name}.exr": checksum(folder / f"{name}.exr") for name in _FILES}
+        write_manifest(folder, self.manifest.model_copy(update={"checksums": checksums, "status": "complete"}))
+        return folder
+
+    def check_fit(self, shots: Capture) -> None:
+        """MitsimError when ``shots`` are of another camera, mask, distance or projector: the first thing that
+        differs."""
+        ours_all, theirs_all = shots.manifest.camera, self.manifest.camera
+        for part in sorted({*ours_all, *theirs_all}):
+            ours, theirs = ours_all.get(part), theirs_all.get(part)
+            if ours == theirs:
+                continue
+            if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+                key = next(key for key in sorted({*ours, *theirs}) if ours.get(key) != theirs.get(key))
+                part, ours, theirs = f"{part}.{key}", ours.get(key), theirs.get(key)
+            raise MitsimError(
+                f"calibration {self.name}: {cut(part)} is {cut(str(theirs))}, but {shots.name} has {cut(str(ours))}; "
+                "calibrate this camera"
+            )
+        for side, pattern, factor in zip(("P_L", "P_R"), shots.patterns, (self.left, self.right), strict=True):
+            if len(pattern) != factor.shape[1]:
+                raise MitsimError(
+                    f"{shots.name}: patterns.{side} has {len(pattern)} scene pixels, but calibration {self.name} has "
+                    f"{factor.shape[1]}; calibrate with this projector"
+                )
+
+    def operator(self, patterns: str | PatternFamily, seed: int = 0) -> LinearOperator:
+        """The whole model as a linear operator, with its adjoint.
+
+        Parameters
+        ----------
+        patterns
+            a family, or its name such as ``dots:7``.
+        seed
+            of the patterns of a ``random`` family given by name.
+
+        Returns
+        -------
+        LinearOperator
+            (K K' m m', n n'): takes an image (n, n'), row by row, to the measurements (K, K', m, m') [electrons/s] of
+            all patterns (i, j), the differences of signed pairs; centred where the calibration is.
+
+        Raises
+        ------
+        MitsimError
+            for patterns that do not fit the factors.
+        """
+        from scipy.sparse.linalg import LinearOperator
+
+        rows, columns = self.left.shape[1], self.right.shape[1]
+        if isinstance(patterns, str):
+            patterns = parse_patterns(patterns, rows, seed)
+        lit = len(patterns.left), len(patterns.right)
+        if lit != (rows, columns):
+            raise MitsimError(
+                f"patterns {patterns.name!r} are for {lit[0]} x {lit[1]} scene pixels, but the factors have "
+                f"{rows} x {columns}; use patterns of that size"
+            )
+        factors = self.left, self.right
+        if self.manifest.centre:
+            factors = centred_columns(self.left), centred_columns(self.right)
+        # (K, m, n) stacks Phi diag(p_i): frame (i, j) is lefts[i] X rights[j]^T.
+        lefts, rights = (
+            factor[None] * side.T[:, None, :].astype(np.float64)
+            for factor, side in zip(factors, (patterns.left, patterns.right), strict=True)
+        )
+        shape = len(lefts), len(rights), len(self.left), len(self.right)
+
+        def forward(image: FloatArray) -> FloatArray:
+            half = lefts @ image.reshape(rows, columns)
+            return np.asarray(half[:, None] @ rights.transpose(0, 2, 1)).ravel()
+
+        def adjoint(frames: FloatArray) -> FloatArray:
+            gathered = (frames.reshape(shape) @ rights).sum(axis=1)
+            return np.asarray((lefts.transpose(0, 2, 1) @ gathered).sum(axis=0)).ravel()
+
+        return LinearOperator(
+            (int(np.prod(shape)), rows * columns), matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64)
+        )
+
+    def _repr_html_(self) -> str:
+        pictures = {f"{name} {side.shape[0]} x {side.shape[1]}": scaled(side) for name, side in self._sides()}
+        return card(f"Factors: {self.status.verdict.value}", pictures, (str(self.status), *self.warnings))
+
+    def _sides(self) -> tuple[tuple[str, FloatArray], ...]:
+        return tuple(zip(_FILES, (self.left, self.right), strict=True))
 
 
-def pattern_blocks(patterns: FloatArray) -> tuple[IndexArray, ...]:
-    """Groups of scene pixels between which P P^T vanishes: the connected components of its nonzero pattern.
-
-    ``patterns`` is P (n, K). Whole-number patterns are multiplied in integers, so that orthogonal rows give
-    an exact zero; for others two pixels are held apart only if no pattern lights both. Order: by first
-    pixel.
-    """
-    kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
-    whole = np.rint(kinds)
-    if np.array_equal(whole, kinds) and np.abs(whole).max(initial=0) < 2**24:
-        linked = (whole.astype(np.int64) @ whole.astype(np.int64).T) != 0
-    else:
-        lit = (kinds != 0).astype(np.int64)
-        linked = (lit @ lit.T) != 0
-    count, label = connected_components(linked, directed=False)
-    found = [np.flatnonzero(label[kind.ravel()] == block) for block in range(count)]
-    return tuple(sorted(found, key=lambda block: int(block[0])))
-
-
-def group_pixels(patterns: FloatArray, structure: Structure) -> tuple[Group, ...]:
-    """What of the factorisation depends on the patterns (n, K) alone; ``full`` makes one group of general rank."""
-    if structure == "full":
-        return (Group(np.arange(len(patterns)), patterns, None),)
-    return tuple(Group(block, patterns[block], _rank_one(patterns[block])) for block in pattern_blocks(patterns))
-
-
-def factorise(
-    phi: FloatArray,
-    patterns: FloatArray,
-    groups: tuple[Group, ...],
-    method: Method,
-    structure: Structure,
-    centred: bool,
-) -> Side:
-    """Factorise one side; ``phi`` (m, n) and ``patterns`` (n, K) are checked, ``groups`` are those of the patterns."""
-    sensor, scene = phi.shape
-    build = _projected if method == "svd" else _gram
-    basis, singular, slabs = build(phi, patterns, groups, structure)
-    return Side(
-        basis=_frozen(basis),
-        singular=_frozen(singular),
-        slabs=slabs,
-        projected=method == "svd",
-        n_blocks=len(groups),
-        pattern_count=patterns.shape[1],
-        sensor_size=sensor,
-        scene_size=scene,
-        data_rows=(sensor - centred) * patterns.shape[1],
-    )
-
-
-def _projected(
-    phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
-) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
-    """SVD of B block by block: basis, singular values, slabs."""
-    parts = [_block_svd(phi[:, group.pixels], group) for group in groups]
-    singular = np.concatenate([part[1] for part in parts])
-    starts = np.concatenate(([0], np.cumsum([len(part[1]) for part in parts])))
-    basis = np.zeros((phi.shape[1], len(singular)))
-    for group, part, start, stop in zip(groups, parts, starts[:-1], starts[1:], strict=True):
-        basis[group.pixels, start:stop] = part[2].T
-    # Rank cut of numpy.linalg.matrix_rank, against the largest value of the whole side, not of the block.
-    longest = max(phi.shape[0] * patterns.shape[1], phi.shape[1])
-    singular[singular <= singular.max() * longest * np.finfo(np.float64).eps] = 0.0
-    slabs = []
-    for index in range(patterns.shape[1]):
-        lit = [b for b, group in enumerate(groups) if structure == "full" or group.lights(index)]
-        columns = np.concatenate([np.arange(starts[b], starts[b + 1]) for b in lit] or [np.arange(0)])
-        pieces = [parts[b][0][index] for b in lit] or [np.zeros((phi.shape[0], 0))]
-        slabs.append(Slab(_as_slice(columns), _frozen(np.concatenate(pieces, axis=1))))
-    return basis, singular, tuple(slabs)
-
-
-def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray]:
-    """U cut into K slabs (m, r), singular values (r,) and V^T (r, n) of one block's stacked matrix."""
-    patterns = group.patterns
-    if group.shared is not None:
-        # B = psi (x) Phi diag(w): the SVD of one slab serves all, whatever K.
-        weights, psi = group.shared
-        norm = float(np.linalg.norm(psi))
-        left, singular, right = _svd(phi * weights)
-        scale = psi / (norm or 1.0)
-        return tuple(_scaled(left, factor) for factor in scale), singular * norm, right
-    # Phi = Q R once: B = (I (x) Q) [R diag(p_1); R diag(p_2); ...] is then as short as R, and as accurate.
-    q, small = np.linalg.qr(phi)
-    stacked = np.concatenate([small * column for column in patterns.T])
-    left, singular, right = _svd(stacked)
-    return tuple(q @ slab for slab in np.split(left, patterns.shape[1])), singular, right
-
-
-def _scaled(matrix: FloatArray, factor: float) -> FloatArray:
-    """matrix * factor without the work for 1, and with no columns for 0: a dark block is never read."""
-    if factor == 0.0:
-        return matrix[:, :0]
-    return matrix if factor == 1.0 else matrix * factor
-
-
-def _rank_one(patterns: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """(w, psi) with patterns = w psi^T exactly, or None: rows that are multiples of one another."""
-    lit_rows = np.flatnonzero(patterns.any(axis=1))
-    if len(lit_rows) == 0:
-        return np.zeros(len(patterns)), np.zeros(patterns.shape[1])
-    psi = patterns[lit_rows[0]]
-    pivot = int(np.flatnonzero(psi)[0])
-    weights = patterns[:, pivot] / psi[pivot]
-    return (weights, psi) if np.array_equal(np.outer(weights, psi), patterns) else None
-
-
-def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Thin SVD (LAPACK gesdd, which takes a QR first when the matrix is tall).
-
-    numpy's LAPACK, not scipy's: the two wheels carry two thread pools, which on a busy machine wait for
-    each other (2.5 s instead of 15 ms was seen on 2 cores).
-    """
-    left, singular, right = np.linalg.svd(matrix, full_matrices=False)
-    return left, singular, right
-
-
-def _gram(
-    phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
-) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
-    """Eigen-decomposition of A block by block (the paper's way), and slabs Phi diag(p_i)."""
-    scene = phi.shape[1]
-    basis, eigenvalues = np.zeros((scene, scene)), np.zeros(scene)
-    start = 0
-    for block in (group.pixels for group in groups):
-        gram = (phi[:, block].T @ phi[:, block]) * (patterns[block] @ patterns[block].T)
-        values, vectors = np.linalg.eigh(gram)
-        stop = start + len(block)
-        eigenvalues[start:stop] = values
-        basis[block, start:stop] = vectors
-        start = stop
-    # A has no negative eigenvalues: what falls below its rounding error carries no information.
-    eigenvalues[eigenvalues <= eigenvalues.max() * scene * np.finfo(np.float64).eps] = 0.0
-    slabs = []
-    for column in patterns.T:
-        columns = np.arange(scene) if structure == "full" else np.flatnonzero(column)
-        slabs.append(Slab(_as_slice(columns), _frozen(phi[:, columns] * column[columns])))
-    return basis, np.sqrt(eigenvalues), tuple(slabs)
-
-
-def _as_slice(columns: IndexArray) -> slice | IndexArray:
-    """Equally spaced columns as a slice: basic indexing is then a view, twice as fast."""
-    if len(columns) == 0:
-        return slice(0, 0)
-    step = int(columns[1] - columns[0]) if len(columns) > 1 else 1
-    if (np.diff(columns) == step).all():
-        return slice(int(columns[0]), int(columns[-1]) + 1, step)
-    return columns
-
-
-def _frozen(array: FloatArray) -> FloatArray:
-    array = np.ascontiguousarray(array)
-    array.flags.writeable = False
-    return array
-
-
-def check_choices(method: str, structure: str) -> None:
-    """MitsimError unless both names are known."""
-    if method not in get_args(Method):
-        raise MitsimError(f"solver method is {method!r}; use one of {', '.join(get_args(Method))}")
-    if structure not in get_args(Structure):
-        raise MitsimError(f"solver structure is {structure!r}; use one of {', '.join(get_args(Structure))}")
+def load_calibration(folder: Path | str) -> Factors:
+    """The factors in the CAL folder ``folder``. MitsimError when it is not a complete calibration."""
+    folder = Path(folder)
+    manifest = read_manifest(folder, CalibrationManifest)
+    factors = []
+    for name in _FILES:
+        verify(folder, f"{name}.exr", manifest.checksums, "calibrate again")
+        path = folder / f"{name}.exr"
+        factors.append(finite_channel(read_frame(path)[0], "factor", path))
+    sentence = manifest.estimate or "Factors from elsewhere, without a word on how good they are"
+    known = {verdict.value: verdict for verdict in Verdict}
+    status = Status(known.get(manifest.verdict or "", Verdict.UNKNOWN), sentence.rstrip("."))
+    return Factors(factors[0], factors[1], manifest, status, str(folder))

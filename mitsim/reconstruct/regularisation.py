@@ -17,7 +17,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 
 RISK_POWER = 0.5
-"""Errors are weighted by sigma to this power: 0 is the image's error, 2 that of predicted frames."""
+"""Errors are weighted by sigma to this power: 0 is the image's error, 2 that of predicted frames; chosen in
+docs/decisions/0002-automatic-lambda.md."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +43,12 @@ class DiagonalProblem:
     data_count: int
 
     def residual_energy(self, lam: float) -> float:
-        """||Y - model||^2 of the Tikhonov solution; rounding leaves about 1e-16 of ``energy``."""
+        """||Y - model||^2 of the Tikhonov solution at ``lam``; rounding leaves about 1e-16 of ``energy``."""
         outside = max(self.energy - float(np.sum(np.square(self.projected))), 0.0)
         return outside + float(np.sum(np.square((1 - self.kept(lam)) * self.projected)))
 
     def kept(self, lam: float) -> FloatArray:
-        """Share sigma^2 / (sigma^2 + lambda) of each coefficient that is kept; 0 beyond the rank."""
+        """(r, r') share sigma^2 / (sigma^2 + ``lam``) of each coefficient that is kept; 0 beyond the rank."""
         squared = np.square(self.sigma)
         return np.divide(squared, squared + lam, out=np.zeros_like(squared), where=squared > 0)
 
@@ -57,46 +58,60 @@ class DiagonalProblem:
         return float(np.square(self.sigma.max()))
 
 
-def risk_score(spectrum: DiagonalProblem, lam: float, noise: float) -> float:
+def risk_score(problem: DiagonalProblem, lam: float, noise: float) -> float:
     """Unbiased estimate of the weighted squared error of the image, up to a constant.
 
+    Parameters
+    ----------
+    problem
+        in its diagonal basis.
+    lam
+        lambda, in the unit of sigma^2.
+    noise
+        variance of one datum.
+
+    Notes
+    -----
     With kept shares k, coefficient (k W / sigma) has expected squared error (1 - k)^2 x^2 + k^2 noise /
     sigma^2; (W^2 - noise) / sigma^2 estimates x^2 without bias, and what does not depend on lambda is left
-    out, so that small sigma do no harm. ``noise`` is the variance of one datum.
+    out, so that small sigma do no harm.
     """
-    measured = spectrum.sigma > 0
-    sigma, data = spectrum.sigma[measured], np.square(spectrum.projected[measured])
-    kept = spectrum.kept(lam)[measured]
+    measured = problem.sigma > 0
+    sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
+    kept = problem.kept(lam)[measured]
     errors = ((kept - 2) * (data - noise) + kept * noise) / (np.square(sigma) + lam)
     return float(np.sum(sigma**RISK_POWER * errors))
 
 
-def noise_variance(spectrum: DiagonalProblem) -> float:
-    """Mean noise variance of one datum [data unit squared], from the energy outside the model's range."""
-    spare = spectrum.data_count - np.count_nonzero(spectrum.sigma)
+def noise_variance(problem: DiagonalProblem) -> float:
+    """Mean noise variance of one datum of a ``problem`` [data unit squared], from the energy outside the model's range.
+
+    MitsimError when there are no more data than unknowns.
+    """
+    spare = problem.data_count - np.count_nonzero(problem.sigma)
     if spare <= 0:
         raise MitsimError("there are no more data than unknowns, so noise cannot be told; give lambda as a number")
-    inside = np.square(spectrum.projected[spectrum.sigma > 0]).sum()
-    return max(spectrum.energy - float(inside), 0.0) / spare
+    inside = np.square(problem.projected[problem.sigma > 0]).sum()
+    return max(problem.energy - float(inside), 0.0) / spare
 
 
-def automatic_lambda(spectrum: DiagonalProblem) -> float:
-    """Lambda that minimises :func:`risk_score`: a grid over 16 decades, refined between its best neighbours.
+def automatic_lambda(problem: DiagonalProblem) -> float:
+    """Lambda that minimises :func:`risk_score` of a ``problem``: a grid over 16 decades, refined at its best.
 
     Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there
     are no more data than unknowns (the noise is then unknown) or no signal.
     """
-    noise = noise_variance(spectrum)
-    if spectrum.energy == 0:
+    noise = noise_variance(problem)
+    if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
     grid = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
 
     def score(exponent: float) -> float:
-        return risk_score(spectrum, spectrum.scale * 10.0**exponent, noise)
+        return risk_score(problem, problem.scale * 10.0**exponent, noise)
 
     best = int(np.argmin([score(exponent) for exponent in grid]))
-    if best == 0 and risk_score(spectrum, 0.0, noise) <= score(grid[0]):
+    if best == 0 and risk_score(problem, 0.0, noise) <= score(grid[0]):
         return 0.0
     lower, upper = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     refined = minimize_scalar(score, bounds=(lower, upper), method="bounded", options={"xatol": 1e-3})
-    return float(spectrum.scale * 10.0 ** float(refined.x))
+    return float(problem.scale * 10.0 ** float(refined.x))

@@ -8,7 +8,7 @@ factors prepared once and the frames added one by one:
 >>> frames.add(Y, i, j)                           # for each pattern P_L[:, i] P_R[:, j]^T
 >>> solution = prepared.solve(frames, "auto")
 
-With B_L = U_L S_L V_L^T (see :mod:`mitsim.reconstruct.factors`) and W = sum_ij U_Li^T Y_ij U_Rj the
+With B_L = U_L S_L V_L^T (see :mod:`mitsim.reconstruct.sides`) and W = sum_ij U_Li^T Y_ij U_Rj the
 solution is X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. Its rounding error is about eps /
 sqrt(lambda_rel), with lambda_rel = lambda / (max s_L^2 max s_R^2); with the paper's Q = sum (Phi_L^T Y
 Phi_R) o P in place of W it is eps / lambda_rel (docs/decisions/0001-projected-accumulation.md).
@@ -32,15 +32,18 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.accumulator import Accumulator, centred_columns
-from mitsim.reconstruct.factors import Method, Side, Structure, check_choices, factorise, group_pixels
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
+from mitsim.reconstruct.sides import Method, Side, Structure, check_choices, factorise, group_pixels
+from mitsim.reconstruct.status import Status, Verdict
 
 ROUNDING_LIMIT = 0.01
 """Rounding above this part of the image flags a solution: two digits are the least that anyone can see or use."""
 _ROUNDING_UNITS = 10 * float(np.finfo(np.float64).eps)
+"""Rounding of a number before it is magnified: chosen above all that tests/hard/test_solver_digits.py measures."""
 _SMALLEST, _LARGEST = 1e-30, 1e30
 """Largest number of a factor or pattern: sigma^2, a product of eight of them, then stays far from 1e-308 and 1e308."""
 _UNSEEN = 1e-60
+"""Singular values below it are zero: the square of ``_SMALLEST``, a factor that small times a pattern that small."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +65,9 @@ class Solution:
         ||Y - model|| / ||Y|| over all frames; rounding hides what is below about 1e-8.
     rounding
         what rounding may have changed, ||error|| / ||image||; see above.
-    ok
-        False when the image lacks something that no lambda explains, or rounding may have changed more than
-        ROUNDING_LIMIT of it; ``status`` says what and what to do.
     status
-        a sentence, and one with rank, condition and rounding.
+        not ok when the image lacks something that no lambda explains, or rounding may have changed more than
+        ROUNDING_LIMIT of it; with rank, condition and rounding.
     """
 
     image: FloatArray
@@ -77,8 +78,12 @@ class Solution:
     condition: float
     residual: float
     rounding: float
-    ok: bool
-    status: str
+    status: Status
+
+    @property
+    def ok(self) -> bool:
+        """Whether the image can be used as it is."""
+        return self.status.ok
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +119,8 @@ class Prepared:
         """An empty sum to add frames to."""
         return Accumulator(self.left, self.right, self.centre)
 
-    def spectrum(self, frames: Accumulator) -> DiagonalProblem:
-        """Data and singular values in the basis where the problem is diagonal.
+    def problem(self, frames: Accumulator) -> DiagonalProblem:
+        """Data of all ``frames`` and singular values in the basis where the problem is diagonal.
 
         MitsimError when frames are missing: the closed form holds for all patterns or none.
         """
@@ -134,84 +139,92 @@ class Prepared:
         return DiagonalProblem(sigma, projected, frames.energy, data_count)
 
     def image(self, coefficients: npt.ArrayLike) -> FloatArray:
-        """Scene image (n, n') of coefficients (r, r') in the diagonal basis: V_L coefficients V_R^T."""
+        """Scene image (n, n') of ``coefficients`` (r, r') in the diagonal basis: V_L coefficients V_R^T."""
         return np.asarray(self.left.basis @ np.asarray(coefficients) @ self.right.basis.T)
 
     def coefficients(self, image: npt.ArrayLike) -> FloatArray:
-        """Adjoint of :meth:`image`: V_L^T image V_R."""
+        """Adjoint of :meth:`image`: coefficients (r, r') V_L^T ``image`` V_R of an image (n, n')."""
         return np.asarray(self.left.basis.T @ np.asarray(image) @ self.right.basis)
 
     def solve(self, frames: Accumulator, lam: float | Literal["auto"] = "auto") -> Solution:
-        """Tikhonov solution of the added frames.
+        """Tikhonov solution of the added ``frames``.
 
         ``lam`` is lambda >= 0 in the unit of (Phi_L Phi_R)^2; 0 gives the pseudo-inverse, in which singular
         values below max(rows, columns) eps of the largest of their side count as zero. ``"auto"`` chooses
-        it by an unbiased
-        risk estimate. MitsimError for missing frames or another lambda.
+        it by an unbiased risk estimate. MitsimError for missing frames or another lambda.
         """
-        spectrum = self.spectrum(frames)
+        problem = self.problem(frames)
         if isinstance(lam, str):
             if lam != "auto":
                 raise MitsimError(f"lambda is {lam!r}; give a number of at least 0, or auto")
-            lam = automatic_lambda(spectrum)
+            lam = automatic_lambda(problem)
         lam = float(lam)
         if not (np.isfinite(lam) and lam >= 0):
             raise MitsimError(f"lambda is {lam}; give a finite number of at least 0, or auto")
-        sigma = spectrum.sigma
+        sigma = problem.sigma
         filtered = np.divide(
-            sigma * spectrum.projected, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0
+            sigma * problem.projected, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0
         )
-        residual = spectrum.residual_energy(lam)
-        rounding = self._rounding(spectrum, lam)
-        ok, status = self._verdict(lam, rounding, spectrum.scale)
+        residual = problem.residual_energy(lam)
+        rounding = self._rounding(problem, lam)
         return Solution(
             image=self.image(filtered),
             lam=lam,
-            lam_relative=lam / spectrum.scale,
+            lam_relative=lam / problem.scale,
             rank=self.rank,
             unknowns=self.unknowns,
             condition=self.condition,
-            residual=float(np.sqrt(residual / spectrum.energy)) if spectrum.energy > 0 else 0.0,
+            residual=float(np.sqrt(residual / problem.energy)) if problem.energy > 0 else 0.0,
             rounding=rounding,
-            ok=ok,
-            status=f"{status} {self.extent}, rounding below {rounding:.0e}.",
+            status=self._status(lam, rounding, problem.scale),
         )
 
-    def _rounding(self, spectrum: DiagonalProblem, lam: float) -> float:
+    def _rounding(self, problem: DiagonalProblem, lam: float) -> float:
         """Bound on ||error|| / ||image|| by rounding; the module's text says where it comes from."""
-        sigma = spectrum.sigma[spectrum.sigma > 0]
+        sigma = problem.sigma[problem.sigma > 0]
         power = np.square(sigma) + lam
         top = float(sigma.max())
         magnified = top * (sigma / power).max() if self.method == "svd" else top**2 / power.min()
         return _ROUNDING_UNITS * max(float(magnified), 1.0)
 
-    def _verdict(self, lam: float, rounding: float, scale: float) -> tuple[bool, str]:
-        """Whether the image is complete, and the sentence that says why not and what to do."""
+    def _status(self, lam: float, rounding: float, scale: float) -> Status:
+        """Whether the image is complete, and what to do where it is not."""
+        figures = f"{self.extent}, rounding below {rounding:.0e}."
+        lost = self.unknowns - self.rank
         for name, side in (("row", self.left), ("column", self.right)):
             if side.data_rows < side.scene_size:
-                return False, (
-                    f"Under-determined: {side.data_rows} sensor {name}s in all for {side.scene_size} "
-                    f"scene {name}s; use more patterns, more sensor pixels or fewer scene pixels."
+                return Status(
+                    Verdict.UNDER_DETERMINED,
+                    f"Under-determined: {side.data_rows} sensor {name}s in all for {side.scene_size} scene {name}s",
+                    "use more patterns, more sensor pixels or fewer scene pixels",
+                    figures,
                 )
-        lost = self.unknowns - self.rank
         if lost and lam == 0:
-            return False, (
-                f"Rank deficient: {lost} of {self.unknowns} directions are not measured and left at zero "
-                "by the pseudo-inverse; use more patterns, or lambda above 0."
+            return Status(
+                Verdict.RANK_DEFICIENT,
+                f"Rank deficient: {lost} of {self.unknowns} directions are not measured and left at zero by the "
+                "pseudo-inverse",
+                "use more patterns, or lambda above 0",
+                figures,
             )
         if rounding > ROUNDING_LIMIT:
             least = _ROUNDING_UNITS / ROUNDING_LIMIT
             least = scale * (least if self.method == "gram" else (least / 2) ** 2)
-            return False, (
-                f"Ill-conditioned: rounding may change more than {ROUNDING_LIMIT:.0%} of the image; "
-                f"raise lambda above {least:.1e}, or use more patterns."
+            return Status(
+                Verdict.ILL_CONDITIONED,
+                f"Ill-conditioned: rounding may change more than {ROUNDING_LIMIT:.0%} of the image",
+                f"raise lambda above {least:.1e}, or use more patterns",
+                figures,
             )
         if lost:
-            return True, (
-                f"Solved, but {lost} of {self.unknowns} directions are not measured above rounding and "
-                "follow from lambda alone; use more patterns."
+            return Status(
+                Verdict.PARTLY_MEASURED,
+                f"Solved, but {lost} of {self.unknowns} directions are not measured above rounding and follow from "
+                "lambda alone",
+                "use more patterns",
+                figures,
             )
-        return True, "Solved: every direction of the image is measured."
+        return Status(Verdict.SOLVED, "Solved: every direction of the image is measured", "", figures)
 
 
 def prepare(
@@ -273,8 +286,8 @@ def prepare(
     with single_threaded_blas():
         first = side(0)
         sides = first, first if same else side(1)
-    for name, found in zip(("left", "right"), sides, strict=True):
-        if found.singular.max() < _UNSEEN:
+    for name, factorised in zip(("left", "right"), sides, strict=True):
+        if factorised.singular.max() < _UNSEEN:
             raise MitsimError(f"patterns light no scene pixel that the {name} factor sees; light those that it sees")
     return Prepared(*sides, method, centre)
 

@@ -17,35 +17,55 @@ from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
 from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.status import Status, Verdict
 
 _BALANCE = 3.0
+"""Ratio of the two residuals beyond which the penalty changes, which sets the speed only; Boyd et al. name 10."""
+_DENOISE = {"eps": 1e-6, "max_num_iter": 60}
+"""Chambolle's steps within one of ADMM, which need not converge: the next one goes on from there."""
 AUTO_WEIGHT = 0.12
-"""Automatic weight in units of the noise that the data term's gradient carries to one scene pixel."""
+"""Automatic weight in units of the noise that the data term's gradient carries to one scene pixel; chosen by PSNR on
+the anchor's photograph."""
 
 
 @dataclass(frozen=True, eq=False)
 class TVSolution:
-    """Image (n, n') of :func:`solve_tv`, the weight used, iterations spent, the last relative change, and a
-    sentence on convergence with one on rank and condition.
+    """What :func:`solve_tv` found.
+
+    Attributes
+    ----------
+    image
+        (n, n').
+    lam
+        weight of the total variation that was used [data^2 / image].
+    iterations, change
+        that were spent, and the last relative change of the image.
+    residual
+        ||Y - model|| / ||Y|| over all frames.
+    status
+        of the convergence, with rank and condition.
     """
 
     image: FloatArray
-    weight: float
+    lam: float
     iterations: int
     change: float
     residual: float
-    ok: bool
-    status: str
+    status: Status
+
+    @property
+    def ok(self) -> bool:
+        """Whether the iterations converged."""
+        return self.status.ok
 
 
-def automatic_weight(spectrum: DiagonalProblem) -> float:
-    """Weight from the noise estimate: noise standard deviation times the root mean square of sigma, times a
-    constant.
+def automatic_weight(problem: DiagonalProblem) -> float:
+    """Weight for a ``problem``: standard deviation of its noise times the root mean square of sigma, times a constant.
 
     Where the truth is flat the weight must beat the data term's gradient, which is noise of that standard
     deviation.
     """
-    return AUTO_WEIGHT * float(np.sqrt(noise_variance(spectrum) * np.mean(np.square(spectrum.sigma))))
+    return AUTO_WEIGHT * float(np.sqrt(noise_variance(problem) * np.mean(np.square(problem.sigma))))
 
 
 def solve_tv(
@@ -57,20 +77,30 @@ def solve_tv(
 ) -> TVSolution:
     """Total-variation solution of the added frames.
 
-    ``weight`` >= 0 is in the unit of data^2 / image (``"auto"``: :func:`automatic_weight`); it stops when
-    the image changes by less than ``tolerance``, relative, or after ``iterations``. MitsimError for missing
-    frames or another weight.
+    Parameters
+    ----------
+    prepared, frames
+        the factorised model, and all its frames.
+    weight
+        >= 0 [data^2 / image], or ``"auto"``: :func:`automatic_weight`.
+    iterations, tolerance
+        it stops when the image changes by less than ``tolerance``, relative, or after so many.
+
+    Raises
+    ------
+    MitsimError
+        for missing frames, another weight, or no iterations.
     """
-    spectrum = prepared.spectrum(frames)
+    problem = prepared.problem(frames)
     if weight == "auto":
-        weight = automatic_weight(spectrum)
+        weight = automatic_weight(problem)
     if isinstance(weight, str) or not (np.isfinite(weight) and weight >= 0):
         raise MitsimError(f"TV weight is {weight!r}; give a finite number of at least 0, or auto")
     if iterations < 1:
         raise MitsimError(f"TV iterations are {iterations}; give at least 1")
-    squared = np.square(spectrum.sigma)
-    rho = _penalty(spectrum)
-    data = spectrum.sigma * spectrum.projected
+    squared = np.square(problem.sigma)
+    rho = _penalty(problem)
+    data = problem.sigma * problem.projected
     smooth = prepared.image(data / (squared + rho))
     dual = np.zeros_like(smooth)
     change, spent = float("inf"), 0
@@ -78,14 +108,13 @@ def solve_tv(
         spent += 1
         target = prepared.coefficients(smooth - dual)
         # Directions outside the basis (under-determined sides) are not measured: they keep the target.
-        kept = smooth - dual - prepared.image(target)
-        updated = prepared.image((data + rho * target) / (squared + rho)) + kept
+        unmeasured = smooth - dual - prepared.image(target)
+        updated = prepared.image((data + rho * target) / (squared + rho)) + unmeasured
         before = smooth
         # skimage minimises |u - f|^2 / (2 weight) + TV(u).
+        smooth = updated + dual
         if weight:
-            smooth = denoise_tv_chambolle(updated + dual, weight=weight / rho, eps=1e-6, max_num_iter=60)
-        else:
-            smooth = updated + dual
+            smooth = denoise_tv_chambolle(smooth, weight=weight / rho, **_DENOISE)
         dual = dual + updated - smooth
         # Primal and dual residual (Boyd et al., section 3.3): one alone can be small far from the minimum.
         primal, moved = float(np.linalg.norm(updated - smooth)), float(np.linalg.norm(smooth - before))
@@ -93,49 +122,56 @@ def solve_tv(
         # Residual balancing (section 3.4.1): the penalty sets the speed only, and costs nothing to change here.
         factor = 2.0 if primal > _BALANCE * moved else 0.5 if moved > _BALANCE * primal else 1.0
         rho, dual = rho * factor, dual / factor
-    return _solution(prepared, spectrum, smooth, float(weight), spent, change, change < tolerance)
+    return _solution(prepared, problem, smooth, float(weight), spent, change, change < tolerance)
 
 
-def _penalty(spectrum: DiagonalProblem) -> float:
+def _penalty(problem: DiagonalProblem) -> float:
     """ADMM penalty, which sets the speed only: the Tikhonov lambda balances both of its steps."""
-    measured = np.square(spectrum.sigma[spectrum.sigma > 0])
-    if spectrum.data_count > measured.size:
-        lam = automatic_lambda(spectrum)
-        if lam > spectrum.scale * np.finfo(np.float64).eps:
+    measured = np.square(problem.sigma[problem.sigma > 0])
+    if problem.data_count > measured.size:
+        lam = automatic_lambda(problem)
+        if lam > problem.scale * np.finfo(np.float64).eps:
             return lam
     return float(np.exp(np.mean(np.log(measured))))
 
 
 def _solution(
     prepared: Prepared,
-    spectrum: DiagonalProblem,
+    problem: DiagonalProblem,
     image: FloatArray,
     weight: float,
     iterations: int,
     change: float,
     converged: bool,
 ) -> TVSolution:
-    modelled = spectrum.sigma * prepared.coefficients(image)
-    outside = max(spectrum.energy - float(np.sum(np.square(spectrum.projected))), 0.0)
-    misfit = outside + float(np.sum(np.square(spectrum.projected - modelled)))
-    status = f"Solved: total variation converged in {iterations} iterations."
+    modelled = problem.sigma * prepared.coefficients(image)
+    outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
+    misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
     lost = prepared.unknowns - prepared.rank
-    if lost:
-        status = (
-            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured and "
-            "follow from total variation alone; use more patterns."
-        )
+    figures = f"{prepared.extent}."
     if not converged:
-        status = (
-            f"Not converged: after {iterations} iterations the image still changes by {change:.1e} a step; "
-            "allow more iterations or a larger tolerance."
+        status = Status(
+            Verdict.NOT_CONVERGED,
+            f"Not converged: after {iterations} iterations the image still changes by {change:.1e} a step",
+            "allow more iterations or a larger tolerance",
+            figures,
         )
+    elif lost:
+        status = Status(
+            Verdict.PARTLY_MEASURED,
+            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured and "
+            "follow from total variation alone",
+            "use more patterns",
+            figures,
+        )
+    else:
+        sentence = f"Solved: total variation converged in {iterations} iterations"
+        status = Status(Verdict.SOLVED, sentence, "", figures)
     return TVSolution(
         image=image,
-        weight=weight,
+        lam=weight,
         iterations=iterations,
         change=change,
-        residual=float(np.sqrt(misfit / spectrum.energy)) if spectrum.energy > 0 else 0.0,
-        ok=converged,
-        status=f"{status} {prepared.extent}.",
+        residual=float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0,
+        status=status,
     )

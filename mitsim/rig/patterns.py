@@ -59,7 +59,7 @@ class Lighting:
         """One capture with each of ``n`` x ``n`` projector pixels fully lit."""
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
-    def shots(self, chosen: npt.ArrayLike) -> Lighting:
+    def shots(self, chosen: list[int] | npt.NDArray[np.int64]) -> Lighting:
         """The same classes in the ``chosen`` shots only."""
         return replace(self, weights=self.weights[chosen])
 

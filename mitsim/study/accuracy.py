@@ -31,8 +31,9 @@ from mitsim.capture.run import NoiseTarget
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Progress, silent
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifest import versions, write_json
+from mitsim.core.manifest import write_json
 from mitsim.core.output import output_folder, whole_file
+from mitsim.core.versions import versions
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.rig.patterns import PatternFamily
 from mitsim.study import plots

@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.request import Exposure
+from mitsim.capture.exposer import Exposure
 from mitsim.capture.run import digital_block
 from mitsim.capture.session import Session
 from mitsim.core.arrays import Progress, silent
-from mitsim.core.framefile import checksum, write_frame
 from mitsim.core.job import Clock
-from mitsim.core.manifest import versions, write_json
+from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.output import output_folder
 from mitsim.core.resources import Limits
-from mitsim.reconstruct.calibration import Calibration, estimate_factors
+from mitsim.core.versions import versions
+from mitsim.reconstruct.calibration import estimate_factors
+from mitsim.reconstruct.factors import Factors
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.study.metrics import relative_error
 
@@ -52,7 +53,7 @@ def calibrate(
     recipe: SessionRecipe | None = None,
     progress: Progress = silent,
     limits: Limits | None = None,
-) -> tuple[CalibrationResult, Calibration]:
+) -> tuple[CalibrationResult, Factors]:
     """Run a session and write its factors to a CAL folder; returns the report and the factors.
 
     Raises
@@ -68,7 +69,7 @@ def calibrate(
         noisy = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
         with clock.stage("noise-free check"):
             clean = estimate_factors(*session.noise_free(), session.signs, centre=session.centre)
-        warnings = session.plan.warnings + (() if noisy.ok else (noisy.status,))
+        warnings = session.plan.warnings + (() if noisy.ok else (str(noisy.status),))
         if session.saturated:
             warnings += (
                 f"{session.saturated} of {session.captures} frames have pixels at the full well or the ADC's end, "
@@ -79,12 +80,6 @@ def calibrate(
         error = float(
             np.hypot(relative_error(sign * noisy.left, clean.left), relative_error(sign * noisy.right, clean.right))
         )
-        for name, factor in (("left", noisy.left), ("right", noisy.right)):
-            write_frame(
-                folder / f"{name}.exr",
-                {"factor": factor.astype(np.float32)},
-                {"unit": "sqrt(e-/s)", "reflectance": recipe.board_reflectance},
-            )
         result = CalibrationResult(
             n=bench.n,
             frames=session.captures,
@@ -98,21 +93,18 @@ def calibrate(
             output=str(folder),
             warnings=warnings,
         )
-        write_json(
-            folder / "manifest.json",
-            {
-                "kind": "calibration",
-                "status": "complete",
-                "configuration": {**bench.provenance(), "accuracy": accuracy, "seed": seed, "recipe": recipe},
-                "camera": bench.identity(),
-                "centre": session.centre,
-                "board_reflectance": recipe.board_reflectance,
-                "digital": digital_block(bench, session.exposure_s),
-                "checksums": {name: checksum(folder / name) for name in ("left.exr", "right.exr")},
-                "result": {key: value for key, value in vars(result).items() if key != "output"},
-                "warnings": warnings,
-                "estimate": noisy.status,
-                "versions": versions(),
-            },
+        factors = Factors.of(
+            noisy,
+            CalibrationManifest(
+                configuration={**bench.provenance(), "accuracy": accuracy, "seed": seed, "recipe": recipe},
+                camera=bench.identity(),
+                centre=session.centre,
+                board_reflectance=recipe.board_reflectance,
+                digital=digital_block(bench, session.exposure_s),
+                result={key: value for key, value in vars(result).items() if key != "output"},
+                warnings=warnings,
+                versions=versions(),
+            ),
         )
-        return result, noisy
+        factors.write(folder)
+        return result, factors

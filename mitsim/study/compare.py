@@ -16,7 +16,7 @@ from mitsim.core.arrays import FloatArray, Progress
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.accumulator import Accumulator
-from mitsim.reconstruct.calibration import Calibration
+from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.rig.patterns import PatternFamily
 from mitsim.sensor.chain import Digital, electrons_from_irradiance
@@ -39,7 +39,7 @@ class Comparison:
         self,
         bench: Bench,
         light: Light,
-        factors: Calibration,
+        factors: Factors,
         truth: FloatArray,
         plan: Plan,
         seed: int,
@@ -99,7 +99,7 @@ class Comparison:
             psnr(solution.image, self.truth),
             ssim(solution.image, self.truth),
             solution.lam,
-            solution.status,
+            str(solution.status),
         )
 
     def _model(self, family: PatternFamily, factors: tuple[FloatArray, FloatArray]) -> Prepared:

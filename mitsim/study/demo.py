@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.folder import frame_name
 from mitsim.capture.light import collect, pinhole_view
 from mitsim.capture.plan import check_accuracy
 from mitsim.capture.run import CaptureResult, capture
@@ -22,15 +21,16 @@ from mitsim.core.arrays import FloatArray, Progress, silent
 from mitsim.core.configuration import shipped
 from mitsim.core.framefile import read_frame
 from mitsim.core.job import Clock
-from mitsim.core.manifest import read_json, versions, write_json
+from mitsim.core.manifest import read_json, write_json
 from mitsim.core.output import output_folder, sweep
-from mitsim.reconstruct.calibration import Calibration
+from mitsim.core.runs import frame_name, load_run
+from mitsim.core.versions import versions
+from mitsim.reconstruct.factors import Factors
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.recipe import load_recipe
 from mitsim.study.calibration import CalibrationResult, calibrate
 from mitsim.study.compare import Comparison
 from mitsim.study.describe import scene_line
-from mitsim.study.metrics import read_truth
 from mitsim.study.report import (
     BudgetRow,
     CalibrationFacts,
@@ -98,8 +98,9 @@ def _run(bench: Bench, folder: Path, accuracy: float, seed: int, progress: Progr
     calibrated, factors = calibrate(bench, folder / "calibration", accuracy, seed, progress=progress)
     clock.add(calibrated.seconds, "calibration ")
     with clock.stage("transport"):
-        light = collect(bench, captured.plan, bench.family(MAIN, seed).lighting, seed)
-    truth = read_truth(folder / "run")
+        light = collect(bench, captured.plan, *bench.family(MAIN, seed).classes(), seed)
+    truth = load_run(folder / "run").truth
+    assert truth is not None, "a capture writes its truth"
     comparison = Comparison(bench, light, factors, truth, captured.plan, seed, progress)
     with clock.stage("compare families"):
         compared = [comparison.family(name, label) for name, label in FAMILIES.items()]
@@ -150,7 +151,7 @@ def _report(
     bench: Bench,
     captured: CaptureResult,
     calibrated: CalibrationResult,
-    factors: Calibration,
+    factors: Factors,
     white: CapturedFrame,
     families: tuple[FamilyResult, ...],
     exposure: tuple[ExposureRow, ...],

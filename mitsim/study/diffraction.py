@@ -29,9 +29,10 @@ from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Progress
 from mitsim.core.job import Clock
-from mitsim.core.manifest import versions, write_json
+from mitsim.core.manifest import write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.versions import versions
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.calibration import estimate_factors
 from mitsim.reconstruct.solver import prepare
@@ -247,7 +248,7 @@ def _rows(
             ssim=ssim(found.image, image),
             lam=found.lam,
             residual=found.residual,
-            status=found.status,
+            status=str(found.status),
         )
 
 

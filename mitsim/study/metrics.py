@@ -6,24 +6,24 @@ clips: a reconstruction of the wrong brightness is a wrong reconstruction.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.runs import Capture
 
 Image = NDArray[np.floating[Any]]
 
-TRUTH_FILE, TRUTH_CHANNEL = "truth.exr", "reflectance"
-_SSIM_WINDOW = 7  # pixels a side; scikit-image's default
+SSIM_WINDOW = 7
+"""Pixels a side; scikit-image's default."""
 
 
 def psnr(image: Image, truth: Image) -> float:
     """Peak signal-to-noise ratio in dB, peak 1: -10 log10(mean((image - truth)^2)); inf when they are equal.
 
-    Both (n_rows, n_columns). Raises MitsimError when the shapes differ or a value is not finite.
+    ``image`` and ``truth`` are (rows, columns). MitsimError when the shapes differ or a value is not finite.
     """
     image, truth = _pair(image, truth)
     mean_square = float(np.mean((image - truth) ** 2))
@@ -33,18 +33,18 @@ def psnr(image: Image, truth: Image) -> float:
 def ssim(image: Image, truth: Image) -> float:
     """Structural similarity (Wang et al. 2004; scikit-image, 7 x 7 uniform window, data range 1), 1 = equal.
 
-    Both (n_rows, n_columns), at least 7 x 7. Raises MitsimError as `psnr` does, and for smaller images.
+    ``image`` and ``truth`` are (rows, columns). MitsimError as :func:`psnr`, and for images smaller than the window.
     """
     from skimage.metrics import structural_similarity
 
     image, truth = _pair(image, truth)
-    if min(image.shape) < _SSIM_WINDOW:
-        raise MitsimError(f"SSIM: image is {_size(image)} pixels; needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW}")
-    return float(structural_similarity(image, truth, win_size=_SSIM_WINDOW, data_range=1.0))
+    if min(image.shape) < SSIM_WINDOW:
+        raise MitsimError(f"SSIM: image is {_size(image)} pixels; needs at least {SSIM_WINDOW} x {SSIM_WINDOW}")
+    return float(structural_similarity(image, truth, win_size=SSIM_WINDOW, data_range=1.0))
 
 
 def relative_error(values: Image, reference: Image) -> float:
-    """||a - b|| / ||b|| over all entries of two arrays of one shape: what "relative error" means everywhere."""
+    """||a - b|| / ||b|| over all entries of ``values`` a and a ``reference`` b of one shape."""
     b = np.asarray(reference, dtype=np.float64)
     return float(np.linalg.norm(np.asarray(values, dtype=np.float64) - b) / np.linalg.norm(b))
 
@@ -52,9 +52,24 @@ def relative_error(values: Image, reference: Image) -> float:
 def contrast(region: Image, lines: Literal["vertical", "horizontal"] = "vertical", background: float = 0.0) -> float:
     """Contrast ratio (I_max - I_min) / (I_max + I_min) of one group of lines; the paper's MTF / 100.
 
-    `region` (rows, columns) holds only the group. Its mean along the lines gives the profile, less a fixed
-    `background` (the paper's "DC background", unit of the image). Exceeds 1 when the profile goes negative,
-    as least-squares images may. Raises MitsimError when the region is empty or has no light to compare with.
+    Parameters
+    ----------
+    region
+        (rows, columns) of the group alone; its mean along the lines is the profile.
+    lines
+        ``vertical`` or ``horizontal``.
+    background
+        taken off the profile (the paper's "DC background"), in the image's unit.
+
+    Returns
+    -------
+    float
+        above 1 when the profile goes negative, as least-squares images may.
+
+    Raises
+    ------
+    MitsimError
+        when the region is empty or has no light to compare with.
     """
     region = np.asarray(region, dtype=np.float64)
     if region.ndim != 2 or region.size == 0 or not np.all(np.isfinite(region)):
@@ -71,24 +86,14 @@ def contrast(region: Image, lines: Literal["vertical", "horizontal"] = "vertical
     return (high - low) / (high + low)
 
 
-def read_truth(run_folder: Path, board_reflectance: float | None = None) -> NDArray[np.float64]:
-    """(n_rows, n_columns) apparent reflectance that `capture` wrote beside its frames as truth.exr.
+def truth_for(shots: Capture, board_reflectance: float | None = None) -> NDArray[np.float64] | None:
+    """(n, n) apparent reflectance that was written beside the ``shots``; None for frames of a real camera.
 
-    It is relative to the board of the shipped session recipe, or to one of ``board_reflectance`` when that is given.
-    Raises MitsimError when the folder holds no truth, as with frames of a real camera.
+    It is relative to a board of ``board_reflectance`` where that and the truth's own board are known, otherwise to the
+    latter, that of the shipped session recipe.
     """
-    from mitsim.core.framefile import read_frame
-
-    path = Path(run_folder) / TRUTH_FILE
-    if not path.is_file():
-        raise MitsimError(f"{path}: no truth in this run, so no PSNR or SSIM; only `mitsim capture` writes one")
-    channels, metadata = read_frame(path)
-    if TRUTH_CHANNEL not in channels:
-        found = ", ".join(sorted(channels))
-        raise MitsimError(f"{path}: channels are {found}; needs {TRUTH_CHANNEL!r}; capture the scene again")
-    truth = np.asarray(channels[TRUTH_CHANNEL], dtype=np.float64)
-    board = metadata.get("board_reflectance")
-    return truth if board_reflectance is None or board is None else truth * (float(board) / board_reflectance)
+    truth, board = shots.truth, shots.truth_board
+    return truth if truth is None or board_reflectance is None or board is None else truth * (board / board_reflectance)
 
 
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

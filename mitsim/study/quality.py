@@ -1,42 +1,33 @@
-"""`mitsim reconstruct` as a study sees it: solve, compare with the truth where there is one, write the image."""
+"""`mitsim reconstruct`: a RUN and a CAL folder in, the image written, and compared with the truth if there is one."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-import numpy as np
-from matplotlib import image as matplotlib_image
-
-from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
-from mitsim.core.manifest import write_json
-from mitsim.core.output import output_folder, whole_file
-from mitsim.reconstruct.folders import check_fit, inherited, load, read_calibration, read_run, solve, verify
-from mitsim.reconstruct.solver import Solution
-from mitsim.study.metrics import TRUTH_FILE, psnr, read_truth, ssim
-
-IMAGE_FILE = "image.exr"
+from mitsim.core.output import output_folder
+from mitsim.core.runs import load_run
+from mitsim.reconstruct.factors import load_calibration
+from mitsim.reconstruct.reconstruction import Reconstruction, inputs, may_replace
+from mitsim.reconstruct.reconstruction import reconstruct as solve
+from mitsim.study.metrics import SSIM_WINDOW, psnr, ssim, truth_for
 
 
 @dataclass(frozen=True)
-class ReconstructionResult:
-    """What `mitsim reconstruct` reports; ``psnr`` [dB] and ``ssim`` are None for frames without a truth."""
+class Judged:
+    """A reconstruction with its quality: ``psnr`` [dB] and ``ssim`` are None for frames without a truth, ``ssim`` also
+    for images smaller than its window; ``output`` is the folder that holds it."""
 
-    image: FloatArray
+    reconstruction: Reconstruction
     psnr: float | None
     ssim: float | None
-    lam: float
-    rank: int
-    condition: float
-    residual: float
-    ok: bool
-    status: str
-    seconds: dict[str, float]
     output: str
+
+    def summary(self) -> dict[str, Any]:
+        """All but the image, by the keys of the command line's JSON."""
+        return {"psnr": self.psnr, "ssim": self.ssim, **self.reconstruction.summary(), "output": self.output}
 
 
 def reconstruct(
@@ -45,8 +36,20 @@ def reconstruct(
     output: Path | str,
     lam: float | Literal["auto"] = "auto",
     method: str = "tikhonov",
-) -> ReconstructionResult:
-    """Recover the image of a run with a calibration; writes image.exr, image.png and result.json to ``output``.
+    overwrite: bool = False,
+) -> Judged:
+    """Recover the image of a run with a calibration; writes image.exr, image.png and result.json.
+
+    Parameters
+    ----------
+    run, calibration
+        RUN and CAL folders.
+    output
+        folder for the image: new or empty, or with an earlier image of the same inputs.
+    lam, method
+        as for :func:`mitsim.reconstruct.reconstruction.reconstruct`.
+    overwrite
+        whether an earlier image of other inputs may be replaced.
 
     Raises
     ------
@@ -54,58 +57,18 @@ def reconstruct(
         for folders that do not fit each other, an unknown method or lambda, or an output that cannot be written.
     """
     started = time.perf_counter()
-    if method not in ("tikhonov", "tv"):
-        raise MitsimError(f"--method {method!r}: use tikhonov or tv")
-    measurements, factors = read_run(run), read_calibration(calibration)
-    check_fit(measurements, factors, calibration)
-    truth = None
-    if (Path(run) / TRUTH_FILE).is_file():
-        verify(Path(run), TRUTH_FILE, measurements.manifest.checksums, "remove it, or capture again with --resume")
-        truth = read_truth(Path(run), factors.manifest.board_reflectance)
-    # Only an earlier result is replaced: image.exr is the first file of one.
-    with output_folder(output, overwrite=(Path(output) / IMAGE_FILE).is_file()) as folder:
-        read = time.perf_counter()
-        prepared, frames = load(measurements, factors)
-        added = time.perf_counter()
-        solution = solve(prepared, frames, lam, method)
-        solved = time.perf_counter()
-        flags = inherited(measurements, factors)
-        result = ReconstructionResult(
-            image=solution.image,
-            psnr=psnr(solution.image, truth) if truth is not None else None,
-            ssim=ssim(solution.image, truth) if truth is not None else None,
-            lam=solution.lam if isinstance(solution, Solution) else solution.weight,
-            rank=prepared.rank,
-            condition=prepared.condition,
-            residual=solution.residual,
-            ok=solution.ok and not flags,
-            status=" ".join((solution.status, *flags)),
-            seconds={"read": read - started, "accumulate": added - read, "solve": solved - added},
+    shots, factors = load_run(run), load_calibration(calibration)
+    factors.check_fit(shots)
+    truth = truth_for(shots, factors.manifest.board_reflectance)
+    replaces = may_replace(Path(output), inputs(shots, factors, lam, method), overwrite)
+    with output_folder(output, overwrite=replaces) as folder:
+        read = time.perf_counter() - started
+        image = solve(shots, factors, lam, method)
+        judged = Judged(
+            reconstruction=replace(image, seconds={"read": read, **image.seconds}),
+            psnr=None if truth is None else psnr(image.image, truth),
+            ssim=None if truth is None or min(truth.shape) < SSIM_WINDOW else ssim(image.image, truth),
             output=str(folder),
         )
-        _write(folder, result, method)
-    return result
-
-
-def summary(result: ReconstructionResult) -> dict[str, object]:
-    """The report of a reconstruction without its image, by the keys of the command line's JSON."""
-    return {
-        "psnr": result.psnr,
-        "ssim": result.ssim,
-        "lambda": result.lam,
-        "rank": result.rank,
-        "condition": result.condition,
-        "residual": result.residual,
-        "status": result.status,
-        "seconds": {**result.seconds, "total": sum(result.seconds.values())},
-        "output": result.output,
-    }
-
-
-def _write(folder: Path, result: ReconstructionResult, method: str) -> None:
-    write_frame(folder / IMAGE_FILE, {"reflectance": result.image.astype(np.float32)}, {"method": method})
-    # Display only: clipped to 0..1 and with the sRGB curve's approximate 1/2.2.
-    display = np.clip(result.image, 0, 1) ** (1 / 2.2)
-    with whole_file(folder / "image.png") as part:
-        matplotlib_image.imsave(part, display, cmap="gray", vmin=0, vmax=1, format="png")
-    write_json(folder / "result.json", summary(result))
+        judged.reconstruction.write(folder, judged.summary())
+    return judged

@@ -34,7 +34,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.factors import Method, Structure
+from mitsim.reconstruct.sides import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.rig.camera import CameraGeometry, centred_edges
 from mitsim.rig.mask import mls_mask

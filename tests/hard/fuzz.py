@@ -22,7 +22,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame, write_frame
-from mitsim.reconstruct.folders import read_run
+from mitsim.core.runs import load_run
 from mitsim.scene.guard.check import check_file
 from mitsim.scene.guard.vocabulary import PLUGINS
 from tests.hard.hostile import GOOD, MESH, OBJ, beside, file
@@ -259,7 +259,7 @@ class Fuzz:
             manifest = json_changed(manifest, chance)  # type: ignore[assignment]
         content = json.dumps(manifest).encode()
         (self.folder / "manifest.json").write_bytes(content if seed % 2 else bytes_changed(content, chance))
-        read_run(self.folder)
+        load_run(self.folder)
 
     def exr(self, seed: int) -> None:
         """Frames with other bytes, mostly in the header."""

@@ -74,19 +74,19 @@ def test_full_size_masks_from_2_mm_to_20_um(distance: float) -> None:
     phi, one, image = shadow(distance), np.ones((128, 1)), np.random.default_rng(1).random((128, 128))
     prepared = prepare(phi, phi, one, one)
     sums = summed(prepared, frames_of(phi, phi, one, one, image))
-    spectrum = prepared.spectrum(sums)
+    problem = prepared.problem(sums)
     for relative in LAMBDAS:
-        lam = relative * spectrum.scale
+        lam = relative * problem.scale
         solution = prepared.solve(sums, lam)
-        check_ending(solution.status, prepared)
+        check_ending(str(solution.status), prepared)
         assert np.isfinite(solution.image).all()
-        expected = prepared.image(spectrum.kept(lam) * prepared.coefficients(image))
+        expected = prepared.image(problem.kept(lam) * prepared.coefficients(image))
         assert np.linalg.norm(solution.image - expected) < solution.rounding * np.linalg.norm(image)
-        assert f"rounding below {solution.rounding:.0e}." in solution.status
+        assert f"rounding below {solution.rounding:.0e}." in str(solution.status)
         if relative:
             assert solution.ok and solution.rounding < 10 * EPS / np.sqrt(relative)
         elif prepared.rank < prepared.unknowns:
-            assert not solution.ok and solution.status.startswith("Rank deficient")
+            assert not solution.ok and str(solution.status).startswith("Rank deficient")
         else:
             assert solution.ok == (solution.rounding <= ROUNDING_LIMIT)
     assert (prepared.rank == 128**2) == (distance > 0.1)
@@ -118,11 +118,11 @@ def test_binned_sensors(pixels: int, k: int) -> None:
     prepared = prepare(phi, phi, P, P)
     sums = summed(prepared, frames_of(phi, phi, P, P, image))
     solution = prepared.solve(sums, 0.0)
-    check_ending(solution.status, prepared)
-    measured = prepared.image((prepared.spectrum(sums).sigma > 0) * prepared.coefficients(image))
+    check_ending(str(solution.status), prepared)
+    measured = prepared.image((prepared.problem(sums).sigma > 0) * prepared.coefficients(image))
     assert np.linalg.norm(solution.image - measured) < min(solution.rounding, 1e-4) * np.linalg.norm(image)
     short = pixels * k < 128
-    assert solution.ok != short and solution.status.startswith("Under-determined") == short
+    assert solution.ok != short and str(solution.status).startswith("Under-determined") == short
     assert prepared.rank == min(pixels * k, 128) ** 2
     if not short:
         assert np.linalg.norm(measured - image) < 1e-4 * np.linalg.norm(image)
@@ -139,13 +139,13 @@ def test_unlit_projector_pixels(dark: set[int], seed: int, k: int) -> None:
     prepared = prepare(factor, factor, P_L, P)
     frames = frames_of(factor, factor, P_L, P, image)
     solution = prepared.solve(summed(prepared, frames), 0.0)
-    check_ending(solution.status, prepared)
+    check_ending(str(solution.status), prepared)
     assert prepared.rank == 9 * lit.sum() and solution.ok == bool(lit.all())
     assert not solution.image[~lit].any()
     # Nine random columns have a condition below 100 a side; ten eps times 1e4 and room for the worst draw.
     assert np.abs(solution.image[lit] - image[lit]).max() < 1e-9
     if dark:
-        assert f"{9 * (~lit).sum()} of 81 directions" in solution.status
+        assert f"{9 * (~lit).sum()} of 81 directions" in str(solution.status)
 
 
 # ---- what the status says --------------------------------------------------------------------------------------------
@@ -167,16 +167,16 @@ def test_every_status_names_rank_and_condition() -> None:
         prepared = prepare(factor, factor, one, one)
         sums = summed(prepared, frames_of(factor, factor, one, one, image))
         solution = prepared.solve(sums, lam)
-        assert solution.status.startswith(start) and solution.ok == ok
-        check_ending(solution.status, prepared)
+        assert str(solution.status).startswith(start) and solution.ok == ok
+        check_ending(str(solution.status), prepared)
         tv = solve_tv(prepared, sums, 1e-6, iterations=2)
-        check_ending(tv.status, prepared)
-        assert tv.status.startswith("Not converged") and not tv.ok
+        check_ending(str(tv.status), prepared)
+        assert str(tv.status).startswith("Not converged") and not tv.ok
         # A tolerance that the first step meets: TV may fill in what is not measured, but says how much that is.
         tv = solve_tv(prepared, sums, 1e-6, iterations=2, tolerance=1e9)
-        check_ending(tv.status, prepared)
+        check_ending(str(tv.status), prepared)
         lost = prepared.unknowns - prepared.rank
-        assert tv.ok and (f"{lost} of 64 directions are not measured" in tv.status) == bool(lost)
+        assert tv.ok and (f"{lost} of 64 directions are not measured" in str(tv.status)) == bool(lost)
 
 
 @pytest.mark.parametrize("exponent", range(13))
@@ -196,7 +196,7 @@ def test_rounding_is_bounded_or_flagged(exponent: int) -> None:
     assert np.linalg.norm(solution.image - image) < solution.rounding * np.linalg.norm(image)
     assert solution.ok == (exponent <= 6)
     if not solution.ok:
-        advised = float(re.search(r"lambda above (\S+),", solution.status)[1])
+        advised = float(re.search(r"lambda above (\S+),", str(solution.status))[1])
         again = prepared.solve(sums, 1.05 * advised)
         assert again.ok and again.rounding < ROUNDING_LIMIT
 
@@ -209,9 +209,9 @@ def test_gram_is_flagged_where_the_default_is_not() -> None:
         prepared = prepare(factor, factor, one, one, method=method)
         sums = summed(prepared, frames_of(factor, factor, one, one, image))
         found[method] = prepared.solve(sums, 1e-15)
-        check_ending(found[method].status, prepared)
+        check_ending(str(found[method].status), prepared)
     assert found["svd"].ok and found["svd"].rounding < 1e-7
-    assert not found["gram"].ok and "raise lambda above 2.2e-13" in found["gram"].status
+    assert not found["gram"].ok and "raise lambda above 2.2e-13" in str(found["gram"].status)
     assert np.linalg.norm(found["gram"].image - found["svd"].image) < found["gram"].rounding * np.linalg.norm(image)
 
 
@@ -242,13 +242,13 @@ def test_units_change_nothing(shifts: tuple[int, ...], family: str, lam: float |
     for a, b, c, d, e in (np.ones(5), units):
         prepared = prepare(a * left, b * right, c * P_L, d * P_R)
         sums = summed(prepared, {key: e * frame for key, frame in frames.items()})
-        scale = prepared.spectrum(sums).scale
+        scale = prepared.problem(sums).scale
         found.append(prepared.solve(sums, lam if isinstance(lam, str) else lam * scale))
     one, other = found
     np.testing.assert_array_equal(other.image, one.image * (units[4] / np.prod(units[:4])))
     for name in ("rank", "condition", "residual", "rounding", "ok", "lam_relative"):
         assert getattr(other, name) == getattr(one, name), name
-    assert re.sub("lambda above \\S+", "", other.status) == re.sub("lambda above \\S+", "", one.status)
+    assert re.sub("lambda above \\S+", "", str(other.status)) == re.sub("lambda above \\S+", "", str(one.status))
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6, 1e12])
@@ -288,9 +288,9 @@ def test_the_largest_and_smallest_allowed_units(size: float) -> None:
     for method, relative in product(("svd", "gram"), LAMBDAS):
         prepared = prepare(factor, factor, P, P, method=method)
         sums = summed(prepared, frames_of(factor / size**2, factor, P, P, image))
-        solution = prepared.solve(sums, relative * prepared.spectrum(sums).scale)
+        solution = prepared.solve(sums, relative * prepared.problem(sums).scale)
         assert np.isfinite(solution.image).all() and 0 <= solution.residual < 1
-        kept = prepared.spectrum(sums).kept(solution.lam)
+        kept = prepared.problem(sums).kept(solution.lam)
         expected = prepared.image(kept * prepared.coefficients(image / size**2))
         assert np.linalg.norm(solution.image - expected) <= solution.rounding * np.linalg.norm(image / size**2)
 
@@ -346,7 +346,7 @@ def test_adjoints(data) -> None:
     forward = sum(float(np.vdot(modelled[key], data_frames[key])) for key in modelled)
     taken = [centred(frame) if centre else frame for frame in data_frames.values()]
     assert sums.energy == pytest.approx(sum(np.square(frame).sum() for frame in taken), rel=1e-12)
-    found = prepared.spectrum(sums)
+    found = prepared.problem(sums)
     gradient = prepared.image(found.sigma * found.projected)
     size = np.sqrt(found.scale * found.energy) * np.linalg.norm(image)
     assert close(forward, np.vdot(gradient, image), size)
@@ -399,10 +399,10 @@ def test_total_variation_is_at_its_minimum() -> None:
     def objective(x: np.ndarray) -> float:
         down, across = (np.diff(x, axis=axis, append=x.take([-1], axis)) for axis in (0, 1))
         variation = np.sqrt(np.square(down) + np.square(across)).sum()
-        return float(np.square(frame - factor @ x @ factor.T).sum() / 2 + found.weight * variation)
+        return float(np.square(frame - factor @ x @ factor.T).sum() / 2 + found.lam * variation)
 
     base = objective(found.image)
-    others = [solve_tv(prepared, sums, found.weight * change).image for change in (0.5, 2.0)]
+    others = [solve_tv(prepared, sums, found.lam * change).image for change in (0.5, 2.0)]
     for toward in (*others, image, prepared.solve(sums).image, found.image[::-1]):
         for step in (1e-3, 1e-2, 0.1, 1.0):
             assert objective(found.image + step * (toward - found.image)) > base * (1 - 1e-4)
@@ -415,5 +415,5 @@ def test_the_report_s_numbers_are_json() -> None:
 
     prepared = prepare(np.eye(3, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
     solution = prepared.solve(summed(prepared, {(0, 0): np.ones((3, 5))}), 0.1)
-    payload = json.loads(json.dumps(plain({"condition": solution.condition, "status": solution.status})))
+    payload = json.loads(json.dumps(plain({"condition": solution.condition, "status": str(solution.status)})))
     assert payload["condition"] is None and "condition inf" in payload["status"]

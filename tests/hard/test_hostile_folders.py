@@ -21,7 +21,9 @@ import pytest
 from mitsim.core.configuration import read_toml
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame, write_frame
-from mitsim.reconstruct.folders import check_fit, load, read_calibration, read_run
+from mitsim.core.runs import load_run
+from mitsim.reconstruct.factors import load_calibration
+from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.rig.sensor import load_sensor
 
 LONGEST = 5.0
@@ -62,9 +64,7 @@ def make(folder: Path) -> tuple[Path, Path]:
 
 def solved(run: Path, calibration: Path) -> None:
     """All that `mitsim reconstruct` reads."""
-    measurements, factors = read_run(run), read_calibration(calibration)
-    check_fit(measurements, factors, calibration)
-    load(measurements, factors)
+    reconstruct(load_run(run), load_calibration(calibration), 1.0)
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ BOTH = {
     "an array": (raw("[1, 2]"), "holds a list"),
     "a number": (raw("1e400"), "holds a float"),
     "null": (raw("null"), "holds a NoneType"),
-    "huge": (sparse, "at most 16777216"),
+    "huge": (sparse, "at most 33554432"),
     "a pipe": (pipe, "pipe or device"),
     "a folder": (folder, "Is a directory"),
     "a device": (linked("/dev/zero"), "pipe or device"),
@@ -169,11 +169,11 @@ BOTH = {
     "kind of several lines": (put("kind", value="a\nb\x1b[31m"), "holds a a b"),
     "status of several lines": (put("status", value="a\n" * 999), "..."),
     "camera is a list": (put("camera", value=[1]), "camera: got [1]"),
-    "checksums of numbers": (
-        put("checksums", value={"x": 3}),
-        "checksums: got {'x': 3}, value error, that of 'x' is no text",
+    "checksums of numbers": (put("checksums", value={"x": 3}), "checksums: that of 'x' is no text"),
+    "200000 false checksums": (
+        put("checksums", value=dict.fromkeys(map(str, range(200_000)), 1)),
+        "checksums: that of",
     ),
-    "200000 false checksums": (put("checksums", value=dict.fromkeys(map(str, range(200_000)), 1)), "checksums: got"),
     "wrong checksum": (put("checksums", value={"left.exr": "0", "frame_01.exr": "0"}), "its checksum differs"),
     "another camera of 10 MB": (put("camera", value={"name": "x" * 10_000_000}), "name is"),
     "another camera of several lines": (put("camera", value={"na\nme": "x"}), "calibrate this camera"),

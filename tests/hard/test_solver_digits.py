@@ -49,7 +49,7 @@ def solved(left, right, P_L, P_R, frames: Frames, relative: float, **options: st
     sums = prepared.accumulator()
     for key, frame in frames.items():
         sums.add(frame, *key)
-    return prepared.solve(sums, relative * prepared.spectrum(sums).scale)
+    return prepared.solve(sums, relative * prepared.problem(sums).scale)
 
 
 class Exact:
@@ -328,4 +328,6 @@ def test_repeated_dark_and_nearly_parallel_columns(data) -> None:
     else:
         lost = n * n - (n - 1) * (n - 1 if case == "unlit" else n)
         assert not bare.ok and bare.rank == solution.rank == n * n - lost
-        assert f"{lost} of {n * n} directions" in bare.status and f"{lost} of {n * n} directions" in solution.status
+        assert f"{lost} of {n * n} directions" in str(bare.status) and f"{lost} of {n * n} directions" in str(
+            solution.status
+        )

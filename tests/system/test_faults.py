@@ -203,7 +203,7 @@ def test_damaged_frames_of_an_interrupted_run_are_made_again(
 def test_resume_with_another_version_is_refused(
     refused: Callable[..., str], lab: Any, interrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mitsim.core.manifest import versions
+    from mitsim.core.versions import versions
 
     for package in ("mitsim", "mitsuba", "numpy"):
         monkeypatch.setattr("mitsim.capture.run.versions", lambda name=package: {**versions(), name: "99.0"})

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.factors import pattern_blocks
+from mitsim.reconstruct.sides import pattern_blocks
 from mitsim.reconstruct.solver import prepare
 
 
@@ -123,12 +123,12 @@ def test_status_names_what_is_missing():
 
     under = solve(short, tall, one, one, frames_of(short, tall, one, one, image), 0.1)
     assert not under.ok
-    assert under.status.startswith("Under-determined: 4 sensor rows")
+    assert str(under.status).startswith("Under-determined: 4 sensor rows")
     assert (under.rank, under.unknowns, under.condition) == (24, 36, np.inf)
 
     deficient = solve(twin, tall, one, one, frames_of(twin, tall, one, one, image), 0.0)
     assert not deficient.ok
-    assert deficient.status.startswith("Rank deficient: 6 of 36")
+    assert str(deficient.status).startswith("Rank deficient: 6 of 36")
     # The pseudo-inverse shares what cannot be told apart.
     np.testing.assert_allclose(deficient.image[2], (image[2] + image[3]) / 2, atol=1e-9)
 

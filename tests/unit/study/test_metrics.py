@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
-from mitsim.study.metrics import contrast, psnr, read_truth, relative_error, ssim
+from mitsim.core.manifests import Digital, Patterns, RunManifest, ShotFile
+from mitsim.core.runs import Capture
+from mitsim.study.metrics import contrast, psnr, relative_error, ssim, truth_for
 
 RNG = np.random.default_rng(11)
 TRUTH = RNG.uniform(0.05, 0.9, (24, 20))
@@ -71,27 +70,25 @@ def test_refusals_are_one_line_that_names_the_trouble() -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_truth_is_read_as_written(tmp_path: Path) -> None:
-    values = TRUTH.astype(np.float32)
-    write_frame(tmp_path / "truth.exr", {"reflectance": values}, {})
-    read = read_truth(tmp_path)
-    assert read.dtype == np.float64 and np.array_equal(read, values)
-
-
-def test_truth_follows_the_board_of_the_calibration(tmp_path: Path) -> None:
-    # A sheet that is 0.5 of a 0.99 board is 0.55 of a 0.9 board.
+@pytest.mark.parametrize(("board", "expected"), [(None, 0.5), (0.9, 0.55)])
+def test_truth_follows_the_board_of_the_calibration(board: float | None, expected: float) -> None:
+    """A sheet that is 0.5 of a 0.99 board is 0.55 of a 0.9 board."""
     values = np.full((3, 4), 0.5, dtype=np.float32)
-    write_frame(tmp_path / "truth.exr", {"reflectance": values}, {"board_reflectance": 0.99})
-    assert read_truth(tmp_path, 0.9) == pytest.approx(0.55)
-    assert read_truth(tmp_path) == pytest.approx(0.5)
+    shots = Capture(manifest(), memory={"truth.exr": ({"reflectance": values}, {"board_reflectance": 0.99})})
+    truth = truth_for(shots, board)
+    assert truth is not None and truth.dtype == np.float64 and truth == pytest.approx(expected)
 
 
-def test_a_run_without_truth_says_so(tmp_path: Path) -> None:
-    with pytest.raises(MitsimError, match="no truth in this run"):
-        read_truth(tmp_path)
-    write_frame(tmp_path / "truth.exr", {"other": TRUTH.astype(np.float32)}, {})
-    with pytest.raises(MitsimError, match="channels are other"):
-        read_truth(tmp_path)
+def test_frames_of_a_real_camera_have_no_truth() -> None:
+    assert truth_for(Capture(manifest()), 0.9) is None
+
+
+def manifest() -> RunManifest:
+    return RunManifest(
+        camera={},
+        digital=Digital(exposure_s=1.0, gain_dn_per_e=1.0, black_level_dn=0.0, dark_current_e_per_s=0.0),
+        patterns=Patterns(P_L=((1.0,),), P_R=((1.0,),), captures=(ShotFile(file="a.exr", row=0, column=0, sign=0),)),
+    )
 
 
 def test_relative_error_is_a_ratio_of_norms() -> None:

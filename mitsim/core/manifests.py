@@ -1,0 +1,284 @@
+"""What manifest.json of a RUN and of a CAL folder says: plain data in, a checked and frozen model out, and back.
+
+Writers and readers use these models, so each field stands once; docs/formats.md shows them as tables.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    FailFast,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import LARGEST, Positive, validated
+from mitsim.core.errors import MitsimError, cut
+from mitsim.core.manifest import plain, read_json, write_json
+
+MANIFEST = "manifest.json"
+FORMAT = 1
+"""Number of the format that is written here and the newest that is read."""
+MOST_PIXELS = 4096
+"""Scene pixels a side, and pattern columns: eight times the projector's, and the manifest stays within its limit."""
+MOST_SHOTS = 1 << 16
+"""Shots of one capture: 256 patterns a side, twice the side of any family of 128 pixels."""
+_MOST_BINNED = 64**2
+"""Pixels that a camera file may bin: black level and dark current of a binned pixel add up to that many times one's."""
+_UNVERSIONED = "0.3.0"
+
+# Bounds far from any camera, within which products of these numbers stay finite.
+Weight = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Row = Annotated[tuple[Weight, ...], Field(strict=False, max_length=MOST_PIXELS), FailFast()]
+Rows = Annotated[tuple[Row, ...], Field(strict=False, max_length=MOST_PIXELS), FailFast()]
+BinnedSum = Annotated[float, Field(ge=0, le=LARGEST * _MOST_BINNED, allow_inf_nan=False)]
+Texts = Annotated[tuple[str, ...], Field(strict=False)]
+Plain = Annotated[dict[str, Any], BeforeValidator(plain)]
+"""A part that others than the solver read, as JSON holds it."""
+
+
+def _texts(checksums: dict[str, Any]) -> dict[str, str]:
+    """One complaint, where pydantic would list each of a million."""
+    wrong = next((name for name, value in checksums.items() if not isinstance(value, str)), None)
+    if wrong is not None:
+        raise ValueError(f"that of {cut(wrong)!r} is no text; give the SHA-256 of that file, or leave it out")
+    return checksums
+
+
+Checksums = Annotated[dict[str, Any], AfterValidator(_texts)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_0_3_0(cls, data: Any, info: ValidationInfo) -> Any:
+        """Where no format was stated, as in version 0.3.0, unknown fields are others' and left alone."""
+        if info.context == _UNVERSIONED and isinstance(data, dict):
+            return {name: value for name, value in data.items() if name in cls.model_fields}
+        return data
+
+
+class Digital(_Part):
+    """How digital numbers become photoelectrons a second: (DN - black level) / gain / exposure - dark current."""
+
+    exposure_s: Positive = Field(description="exposure of every frame [s]")
+    gain_dn_per_e: Positive = Field(description="digital numbers per electron")
+    black_level_dn: BinnedSum = Field(description="digital number of a (binned) pixel without charge")
+    dark_current_e_per_s: BinnedSum = Field(description="dark electrons a second and (binned) pixel")
+
+    def rate(self, dn: npt.NDArray[Any]) -> FloatArray:
+        """Photoelectrons a second of digital numbers ``dn``."""
+        electrons = (dn.astype(np.float64) - self.black_level_dn) / self.gain_dn_per_e
+        return np.asarray(electrons / self.exposure_s - self.dark_current_e_per_s)
+
+
+class ShotFile(_Part):
+    """One shot: pattern (row, column), whole (sign 0) or the +1 or -1 half of a signed pattern."""
+
+    file: str = Field(
+        pattern=r"^[^/\\\x00]+$", max_length=255, description="name of the frame in the run's folder, without a path"
+    )
+    row: int = Field(ge=0, description="column i of P_L")
+    column: int = Field(ge=0, description="column j of P_R")
+    sign: int = Field(ge=-1, le=1, description="0, or the half (1 + P)/2 or (1 - P)/2 of a signed pattern P")
+
+
+class _Family(Protocol):
+    """Patterns of :mod:`mitsim.rig.patterns`."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def left(self) -> npt.NDArray[np.int8]: ...
+    @property
+    def right(self) -> npt.NDArray[np.int8]: ...
+    @property
+    def captures(self) -> Sequence[Any]: ...
+
+
+class Patterns(_Part):
+    """Factors of the patterns, and the shots that show them."""
+
+    family: str | None = Field(default=None, description="name of the family, such as `dots:7`")
+    n: int | None = Field(default=None, ge=1, le=MOST_PIXELS, description="projector pixels a side")
+    P_L: Rows = Field(description="rows of P_L: for each scene row, one number a pattern column i")
+    P_R: Rows = Field(description="rows of P_R: for each scene column, one number a pattern column j")
+    captures: Annotated[tuple[ShotFile, ...], FailFast()] = Field(
+        strict=False, max_length=MOST_SHOTS, description="every shot; each pattern (i, j) once, or as its two halves"
+    )
+
+    @classmethod
+    def of(cls, family: _Family, files: Sequence[str]) -> Patterns:
+        """Patterns of a ``family`` (:class:`mitsim.rig.patterns.PatternFamily`), its shots in ``files`` by index.
+
+        MitsimError when there are more pixels or shots than a reader takes.
+        """
+        shots = [
+            {"file": file, "row": shot.row, "column": shot.column, "sign": shot.sign}
+            for file, shot in zip(files, family.captures, strict=True)
+        ]
+        matrices = {"P_L": family.left.tolist(), "P_R": family.right.tolist()}
+        return validated(
+            cls,
+            {"family": family.name, "n": len(family.left), **matrices, "captures": shots},
+            f"patterns {family.name!r}",
+        )
+
+    @property
+    def matrices(self) -> tuple[FloatArray, FloatArray]:
+        """P_L (n, K) and P_R (n', K')."""
+        return np.array(self.P_L, dtype=np.float64), np.array(self.P_R, dtype=np.float64)
+
+    @field_validator("P_L", "P_R")
+    @classmethod
+    def _rows_of_one_length(cls, rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+        lengths = sorted({len(row) for row in rows})
+        if len(lengths) != 1 or lengths[0] == 0:
+            counts = ", ".join(map(str, lengths)) or "no"
+            raise ValueError(f"has rows of {counts} numbers; give one row of K for a scene pixel")
+        return rows
+
+    @model_validator(mode="after")
+    def _every_pattern_is_captured(self) -> Patterns:
+        rows, columns = len(self.P_L[0]), len(self.P_R[0])
+        signs: dict[tuple[int, int], list[int]] = {}
+        for number, shot in enumerate(self.captures):
+            if shot.row >= rows or shot.column >= columns:
+                raise ValueError(
+                    f"captures.{number}: got pattern ({shot.row}, {shot.column}); "
+                    f"allowed are 0 to {rows - 1} and 0 to {columns - 1}"
+                )
+            signs.setdefault((shot.row, shot.column), []).append(shot.sign)
+        for index, halves in signs.items():
+            if sorted(halves) not in ([0], [-1, 1]):
+                raise ValueError(
+                    f"captures: pattern {index} has frames of signs {halves}; "
+                    "give one of sign 0, or one of +1 and one of -1"
+                )
+        missing = rows * columns - len(signs)
+        if missing:
+            first = next((i, j) for i in range(rows) for j in range(columns) if (i, j) not in signs)
+            raise ValueError(
+                f"captures: {missing} of {rows * columns} patterns have no frame, first {first}; capture them all"
+            )
+        return self
+
+
+class _Head(_Part):
+    format: int = Field(
+        default=FORMAT,
+        ge=1,
+        le=FORMAT,
+        description="version of this format; without it unknown fields are ignored, as by version 0.3.0",
+    )
+    status: Literal["incomplete", "complete"] = Field(default="complete", description="whether all files are written")
+    configuration: Plain = Field(
+        default={}, description="all that decides the frames: options, files, devices, versions"
+    )
+    warnings: Texts = Field(default=(), description="why the folder is flagged; an image made of it is flagged too")
+    versions: dict[str, str] = Field(default={}, description="of mitsim, Python and packages")
+
+
+class RunHead(_Head):
+    """What an unfinished run's manifest says, and a finished one's begins with."""
+
+    kind: Literal["capture"] = Field(default="capture", description="what the folder is")
+    configuration_sha256: str = Field(
+        default="", description="hash of `configuration`; a run is resumed by the same alone"
+    )
+
+    @classmethod
+    def of(cls, configuration: Mapping[str, Any]) -> RunHead:
+        """The head of an unfinished run of that ``configuration``."""
+        digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
+        return cls(status="incomplete", configuration=dict(configuration), configuration_sha256=digest)
+
+
+class RunManifest(RunHead):
+    """A capture: how its frames are read, and what was projected."""
+
+    camera: Plain = Field(description="identity that a calibration must share; anything, as long as both are equal")
+    digital: Digital = Field(description="how digital numbers become electrons a second")
+    patterns: Patterns = Field(description="what was projected, and in which file it is seen")
+    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
+    plan: Plain | None = Field(default=None, description="the effect plan, see Plan")
+    mc_error: float | None = Field(default=None, description="relative Monte Carlo error of the expected frames")
+    mc_to_sensor_noise: float | None = Field(
+        default=None, description="largest ratio of that to a frame's sensor noise"
+    )
+    sensor_noise: float | None = Field(None, description="relative noise of the sensor over all frames, closed form")
+    heaviest_group: float | None = Field(
+        default=None,
+        description="largest part of the Monte Carlo variance in one of 8 groups of the light; above 0.8 a few "
+        "heavy paths make it",
+    )
+    paths: int | None = Field(default=None, description="connections and paths traced")
+    seconds: dict[str, float] = Field(default={}, description="by stage")
+
+
+class CalibrationManifest(_Head):
+    """A calibration: of which camera, and how its factors are used."""
+
+    kind: Literal["calibration"] = Field(default="calibration", description="what the folder is")
+    camera: Plain = Field(description="identity that a run must share")
+    centre: bool = Field(default=False, description="frames and factors lose row and column means (FlatCam masks)")
+    board_reflectance: float | None = Field(
+        default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; none: unknown"
+    )
+    digital: Digital | None = Field(default=None, description="of the session's frames")
+    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
+    result: Plain = Field(default={}, description="the session in numbers, as `calibrate --json` gives them")
+    estimate: str | None = Field(default=None, description="the estimator's own words")
+    verdict: str | None = Field(
+        default=None, description="the estimator's verdict, one of `mitsim.reconstruct.status.Verdict`"
+    )
+
+
+Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
+
+
+def read_manifest(folder: Path, model: type[Manifest]) -> Manifest:
+    """The manifest of a finished run or calibration in ``folder``, by its ``model``.
+
+    MitsimError when there is none, or it is of another kind, unfinished, or breaks a rule of its format.
+    """
+    kind = model.model_fields["kind"].default
+    if not folder.is_dir():
+        command = {"capture": "capture", "calibration": "calibrate"}[kind]
+        raise MitsimError(f"{folder}: no such folder; give the output of `mitsim {command}`")
+    data = read_json(folder / MANIFEST)
+    if not isinstance(data, dict) or data.get("kind") != kind:
+        actual = data.get("kind") if isinstance(data, dict) else type(data).__name__
+        raise MitsimError(f"{folder}: holds a {cut(str(actual))}, not a {kind}; give the right folder")
+    if data.get("status") != "complete":
+        raise MitsimError(f"{folder}: the {kind} is {cut(str(data.get('status')))}; finish it with resume=True")
+    return validated(model, data, f"{folder}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
+
+
+def read_head(folder: Path) -> RunHead:
+    """The head of the run in ``folder``, finished or not; MitsimError when it holds none."""
+    data = read_json(folder / MANIFEST)
+    if not isinstance(data, dict) or data.get("kind") != "capture":
+        raise MitsimError(f"resume: {folder}/{MANIFEST} is not that of a capture; use another folder")
+    return validated(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
+
+
+def write_manifest(folder: Path, manifest: RunHead | CalibrationManifest) -> None:
+    """Write ``manifest`` to ``folder``, all or nothing. MitsimError when it cannot be written."""
+    write_json(folder / MANIFEST, manifest)

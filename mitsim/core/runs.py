@@ -1,0 +1,402 @@
+"""Captures in memory and on disk: shots of a pattern family in, one object out that reads the same from either.
+
+A capture is recorded by a :class:`RunFolder` or a :class:`RunMemory`, which take the same calls; each ends in a
+:class:`Capture`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import Channel, Value, checksum, read_frame, write_frame
+from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, read_manifest, write_manifest
+from mitsim.core.output import output_folder, sweep
+from mitsim.core.pictures import card, scaled
+
+TRUTH = "truth.exr"
+Channels = Mapping[str, Channel]
+Metadata = Mapping[str, Value]
+_SHOWN = 4
+"""Frames that a notebook shows: they fill a line."""
+
+
+def frame_name(index: int) -> str:
+    """File name of shot number ``index`` in its run folder."""
+    return f"frame_{index:05d}.exr"
+
+
+class Capture:
+    """All shots of one pattern family, in memory or in their folder.
+
+    Attributes
+    ----------
+    manifest
+        what was projected and how the frames are read.
+    folder
+        where the files lie; None for a capture in memory. Frames are then read when they are first asked for.
+    """
+
+    def __init__(
+        self,
+        manifest: RunManifest,
+        folder: Path | None = None,
+        memory: Mapping[str, tuple[Channels, Metadata]] | None = None,
+    ) -> None:
+        """Channels and metadata of a capture's files, by ``manifest``.
+
+        Parameters
+        ----------
+        manifest
+            of the finished capture.
+        folder
+            that holds the files.
+        memory
+            channels and metadata by file name, instead of a folder.
+        """
+        self.manifest, self.folder = manifest, folder
+        self._memory = dict(memory or {})
+
+    @property
+    def name(self) -> str:
+        """The folder, or what messages call a capture in memory."""
+        return str(self.folder) if self.folder else "the capture"
+
+    @cached_property
+    def dn(self) -> Channel:
+        """(shots, rows, columns) digital numbers, uint32; float32 of a sensor without an ADC."""
+        return self._stacked("DN")
+
+    @cached_property
+    def electrons(self) -> Channel | None:
+        """(shots, rows, columns) expected photoelectrons; None for a real camera, whose expectation nobody knows."""
+        first = self.manifest.patterns.captures[0].file
+        return self._stacked("electrons") if "electrons" in self._read(first)[0] else None
+
+    @cached_property
+    def truth(self) -> FloatArray | None:
+        """(n, n) apparent reflectance, relative to the board of :attr:`truth_board`; None for a real camera."""
+        known = TRUTH in self._memory if self.folder is None else (self.folder / TRUTH).is_file()
+        return self._channel(TRUTH, "reflectance") if known else None
+
+    @property
+    def truth_board(self) -> float | None:
+        """Reflectance of the board that counts as 1 in :attr:`truth`, where that is known."""
+        board = None if self.truth is None else self._read(TRUTH)[1].get("board_reflectance")
+        return None if board is None else float(board)
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of every frame [s]."""
+        return self.manifest.digital.exposure_s
+
+    @property
+    def plan(self) -> dict[str, Any] | None:
+        """The effect plan, as the manifest holds it; None for a real camera."""
+        return self.manifest.plan
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the capture is flagged."""
+        return self.manifest.warnings
+
+    @cached_property
+    def patterns(self) -> tuple[FloatArray, FloatArray]:
+        """P_L (n, K) and P_R (n', K')."""
+        return self.manifest.patterns.matrices
+
+    def measurements(self) -> Iterator[tuple[FloatArray, int, int]]:
+        """(frame (rows, columns) [electrons/s], i, j) of every pattern, read one at a time; the halves of a signed one
+        come as their difference. MitsimError for a frame that is missing, damaged or not finite."""
+        waiting: dict[tuple[int, int], FloatArray] = {}
+        for shot in self.manifest.patterns.captures:
+            index = (shot.row, shot.column)
+            frame = self.manifest.digital.rate(self._channel(shot.file, "DN")) * (shot.sign or 1)
+            if shot.sign and index not in waiting:
+                waiting[index] = frame
+                continue
+            yield waiting.pop(index, 0.0) + frame, *index
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 that captures of the same frames share, in memory or on disk."""
+        manifest = self.manifest
+        digest = hashlib.sha256(manifest.digital.model_dump_json().encode())
+        digest.update(manifest.patterns.model_dump_json().encode() + manifest.configuration_sha256.encode())
+        for shot in manifest.patterns.captures:
+            if self.folder and not (manifest.configuration_sha256 and shot.file in manifest.checksums):
+                verify(self.folder, shot.file, {}, "")  # no link out of it
+                digest.update(checksum(self.folder / shot.file).encode())
+        return digest.hexdigest()
+
+    def summary(self) -> dict[str, Any]:
+        """What the command line reports; fields of a real camera's capture that nobody knows are None."""
+        manifest = self.manifest
+        known = ("mc_error", "mc_to_sensor_noise", "sensor_noise", "heaviest_group", "seconds", "warnings")
+        return {
+            "frames": len(manifest.patterns.captures),
+            "shape": self._channel(manifest.patterns.captures[0].file, "DN").shape,
+            "variant": manifest.configuration.get("variant"),
+            "seed": manifest.configuration.get("seed"),
+            "output": None if self.folder is None else str(self.folder),
+            "exposure_s": self.exposure_s,
+            **{name: getattr(manifest, name) for name in known},
+        }
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the RUN folder that `mitsim capture` writes, to a new or empty ``folder``; returns it.
+
+        MitsimError when it holds something, or cannot be written.
+        """
+        with claimed(Path(folder), self.manifest, resume=False) as run:
+            if self.folder is not None:
+                for name in (*(shot.file for shot in self.manifest.patterns.captures), TRUTH, MANIFEST):
+                    if (self.folder / name).is_file():
+                        shutil.copyfile(self.folder / name, run.path / name)
+            else:
+                run.begin()
+                for index, shot in enumerate(self.manifest.patterns.captures):
+                    run.write_frame(index, *self._memory[shot.file])
+                if TRUTH in self._memory:
+                    run.write(TRUTH, *self._memory[TRUTH])
+                run.finish(self.manifest)
+        return run.path
+
+    def _repr_html_(self) -> str:
+        shots = self.manifest.patterns.captures
+        frames = {
+            f"shot {i}: ({shot.row}, {shot.column})": scaled(self._channel(shot.file, "DN"))
+            for i, shot in enumerate(shots[:_SHOWN])
+        }
+        rows, columns = next(iter(frames.values())).shape
+        truth = {} if self.truth is None else {"truth": self.truth}
+        family = self.manifest.patterns.family or "patterns"
+        facts = f"{len(shots)} shots of {rows} x {columns} pixels, exposure {self.exposure_s:.3g} s; {self.name}"
+        return card(f"Capture: {family}", {**frames, **truth}, (facts, *self.warnings))
+
+    def _read(self, name: str) -> tuple[Channels, Metadata]:
+        if self.folder is None:
+            return self._memory[name]
+        verify(self.folder, name, self.manifest.checksums, "capture it again with resume=True")
+        return read_frame(self.folder / name)
+
+    def _channel(self, name: str, channel: str) -> FloatArray:
+        return finite_channel(self._read(name)[0], channel, self.folder / name if self.folder else Path(name))
+
+    def _stacked(self, channel: str) -> Channel:
+        shots = self.manifest.patterns.captures
+        stack: Channel = np.array([self._read(shot.file)[0][channel] for shot in shots])
+        if self.folder is None:  # one copy: the shots become views of the stack
+            for shot, values in zip(shots, stack, strict=True):
+                channels, metadata = self._memory[shot.file]
+                self._memory[shot.file] = {**channels, channel: values}, metadata
+        return stack
+
+
+def load_run(folder: Path | str) -> Capture:
+    """The capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
+    return Capture(read_manifest(Path(folder), RunManifest), Path(folder))
+
+
+def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -> None:
+    """Check that a file is the one whose checksum was noted; files without one are taken as they are.
+
+    Parameters
+    ----------
+    folder, name
+        of the file.
+    checksums
+        SHA-256 by name.
+    remedy
+        what to do where they differ.
+
+    Raises
+    ------
+    MitsimError
+        when they differ, or the name leads out of the folder by a link.
+    """
+    if not (folder / name).resolve().is_relative_to(folder.resolve()):
+        raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
+    expected = checksums.get(name)
+    if expected is not None and checksum(folder / name) != expected:
+        raise MitsimError(f"{folder / name}: not the file that was written (its checksum differs); {remedy}")
+
+
+def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
+    """One channel of a frame in double precision.
+
+    Parameters
+    ----------
+    channels
+        of the frame, (rows, columns) each.
+    name
+        of the one that is needed.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when it is not there, or holds a value that is not finite.
+    """
+    if name not in channels:
+        raise MitsimError(f"{path}: channels are {', '.join(channels)}; {name} is needed")
+    values = channels[name].astype(np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(values)))
+    if bad:
+        raise MitsimError(f"{path}: {bad} values are not finite; capture or calibrate again")
+    return values
+
+
+class RunMemory:
+    """Records a capture in memory; the same calls as :class:`RunFolder`."""
+
+    def __init__(self) -> None:
+        self._files: dict[str, tuple[Channels, Metadata]] = {}
+
+    def begin(self) -> None:
+        """Nothing is there yet."""
+
+    def keeps(self, index: int) -> bool:
+        """Whether shot number ``index`` is there already: never."""
+        return False
+
+    def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
+        """Keep shot number ``index``: its ``channels`` (rows, columns) and ``metadata``."""
+        self._files[frame_name(index)] = channels, metadata
+
+    def write_truth(self, reflectance: FloatArray, board: float) -> None:
+        """Keep the truth ``reflectance`` (n, n), relative to a ``board`` of that reflectance."""
+        self._files[TRUTH] = _truth(reflectance, board)
+
+    def finish(self, manifest: RunManifest) -> Capture:
+        """The capture of that ``manifest``."""
+        return Capture(manifest, memory=dict(sorted(self._files.items())))
+
+
+class RunFolder:
+    """Records a capture in a folder, whole, resumable and checked; made by :func:`claimed`.
+
+    A frame is kept on resume when it is the one that a finished run's checksum names, or, in an interrupted run, when
+    it is readable, carries this run's digest, and its pixels have the checksum that was noted with it.
+    """
+
+    def __init__(self, path: Path, head: RunHead, known: Mapping[str, str]) -> None:
+        """A run at ``path`` of the configuration in ``head``; ``known`` are checksums of an earlier, finished one."""
+        self.path, self.head = path, head
+        self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
+
+    def begin(self) -> None:
+        """Mark the folder as an unfinished run of this configuration, and clear what a killed process left."""
+        sweep(self.path)
+        configuration, digest = self.head.configuration, self.head.configuration_sha256
+        head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
+        write_manifest(self.path, head)
+
+    def keeps(self, index: int) -> bool:
+        """Whether shot number ``index`` is there already; it then counts as written."""
+        name = frame_name(index)
+        path = self.path / name
+        if not path.is_file():
+            return False
+        actual = checksum(path)
+        same = self._known[name] == actual if name in self._known else self._is_ours(path, index)
+        if same:
+            self._note(name, actual)
+        return same
+
+    def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
+        """Write shot number ``index``, its ``channels`` (rows, columns) and ``metadata``, whole or not at all."""
+        self.write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
+
+    def write_truth(self, reflectance: FloatArray, board: float) -> None:
+        """Write the truth ``reflectance`` (n, n), relative to a ``board`` of that reflectance."""
+        self.write(TRUTH, *_truth(reflectance, board))
+
+    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        """Write the file ``name`` of the run: its ``channels`` (rows, columns) and ``metadata``."""
+        write_frame(self.path / name, channels, metadata)
+        self._note(name, checksum(self.path / name))
+
+    def finish(self, manifest: RunManifest) -> Capture:
+        """Write the ``manifest`` of the finished run, with checksums; the capture that lies there."""
+        checksums = dict(sorted(self._checksums.items()))
+        manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
+        write_manifest(self.path, manifest)
+        return Capture(manifest, self.path)
+
+    def _note(self, name: str, value: str) -> None:
+        with self._lock:
+            self._checksums[name] = value
+
+    def _is_ours(self, path: Path, index: int) -> bool:
+        try:
+            channels, metadata = read_frame(path)
+        except MitsimError:
+            return False
+        return all(metadata.get(key) == value for key, value in self._identity(index, channels).items())
+
+    def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
+        """What tells a frame from one of another run, another place in this one, or one that was damaged."""
+        return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": _pixels(channels)}
+
+
+def _truth(reflectance: FloatArray, board: float) -> tuple[Channels, Metadata]:
+    return {"reflectance": reflectance.astype(np.float32)}, {"board_reflectance": board}
+
+
+def _pixels(channels: Channels) -> str:
+    """SHA-256 of the channels' names and values: in an interrupted run no manifest holds checksums of files yet."""
+    digest = hashlib.sha256()
+    for name, values in sorted(channels.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def claimed(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
+    """A folder for a run, checked before any work; if that fails before writing, a new folder is removed.
+
+    Parameters
+    ----------
+    path
+        of the folder.
+    head
+        the configuration of the run.
+    resume
+        whether the folder may hold an unfinished or finished run of the same configuration.
+
+    Raises
+    ------
+    MitsimError
+        for a place that cannot be written, that holds something else, or, with ``resume``, another configuration.
+    """
+    known: Mapping[str, str] = {}
+    again = resume and (path / MANIFEST).is_file()
+    if again:
+        known = _checked(path, head)
+    with output_folder(path, overwrite=again) as folder:
+        yield RunFolder(folder, head, known)
+
+
+def _checked(path: Path, head: RunHead) -> Mapping[str, str]:
+    """Checksums of the frames of a finished run of the same configuration; none of an interrupted one."""
+    before = read_head(path)
+    if before.configuration_sha256 != head.configuration_sha256:
+        changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
+        raise MitsimError(
+            f"resume: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
+            "use the same options, or another folder"
+        )
+    return read_manifest(path, RunManifest).checksums if before.status == "complete" else {}

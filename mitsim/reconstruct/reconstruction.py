@@ -1,0 +1,234 @@
+"""Shots and factors in, the scene's image out. Never sees the scene's truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import write_frame
+from mitsim.core.manifest import read_json, write_json
+from mitsim.core.output import output_folder, whole_file
+from mitsim.core.pictures import card, png
+from mitsim.core.resources import Cost, Limits
+from mitsim.core.runs import Capture
+from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.reconstruct.status import Status
+from mitsim.reconstruct.tv import solve_tv
+
+METHODS = ("tikhonov", "tv")
+IMAGE_FILE, RESULT_FILE = "image.exr", "result.json"
+_BYTES_A_NUMBER = 32.0
+"""Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """An image and how far to trust it.
+
+    Attributes
+    ----------
+    image
+        (n, n') reflectance, 1 = the calibration's board, neither clipped nor normalised.
+    lam
+        lambda that was used, in the unit of (Phi_L Phi_R)^2; for ``tv`` the weight of the total variation.
+    rank, condition
+        of the whole model.
+    residual
+        ||Y - model|| / ||Y|| over all frames.
+    rounding
+        what rounding may have changed, ||error|| / ||image||; None for ``tv``.
+    status
+        whether it can be trusted, what is wrong and what to do; flags of the capture and of the calibration count.
+    seconds
+        by stage.
+    inputs
+        fingerprints of shots and factors, ``lam`` as it was asked for, and the method.
+    """
+
+    image: FloatArray
+    lam: float
+    rank: int
+    condition: float
+    residual: float
+    rounding: float | None
+    status: Status
+    seconds: dict[str, float]
+    inputs: dict[str, str | float]
+
+    @property
+    def ok(self) -> bool:
+        """Whether the image can be used as it is."""
+        return self.status.ok
+
+    def summary(self) -> dict[str, Any]:
+        """What result.json and the command line's JSON say of it."""
+        return {
+            "lambda": self.lam,
+            "rank": self.rank,
+            "condition": self.condition,
+            "residual": self.residual,
+            "status": str(self.status),
+            "seconds": {**self.seconds, "total": sum(self.seconds.values())},
+        }
+
+    def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:
+        """Write image.exr, image.png (for display) and result.json.
+
+        Parameters
+        ----------
+        folder
+            new or empty, or with an earlier image of the same inputs, which is replaced.
+        overwrite
+            whether an earlier image of other inputs may be replaced, too.
+        more
+            entries of result.json beside :meth:`summary`.
+
+        Raises
+        ------
+        MitsimError
+            when the folder holds another image or something else, or cannot be written.
+        """
+        with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
+            return self.write(place, more)
+
+    def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
+        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`); ``more``
+        are further entries of result.json."""
+        write_frame(
+            folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
+        )
+        with whole_file(folder / "image.png") as part:
+            part.write_bytes(png(self.image))
+        write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
+        return folder
+
+    def _repr_html_(self) -> str:
+        facts = f"lambda {self.lam:.3g}, residual {self.residual:.1e}"
+        return card(f"Reconstruction: {self.status.verdict.value}", {"": self.image}, (str(self.status), facts))
+
+
+def reconstruct(
+    shots: Capture, factors: Factors, lam: float | Literal["auto"] = "auto", method: str = "tikhonov"
+) -> Reconstruction:
+    """Recover the image from a capture and a calibration alone.
+
+    Parameters
+    ----------
+    shots
+        in memory, or of :func:`mitsim.core.runs.load_run`; frames on disk are read one at a time.
+    factors
+        of the same camera.
+    lam
+        lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
+        from the data.
+    method
+        ``tikhonov`` (closed form) or ``tv`` (least total variation).
+
+    Raises
+    ------
+    MitsimError
+        for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
+        or another lambda or method.
+    """
+    asked = inputs(shots, factors, lam, method)
+    factors.check_fit(shots)
+    started = time.perf_counter()
+    prepared, frames = accumulated(shots, factors)
+    added = time.perf_counter()
+    solution = prepared.solve(frames, lam) if method == "tikhonov" else solve_tv(prepared, frames, lam)
+    return Reconstruction(
+        image=solution.image,
+        lam=solution.lam,
+        rank=prepared.rank,
+        condition=prepared.condition,
+        residual=solution.residual,
+        rounding=getattr(solution, "rounding", None),
+        status=replace(solution.status, flags=_flags(shots, factors)),
+        seconds={"accumulate": added - started, "solve": time.perf_counter() - added},
+        inputs=asked,
+    )
+
+
+def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator]:
+    """The model of ``shots`` and ``factors`` factorised, and every frame added. MitsimError when that takes more memory
+    than is free, or a frame cannot be read."""
+    left, right = shots.patterns
+    sides = (factors.left, left), (factors.right, right)
+    numbers = sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides)
+    Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{shots.name}: factorising its patterns", Limits())
+    prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
+    frames = prepared.accumulator()
+    expected = len(factors.left), len(factors.right)
+    for measurement, row, column in shots.measurements():
+        if measurement.shape != expected:
+            raise MitsimError(
+                f"{shots.name}: the frame of pattern ({row}, {column}) is {_size(measurement.shape)}, but the "
+                f"calibration's are {_size(expected)}; calibrate this camera"
+            )
+        frames.add(measurement, row, column)
+    return prepared, frames
+
+
+def inputs(shots: Capture, factors: Factors, lam: float | Literal["auto"], method: str) -> dict[str, str | float]:
+    """What decides an image: fingerprints of ``shots`` and ``factors``, ``lam`` and ``method`` as asked for.
+
+    MitsimError for an unknown method.
+    """
+    if method not in METHODS:
+        raise MitsimError(f"method {method!r}: use {' or '.join(METHODS)}")
+    return {"run": shots.fingerprint, "calibration": factors.fingerprint, "lambda": lam, "method": method}
+
+
+def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:
+    """Whether a folder holds an image that may be replaced; False when it holds none.
+
+    Parameters
+    ----------
+    folder
+        that is to be written to.
+    asked
+        the :func:`inputs` of the new image.
+    overwrite
+        whether an image of other inputs may be replaced.
+
+    Raises
+    ------
+    MitsimError
+        when there is an image of other inputs, and ``overwrite`` is off.
+    """
+    if not (folder / IMAGE_FILE).is_file():
+        return False
+    if overwrite:
+        return True
+    result = read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}
+    earlier = result.get("inputs") if isinstance(result, dict) else None
+    earlier = earlier if isinstance(earlier, dict) else {}
+    changed = [name for name, value in asked.items() if earlier.get(name) != value]
+    if changed:
+        raise MitsimError(
+            f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); "
+            "choose another folder, or replace it with overwrite=True"
+        )
+    return True
+
+
+def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:
+    """Sentences on why the capture or the calibration was flagged: an image made of them is flagged too."""
+    return tuple(
+        f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
+        for what, warnings in (("capture", shots.warnings), ("calibration", factors.warnings))
+        for warning in warnings
+    )
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape))
