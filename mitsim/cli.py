@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import importlib
 import json
-import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -17,7 +16,7 @@ import typer
 
 import mitsim
 from mitsim.core.errors import MitsimError
-from mitsim.core.worker import enter_worker, stop_signal
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped
 
 app = typer.Typer(
     name="mitsim",
@@ -27,7 +26,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-INTERRUPTED = 130
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Scene = Annotated[Path, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
@@ -53,12 +51,6 @@ MaxMemory = Annotated[
 Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
 
 
-def main() -> None:
-    """Entry point of the program: :func:`run` in a worker process, whose death leaves a clear line and status."""
-    enter_worker()
-    run()
-
-
 def run() -> None:
     """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused, 128 + n ended by signal n."""
     try:
@@ -80,9 +72,7 @@ def run() -> None:
             _fail(_usage(error))
         raise
     if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
-        number = signal.Signals(stop_signal() or signal.SIGINT)
-        print(f"mitsim: {'interrupted' if number == signal.SIGINT else f'ended by {number.name}'}", file=sys.stderr)
-        code = 128 + number
+        end_stopped()
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -200,6 +190,7 @@ def capture(
     from mitsim.capture.run import capture as run_capture
 
     forced, limits = parse_effects(effects), _limits(max_seconds, max_memory)
+    advise(RESUME)
     chosen = Exposure(_number("--exposure", exposure, "auto"), exposure_fraction)
     with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define, outside)
@@ -229,6 +220,7 @@ def calibrate(
     seed: Seed = 0,
     define: Defines = None,
     outside: Outside = False,
+    resume: Annotated[bool, typer.Option("--resume", help="finish an interrupted session")] = False,
     variant: Variant = "llvm_ad_mono",
     max_seconds: MaxSeconds = 86400.0,
     max_memory: MaxMemory = None,
@@ -236,13 +228,16 @@ def calibrate(
     quiet: Quiet = False,
 ) -> int:
     """Render a Hadamard session on a white board and estimate the camera's factors."""
+    from mitsim.capture.calibrate import calibrate as run_calibration
+    from mitsim.core.job import Job
     from mitsim.rig.recipe import load_recipe
-    from mitsim.study.calibration import calibrate as run_calibration
 
     limits = _limits(max_seconds, max_memory)
+    advise(RESUME)
     with _work(output, quiet or as_json) as progress:
         bench = _bench(scene, variant, camera, projector, define, outside)
-        result, _ = run_calibration(bench, output, accuracy, seed, load_recipe(recipe), progress, limits)
+        job = Job(progress=progress, limits=limits)
+        result = run_calibration(bench, load_recipe(recipe), accuracy, seed, output, resume, job).result
     lines = [
         f"{result.frames} frames of {result.n} stripes in {result.seconds['total']:.1f} s: {result.output}",
         f"separability residual {result.separability_residual:.2%} ({result.noise_free_residual:.1e} without noise), "
@@ -497,7 +492,3 @@ def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequenc
     for warning in warnings:
         print(f"mitsim: warning: {warning}", file=sys.stderr)
     return 1 if warnings else 0
-
-
-if __name__ == "__main__":
-    main()

@@ -20,9 +20,9 @@ from mitsim.capture.folder import RunFolder, claimed, frame_name
 from mitsim.capture.light import Light, collect, make_plan, speckle_of, uniform_light
 from mitsim.capture.plan import Plan
 from mitsim.core.arrays import FloatArray, Progress, silent
-from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel
+from mitsim.core.job import Clock
 from mitsim.core.manifest import DECIDING, versions
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.resources import Limits

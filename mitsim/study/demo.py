@@ -14,20 +14,20 @@ from pathlib import Path
 from typing import Any
 
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.calibrate import CalibrationResult, calibrate
 from mitsim.capture.folder import frame_name
 from mitsim.capture.light import collect, pinhole_view
 from mitsim.capture.plan import check_accuracy
 from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.arrays import FloatArray, Progress, silent
-from mitsim.core.clock import Clock
 from mitsim.core.configuration import shipped
 from mitsim.core.framefile import read_frame
+from mitsim.core.job import Clock, Job
 from mitsim.core.manifest import read_json, versions, write_json
 from mitsim.core.output import output_folder, sweep
 from mitsim.reconstruct.calibration import Calibration
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.recipe import load_recipe
-from mitsim.study.calibration import CalibrationResult, calibrate
 from mitsim.study.compare import Comparison
 from mitsim.study.describe import scene_line
 from mitsim.study.metrics import read_truth
@@ -95,7 +95,8 @@ def _run(bench: Bench, folder: Path, accuracy: float, seed: int, progress: Progr
     """The demo in a folder of its own."""
     captured = capture(bench, MAIN, folder / "run", accuracy, seed, progress=progress)
     clock.add(captured.seconds)
-    calibrated, factors = calibrate(bench, folder / "calibration", accuracy, seed, progress=progress)
+    session = calibrate(bench, None, accuracy, seed, folder / "calibration", job=Job(progress=progress))
+    calibrated, factors = session.result, session.factors
     clock.add(calibrated.seconds, "calibration ")
     with clock.stage("transport"):
         light = collect(bench, captured.plan, *bench.family(MAIN, seed).classes(), seed)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.calibrate import estimate
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import Light, collect, make_plan, speckle_of
 from mitsim.capture.plan import Plan
@@ -28,12 +29,11 @@ from mitsim.capture.run import board_flux, truth
 from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Progress
-from mitsim.core.clock import Clock
+from mitsim.core.job import Job
 from mitsim.core.manifest import versions, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.reconstruct.calibration import estimate_factors
 from mitsim.reconstruct.solver import prepare
 from mitsim.rig.mask import MaskKind
 from mitsim.rig.patterns import PatternFamily
@@ -199,16 +199,15 @@ def _rendered(
 
     Without diffraction the same light of scene and board goes through the geometric shadow.
     """
-    session = Session(bench, load_recipe(), ACCURACY, seed, Clock(), lambda stage, part: None)
+    session, job = Session(bench, load_recipe(), seed), Job()
+    board_plan = session.plan(ACCURACY, job)
+    lit = session.lit(board_plan, session.trace(board_plan, job), job)
     assumed = ideal_factors(bench, flux, _electrons_per_joule(bench))
     for name, effects in ((PROJECTOR, plan.settings.effects), (GEOMETRIC, plan.settings.effects - {"diffraction"})):
         settings = replace(plan.settings, effects=effects)
         scene = replace(light, simulation=Simulation(bench, settings)).merged()
-        board = replace(
-            session.plan.settings, effects=session.plan.settings.effects - (plan.settings.effects - effects)
-        )
-        session.light = replace(session.light, simulation=Simulation(session.board, board))
-        found = estimate_factors(*session.noisy(), session.signs, centre=session.centre, noise=session.response_noise)
+        board = replace(board_plan.settings, effects=board_plan.settings.effects - (plan.settings.effects - effects))
+        found, _ = estimate(replace(lit, light=replace(lit.light, simulation=Simulation(session.board, board))), job)
         known = {ASSUMED: assumed, CALIBRATED: (found.left, found.right)}
         for family in families:
             expected = scene.frames(*family.classes(), seed)

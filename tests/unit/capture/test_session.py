@@ -11,19 +11,18 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.calibrate import CalibrationResult, calibrate
 from mitsim.capture.evidence import PHYSICAL
 from mitsim.capture.light import make_plan, uniform_light
 from mitsim.capture.plan import Plan
 from mitsim.capture.session import Session
-from mitsim.core.arrays import silent
-from mitsim.core.clock import Clock
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
+from mitsim.core.job import Job
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Calibration
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.recipe import load_recipe
-from mitsim.study.calibration import CalibrationResult, calibrate
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
@@ -53,7 +52,8 @@ def session(
             folder = tmp_path_factory.mktemp("calibration") / "cal"
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr("mitsim.capture.session.make_plan", geometric_plan)
-                made[key] = (bench, *calibrate(bench, folder, 1e-3, seed=2, recipe=recipe(mode)))
+                calibrated = calibrate(bench, recipe(mode), seed=2, output=folder)
+            made[key] = bench, calibrated.result, calibrated.factors
         return made[key]
 
     return run
@@ -140,12 +140,9 @@ def test_flatcam_is_centred(session: Callable[..., Done]) -> None:
         assert np.abs(factor.sum(axis=0)).max() < 1e-9 * np.abs(factor).sum()
 
 
-def test_seeds(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
+def test_seeds(shared_scene: Callable[..., Path]) -> None:
     bench = open_bench(shared_scene("separable16", n=16))
-    one, again, other = (
-        calibrate(bench, tmp_path / name, 2e-2, seed=seed, recipe=recipe("uniform"))[1].left
-        for name, seed in (("one", 1), ("again", 1), ("other", 2))
-    )
+    one, again, other = (calibrate(bench, recipe("uniform"), 2e-2, seed).factors.left for seed in (1, 1, 2))
     assert np.array_equal(one, again) and not np.allclose(one, other, rtol=1e-6)
 
 
@@ -155,7 +152,7 @@ def test_a_used_folder_is_refused_before_any_work(
     bench, result, _ = session("separable", "pair", 16)
     monkeypatch.setattr("mitsim.capture.session.make_plan", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match="holds files already"):
-        calibrate(bench, result.output)
+        calibrate(bench, output=result.output)
 
 
 def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[..., Path]) -> None:
@@ -163,5 +160,4 @@ def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[
     board = open_bench(shared_scene("separable16", n=16)).with_board(0.99)
     uniform = make_plan(board, *uniform_light(16), 2e-2, 0)
     assert "diffraction" not in uniform.settings.effects
-    session = Session(board, recipe("pair"), 2e-2, 0, Clock(), silent)
-    assert "diffraction" in session.plan.settings.effects
+    assert "diffraction" in Session(board, recipe("pair")).plan(2e-2, Job()).settings.effects
