@@ -36,7 +36,7 @@ def cold() -> dict[str, float]:
     with tempfile.TemporaryDirectory() as home:
         for name in ("empty_caches", "new_process"):
             run = str(Path(home) / name)
-            command = [sys.executable, "-m", "mitsim.cli", "capture", str(SCENE), "--patterns", PATTERNS]
+            command = [sys.executable, "-m", "mitsim", "capture", str(SCENE), "--patterns", PATTERNS]
             command += ["--accuracy", str(ACCURACY), "-o", run, "--json"]
             started = time.perf_counter()
             subprocess.run(command, check=True, capture_output=True, env={**os.environ, "HOME": home})

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import json
 import re
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,7 +22,7 @@ import mitsim
 from mitsim.core.arrays import Progress, silent
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.worker import enter_worker, stop_signal
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
@@ -39,8 +38,6 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-INTERRUPTED = 130
-"""128 + SIGINT, as a shell says it."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _OPTIONS = {"lam": "lambda", "parameters": "D"}
 """Options that are not called like the argument."""
@@ -73,12 +70,6 @@ DAY = 86400.0
 """Work that would take longer is a mistake, unless it is asked for."""
 
 
-def main() -> None:
-    """Entry point of the program: :func:`run` in a worker process, whose death leaves a clear line and status."""
-    enter_worker()
-    run()
-
-
 def run() -> None:
     """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused, 128 + n ended by signal n."""
     try:
@@ -100,9 +91,7 @@ def run() -> None:
             _fail(_usage(error))
         raise
     if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
-        number = signal.Signals(stop_signal() or signal.SIGINT)
-        print(f"mitsim: {'interrupted' if number == signal.SIGINT else f'ended by {number.name}'}", file=sys.stderr)
-        code = 128 + number
+        end_stopped()
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -221,6 +210,7 @@ def capture(
         effects=effects,
         noise_fraction=noise_fraction,
     )
+    advise(RESUME)
     with _job(quiet or as_json, max_seconds, max_memory) as job:
         bench = _open(scene, variant, camera, projector, define, outside)
         shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
@@ -258,10 +248,11 @@ def calibrate(
     from mitsim.rig.recipe import load_recipe
 
     session = load_recipe(recipe)
+    advise(RESUME)
     with _job(quiet or as_json, max_seconds, max_memory) as job:
         bench = _open(scene, variant, camera, projector, define, outside)
         factors = bench.calibrate(seed, accuracy, session, output, resume, job)
-    payload = factors.summary()
+    payload = {**factors.manifest.result, "output": str(output)}
     lines = [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
         f"separability residual {payload['separability_residual']:.2%} ({payload['noise_free_residual']:.1e} without "
@@ -491,7 +482,3 @@ def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequenc
     for warning in warnings:
         print(f"mitsim: warning: {warning}", file=sys.stderr)
     return 1 if warnings else 0
-
-
-if __name__ == "__main__":
-    main()

@@ -27,7 +27,7 @@ ALLOWED = {
     "capture": GROUND | STAGES,
     "study": GROUND | {"capture", "reconstruct", "optics", "sensor"},
     "cli": GROUND | {"capture", "study"} | STAGES,
-    "__main__": {"cli"},
+    "__main__": {"cli", "core"},
 }
 MITSUBA_ROOMS = ("mitsim.scene", "mitsim.transport", "mitsim.capture", "mitsim.core.environment")
 RENDERER = {"mitsuba", "drjit"}

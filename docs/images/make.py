@@ -60,7 +60,7 @@ def main() -> None:
 
 def mitsim(work: Path, *arguments: str) -> None:
     """Run a verb of mitsim in ``work``; an exit status above 1 ends the script."""
-    program = [sys.executable, "-m", "mitsim.cli", *arguments, "--quiet"]
+    program = [sys.executable, "-m", "mitsim", *arguments, "--quiet"]
     if subprocess.run(program, cwd=work, check=False).returncode > 1:
         raise SystemExit(2)
 

@@ -17,7 +17,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
-from mitsim.capture.simulation import Estimate, Simulation
+from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
@@ -89,7 +89,7 @@ class Light:
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     """
 
-    groups: tuple[Estimate, ...]
+    groups: tuple[FiledLight, ...]
     simulation: Simulation
     plan: Plan
     seed: int
@@ -263,7 +263,7 @@ class _Group:
         self.seed = seed
         self.done: dict[str, int] = {}
         self.paths = 0
-        self._sums: dict[str, Estimate] = {}
+        self._sums: dict[str, FiledLight] = {}
         self._flux = np.zeros(simulation.bench.n**2)
 
     def sample(self, rounds: float) -> None:
@@ -281,7 +281,7 @@ class _Group:
                 self.paths += count * stage.tracer.lanes
 
     @property
-    def light(self) -> Estimate:
+    def light(self) -> FiledLight:
         """Mean over the samples."""
         return reduce(add, (light / self.done[name] for name, light in self._sums.items()))
 

@@ -35,7 +35,7 @@ a shadow's fringes hardly move."""
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class FiledLight:
     """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
 
     ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees beyond
@@ -46,11 +46,11 @@ class Estimate:
     coarse: sparse.csr_array
     smooth: sparse.csr_array
 
-    def __add__(self, other: Estimate) -> Estimate:
-        return Estimate(self.fine + other.fine, self.coarse + other.coarse, self.smooth + other.smooth)
+    def __add__(self, other: FiledLight) -> FiledLight:
+        return FiledLight(self.fine + other.fine, self.coarse + other.coarse, self.smooth + other.smooth)
 
-    def __truediv__(self, count: float) -> Estimate:
-        return Estimate(self.fine / count, self.coarse / count, self.smooth / count)
+    def __truediv__(self, count: float) -> FiledLight:
+        return FiledLight(self.fine / count, self.coarse / count, self.smooth / count)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Stage:
 
     tracer: DirectTracer | IndirectTracer | CameraTracer
     predicted: float
-    file: Callable[[Deposits, Labels, int], Estimate]
+    file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
 
 
@@ -101,7 +101,7 @@ class Simulation:
     physics
         what is simulated of the bench.
     fine, coarse, smooth
-        trays for the parts of an :class:`Estimate`; ``ambient`` for lamps' light in the cells of ``fine``.
+        trays for the parts of an :class:`FiledLight`; ``ambient`` for lamps' light in the cells of ``fine``.
     """
 
     def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None) -> None:
@@ -176,26 +176,26 @@ class Simulation:
         positions = anchor_positions(self.settings.anchors, self.physics.geometry.half_width)
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
 
-    def file_direct(self, deposits: Deposits, labels: Labels, samples: int) -> Estimate:
+    def file_direct(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`direct`, per sample: ``deposits`` of ``samples``, by the class in ``labels``."""
         return self._light(fine=self.fine.file(deposits, labels, samples))
 
-    def file_anchored(self, deposits: Deposits, labels: Labels, samples: int) -> Estimate:
+    def file_anchored(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`anchored` beyond its mean over the sensor: ``deposits``, ``labels``, ``samples`` as above."""
         mean = self.smooth.file(deposits.averaged(self.mean_weights), labels, samples)
         coarse = self.coarse.file(deposits, labels, samples)
         return self._light(coarse=coarse - self.coarse.bundle.repeated(mean))
 
-    def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> Estimate:
+    def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`indirect` or :attr:`from_camera`: ``deposits``, ``labels``, ``samples`` as above."""
         indirect = deposits.order == INDIRECT
         fine = self.fine.file(deposits.where(~indirect), labels, samples)
         return self._light(fine=fine, smooth=self.smooth.file(deposits.where(indirect), labels, samples))
 
-    def _light(self, **parts: sparse.csr_array) -> Estimate:
+    def _light(self, **parts: sparse.csr_array) -> FiledLight:
         rows = next(iter(parts.values())).shape[0]
         sizes = {name: getattr(self, name).bundle.size for name in ("fine", "coarse", "smooth")}
-        return Estimate(**{name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()})
+        return FiledLight(**{name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()})
 
     def tracers(self) -> dict[str, Stage]:
         """What is traced: samples a group is predicted to need, and how the light is filed, by name."""
@@ -228,7 +228,7 @@ class Simulation:
             return None
         return self.bench.glint.frames(labels, self.physics.geometry, self.physics.spectrum)
 
-    def expected(self, groups: Sequence[Estimate], rows: Labels, lighting: Lighting, seed: int) -> ExpectedFrames:
+    def expected(self, groups: Sequence[FiledLight], rows: Labels, lighting: Lighting, seed: int) -> ExpectedFrames:
         """Expected frames of all shots of a lighting.
 
         Parameters

@@ -1,4 +1,4 @@
-"""One piece of work: its clock, where its progress is told, and what it may take."""
+"""What goes with long work besides its inputs: where its time goes, who is told how far it is, what it may take."""
 
 from __future__ import annotations
 
@@ -28,19 +28,29 @@ class Clock:
             self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - started
 
     def add(self, stages: Mapping[str, float], prefix: str = "") -> None:
-        """Take over the ``stages`` of another clock, except its total, with ``prefix`` before their names."""
+        """Take over the ``stages`` [s] of another clock, except its total, ``prefix`` before their names."""
         for name, seconds in stages.items():
             if name != "total":
                 self._stages[prefix + name] = self._stages.get(prefix + name, 0.0) + seconds
 
     def seconds(self) -> dict[str, float]:
-        """Stages and ``total`` since the clock was made."""
+        """Stages and ``total`` since the clock was made [s]."""
         return {**self._stages, "total": time.perf_counter() - self._started}
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a long work is given beside its request."""
+    """How one piece of long work is watched and bounded; of no influence on its results.
+
+    Attributes
+    ----------
+    clock
+        takes the seconds of each stage.
+    progress
+        is told each stage and its finished part.
+    limits
+        beyond which the work is refused before it begins.
+    """
 
     clock: Clock = field(default_factory=Clock)
     progress: Progress = silent

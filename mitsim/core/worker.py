@@ -7,29 +7,50 @@ passes signals on and turns the worker's end into an exit status and, where it d
 
 from __future__ import annotations
 
+import mmap
 import os
 import signal
 import sys
 import threading
 from types import FrameType
+from typing import NoReturn
 
+from mitsim.core.parallel import workers
+
+INTERRUPTED = 128 + signal.SIGINT
+"""Exit status after Control-C, as in a shell."""
+RESUME = "finished work is kept, go on with --resume"
+"""Advice to whom a capture or a calibration was cut short."""
 _STOPS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
 _CRASHES = ("SIGABRT", "SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGTRAP")
+_SPACE_BYTES = 0.7e9
+"""Address space in which a command comes to its own check of memory; measured: below, LLVM ends the process."""
+_SPACE_BYTES_PER_PROCESSOR = 85e6
+"""What each processor adds, buffers and stacks of two OpenBLAS; measured."""
+_LONGEST_ADVICE = 256
+"""Bytes; chosen so that any sentence fits."""
+
 _stopped_by: int | None = None
+_advice: mmap.mmap | None = None
 
 
 def enter_worker() -> None:
     """Return in a child process; the parent never returns, but exits with the child's status.
 
     A worker that a signal ended gives 128 + its number, as in a shell. SIGINT, SIGTERM, SIGHUP and SIGQUIT to the
-    parent reach the worker, where they raise KeyboardInterrupt (see :func:`stop_signal`); a second one kills it. When
-    the parent is killed, so is the worker. To be called once, before threads are started: RuntimeError when Dr.Jit is
-    there already, whose threads a fork leaves behind. Without ``os.fork`` the process stays one.
+    parent reach the worker, where they raise KeyboardInterrupt (see :func:`end_stopped`); a second one kills it. When
+    the parent is killed, so is the worker. An address space too small to start in ends the program with status 2. To
+    be called once, before threads are started: RuntimeError when Dr.Jit is there already, whose threads a fork leaves
+    behind. Without ``os.fork`` the process stays one.
     """
+    global _advice
     if not hasattr(os, "fork"):
         return
     if "drjit" in sys.modules:
         raise RuntimeError("enter_worker: Dr.Jit is imported already, and its threads do not survive a fork")
+    signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)  # until both processes know what to do with them
+    _check_address_space()
+    _advice = mmap.mmap(-1, _LONGEST_ADVICE)  # shared: what the worker notes, its parent reads
     reading, writing = os.pipe()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -38,14 +59,49 @@ def enter_worker() -> None:
         os.close(reading)
         _watch(child)
     os.close(writing)
+    # Signals stay blocked in this thread, so it is the main one that they interrupt.
     threading.Thread(target=_end_with_parent, args=(reading,), daemon=True).start()
     for number in _heeded():
         signal.signal(number, _stop)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
 
 
-def stop_signal() -> int | None:
-    """The signal that asked this process to stop, None when none did."""
-    return _stopped_by
+def advise(text: str) -> None:
+    """Note what to do, ``text`` without a full stop, should the running command be cut short; empty for nothing."""
+    if _advice is not None:
+        _advice[:] = text.encode()[:_LONGEST_ADVICE].ljust(_LONGEST_ADVICE, b"\0")
+
+
+def end_stopped() -> NoReturn:
+    """Say what stopped this process, and what to do, and exit with 128 + the signal's number."""
+    number = signal.Signals(_stopped_by or signal.SIGINT)
+    ending = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    _say(_with_advice(ending))
+    sys.exit(128 + number)
+
+
+def _with_advice(text: str) -> str:
+    noted = _advice[:].rstrip(b"\0").decode(errors="ignore") if _advice is not None else ""
+    return f"{text}; {noted}" if noted else text
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"mitsim: {text}\n")
+    sys.stderr.flush()
+
+
+def _check_address_space() -> None:
+    """Exit when the limit on address space is one in which OpenBLAS, loaded with numpy, would try for ever."""
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    needed = _SPACE_BYTES + _SPACE_BYTES_PER_PROCESSOR * workers()
+    if limit != resource.RLIM_INFINITY and limit < needed:
+        _say(
+            f"address space is limited to {limit / 2**30:.2g} GiB; at least {needed / 2**30:.2g} GiB are needed to "
+            "start; raise the limit, for example with: ulimit -v unlimited"
+        )
+        sys.exit(2)
 
 
 def _heeded() -> list[int]:
@@ -56,8 +112,8 @@ def _heeded() -> list[int]:
 def _stop(number: int, _: FrameType | None) -> None:
     global _stopped_by
     _stopped_by = number
-    for other in _heeded():  # a terminal sends Control-C to both processes, and the parent passes it on
-        signal.signal(other, signal.SIG_IGN)
+    for heeded in _heeded():  # a terminal sends Control-C to both processes, and the parent passes it on
+        signal.signal(heeded, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
@@ -66,7 +122,7 @@ def _end_with_parent(reading: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _watch(child: int) -> None:
+def _watch(child: int) -> NoReturn:
     """Wait for the worker, pass signals on, report its end, and exit."""
     asked: list[int] = []
 
@@ -76,23 +132,20 @@ def _watch(child: int) -> None:
 
     for number in _heeded():
         signal.signal(number, forward)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
     _, status = os.waitpid(child, 0)
     for number in _STOPS:
         signal.signal(number, signal.SIG_IGN)
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
-    ended_by = os.WTERMSIG(status)
-    sys.stderr.write(f"mitsim: {_obituary(signal.Signals(ended_by).name, bool(asked))}\n")
-    sys.stderr.flush()
-    os._exit(128 + (asked[0] if asked else ended_by))
+    killer = os.WTERMSIG(status)
+    _say(_obituary(signal.Signals(killer).name, bool(asked)))
+    os._exit(128 + (asked[0] if asked else killer))
 
 
 def _obituary(name: str, asked: bool) -> str:
     if asked:
-        return "stopped at once; finished frames of a capture are kept, go on with --resume"
+        return _with_advice("stopped at once")
     cause = "a crash in native code" if name in _CRASHES else "out of memory, or killed from outside"
     remedy = "run: mitsim doctor" if name in _CRASHES else "free memory or ask for less"
-    return (
-        f"the worker process was ended by {name} ({cause}); finished frames of a capture are kept, go on with "
-        f"--resume; {remedy}"
-    )
+    return f"{_with_advice(f'the worker process was ended by {name} ({cause})')}; {remedy}"

@@ -76,12 +76,78 @@ class Estimate:
 
 
 @dataclass
-class _Split:
-    """Running sums of one direction: u_i as columns, misfit and energy."""
+class StripeSums:
+    """Running sums over the responses of one side; saved after any response and continued, they come to the same bits.
 
+    Attributes
+    ----------
+    side
+        ``horizontal`` or ``vertical`` stripes.
+    centre
+        whether row and column means are taken out of every response.
+    common
+        v (k,) of Y_i = u_i v^T; for vertical stripes a of Y_i^T = w_i a^T.
+    vectors
+        (m, N) u_i, or w_i, as columns; those of responses to come are undefined.
+    misfit, energy
+        sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
+    done
+        responses that are in.
+    """
+
+    side: str
+    centre: bool
+    common: FloatArray
     vectors: FloatArray
     misfit: float = 0.0
     energy: float = 0.0
+    done: int = 0
+
+    def add(self, response: npt.ArrayLike) -> None:
+        """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
+        shape = len(self.vectors), len(self.common)
+        shape = shape if self.side == "horizontal" else shape[::-1]
+        self.add_checked(_response(response, f"{self.side} response {self.done}", shape, self.centre))
+
+    def add_checked(self, response: FloatArray) -> None:
+        """The same for a ``response`` that is checked and centred: least squares for u_i in Y_i = u_i common^T."""
+        values = response if self.side == "horizontal" else response.T
+        vector = values @ (self.common / np.dot(self.common, self.common))
+        self.vectors[:, self.done] = vector
+        self.misfit += float(np.sum(np.square(values - np.outer(vector, self.common))))
+        self.energy += float(np.sum(np.square(values)))
+        self.done += 1
+
+
+def stripe_sums(
+    horizontal: npt.ArrayLike,
+    vertical: npt.ArrayLike,
+    count: int,
+    centre: bool = False,
+    uniform: npt.ArrayLike | None = None,
+) -> tuple[StripeSums, StripeSums]:
+    """Sums of horizontal and of vertical stripes, with the first response of each.
+
+    Parameters
+    ----------
+    horizontal, vertical
+        responses number 0 (rows, columns).
+    count
+        N, the responses of each side.
+    centre, uniform
+        as :func:`estimate_factors`, which also says what is refused.
+    """
+    first = _response(horizontal, "horizontal response 0", None, centre)
+    second = _response(vertical, "vertical response 0", first.shape, centre)
+    mean = (first + second) / 2
+    if uniform is not None:
+        mean = _response(uniform, "uniform response", first.shape, centre)
+    a, v = _rank_one_split(mean)
+    left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
+    right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
+    left.add_checked(first)
+    right.add_checked(second)
+    return left, right
 
 
 def estimate_factors(
@@ -118,42 +184,33 @@ def estimate_factors(
         for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
     """
     signs = _checked_signs(H, uniform is not None)
+    count = signs.shape[1]
     rows, columns = iter(horizontal), iter(vertical)
-    first = [_next(rows, "horizontal", 0, None, signs.shape[1], centre)]
-    first.append(_next(columns, "vertical", 0, first[0].shape, signs.shape[1], centre))
-    mean = (first[0] + first[1]) / 2
-    if uniform is not None:
-        mean = _response(uniform, "uniform response", first[0].shape, centre)
-    a, v = _rank_one_split(mean)
-    left = _split(first[0], rows, "horizontal", v, signs.shape[1], centre)
-    right = _split(first[1].T, columns, "vertical", a, signs.shape[1], centre)
-    return _estimate(left, right, a, v, signs, noise)
+    first = _next(rows, "horizontal", 0, count), _next(columns, "vertical", 0, count)
+    left, right = stripe_sums(*first, count, centre, uniform)
+    for sums, rest in ((left, rows), (right, columns)):
+        while sums.done < count:
+            sums.add(_next(rest, sums.side, sums.done, count))
+        if next(rest, None) is not None:
+            raise MitsimError(f"more than {count} {sums.side} responses were given; give one for each column of H")
+    return factors_of_sums(left, right, signs, noise)
 
 
-def _split(
-    first: FloatArray, rest: Iterator[npt.ArrayLike], name: str, common: FloatArray, count: int, centre: bool
-) -> _Split:
-    """Project each response on its common vector: least squares for u_i in Y_i = u_i common^T."""
-    unit = common / np.dot(common, common)
-    result = _Split(np.empty((first.shape[0], count)))
-    for index in range(count):
-        response = first
-        if index:
-            shape = first.shape if name == "horizontal" else first.shape[::-1]
-            response = _next(rest, name, index, shape, count, centre)
-            response = response if name == "horizontal" else response.T
-        vector = response @ unit
-        result.vectors[:, index] = vector
-        result.misfit += float(np.sum(np.square(response - np.outer(vector, common))))
-        result.energy += float(np.sum(np.square(response)))
-    if next(rest, None) is not None:
-        raise MitsimError(f"more than {count} {name} responses were given; give one for each column of H")
-    return result
-
-
-def _estimate(
-    left: _Split, right: _Split, a: FloatArray, v: FloatArray, signs: FloatArray, stated_noise: float | None
+def factors_of_sums(
+    left: StripeSums, right: StripeSums, signs: FloatArray, stated_noise: float | None = None
 ) -> Estimate:
+    """Factors from finished sums.
+
+    Parameters
+    ----------
+    left, right
+        of horizontal and of vertical stripes, all responses in.
+    signs
+        H (n, N), as :func:`estimate_factors` takes it.
+    stated_noise
+        root mean square sensor noise of a response [frame unit]; None: unknown.
+    """
+    v, a = left.common, right.common
     count = signs.shape[1]
     phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
     energy = left.energy + right.energy
@@ -277,18 +334,11 @@ def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     return sign * root * left[:, 0], sign * root * right[0]
 
 
-def _next(
-    responses: Iterator[npt.ArrayLike],
-    name: str,
-    index: int,
-    shape: tuple[int, ...] | None,
-    count: int,
-    centre: bool,
-) -> FloatArray:
+def _next(responses: Iterator[npt.ArrayLike], side: str, index: int, count: int) -> npt.ArrayLike:
     response = next(responses, None)
     if response is None:
-        raise MitsimError(f"only {index} {name} responses were given; H has {count} columns, give one for each")
-    return _response(response, f"{name} response {index}", shape, centre)
+        raise MitsimError(f"only {index} {side} responses were given; H has {count} columns, give one for each")
+    return response
 
 
 def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:

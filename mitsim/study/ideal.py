@@ -14,7 +14,7 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.light import Light
-from mitsim.capture.simulation import Estimate, Simulation
+from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
 from mitsim.optics.separable import best_term, centred
@@ -44,7 +44,7 @@ def ideal_light(bench: Bench, reflectance: FloatArray, board_flux: float) -> Lig
         sparse.csr_array((bench.n**2 + 1, which.size)) for which in (simulation.coarse, simulation.smooth)
     )
     return Light(
-        (Estimate(light, coarse, smooth),), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True
+        (FiledLight(light, coarse, smooth),), simulation, pixels, flux, paths=0, sampling_error=0.0, reached=True
     )
 
 

@@ -335,9 +335,9 @@ def test_a_saturated_session_is_flagged(
     (That no frame is counted without cause: tests/unit/capture/test_session.py::test_the_folder.)
     """
     from mitsim.capture.bench import open_bench
+    from mitsim.capture.calibrate import calibrate
     from mitsim.capture.effects import EFFECTS
     from mitsim.capture.light import make_plan
-    from mitsim.study.calibration import calibrate
 
     def simple_plan(*arguments: object) -> object:
         return make_plan(*arguments, forced=dict.fromkeys(EFFECTS, False))
@@ -348,7 +348,9 @@ def test_a_saturated_session_is_flagged(
         'name = "short"\npixel_pitch_um = 5.86\nbinning = 2\nfull_well_e = 32360.0\nread_noise_e = 6.7\n'
         'quantum_efficiency = 0.75\ngain_dn_per_e = 0.125\nbits = 8\nsource = "made for a test"\n'
     )
-    result, found = calibrate(open_bench(small_scene(n=8), variant, camera=camera), tmp_path / "cal", 2e-2)
+    bench = open_bench(small_scene(n=8), variant, camera=camera)
+    calibrated = calibrate(bench, accuracy=2e-2, output=tmp_path / "cal")
+    result, found = calibrated.result, calibrated.factors
     [told] = [warning for warning in result.warnings if "full well or the ADC's end" in warning]
     assert told.startswith("30 of 32 frames") and not found.ok
     manifest = json.loads((tmp_path / "cal" / "manifest.json").read_text())

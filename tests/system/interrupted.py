@@ -20,7 +20,7 @@ PATTERNS = "hadamard:16"  # 512 frames: long enough to be hit in the middle
 def running(least: int, *arguments: object, **options: Any) -> subprocess.Popen[str]:
     """Start mitsim; back as soon as ``least`` frames are written, for 0 as soon as the run's folder is there."""
     folder = Path(str(arguments[arguments.index("-o") + 1]))
-    command = [sys.executable, "-m", "mitsim.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "mitsim", *map(str, arguments)]
     # A shell's background jobs ignore SIGINT, and so would what they start.
     before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)

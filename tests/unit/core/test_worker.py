@@ -1,19 +1,24 @@
 """The worker process: its end becomes an exit status and one line, whatever that end is."""
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
+
+from mitsim.core import worker
+from mitsim.core.parallel import workers
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process where there is no fork")
 
 PROGRAM = """
 import ctypes, os, signal, sys, time
-from mitsim.core.worker import enter_worker, stop_signal
+from mitsim.core.worker import advise, end_stopped, enter_worker
 enter_worker()
 {work}
 """
@@ -24,7 +29,7 @@ try:
     time.sleep(60)
 except KeyboardInterrupt:
 """
-TELL = HEED + '    sys.exit(f"stopped by {signal.Signals(stop_signal()).name}")\n'
+TELL = HEED + "    end_stopped()\n"
 STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + WAIT
 
 
@@ -60,7 +65,7 @@ def test_a_worker_that_dies_leaves_one_clear_line(work: str, name: str, words: s
     out, err = process.communicate()
     assert process.returncode == 128 + signal.Signals[name] and out == ""
     assert err.startswith(f"mitsim: the worker process was ended by {name} ({words})")
-    assert "--resume" in err and err.count("\n") == 1
+    assert err.endswith(("); run: mitsim doctor\n", "); free memory or ask for less\n")) and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -70,7 +75,8 @@ def test_a_signal_to_the_parent_stops_the_worker(number: signal.Signals) -> None
     process, _ = started(TELL)
     signal.signal(signal.SIGINT, before)
     process.send_signal(number)
-    assert (*process.communicate(timeout=20), process.returncode) == ("", f"stopped by {number.name}\n", 1)
+    words = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    assert (*process.communicate(timeout=20), process.returncode) == ("", f"mitsim: {words}\n", 128 + number)
 
 
 def test_control_c_on_a_terminal_reaches_both_and_stops_once() -> None:
@@ -96,7 +102,24 @@ def test_a_second_signal_stops_a_worker_that_does_not_listen() -> None:
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=20)
     assert process.returncode == 128 + signal.SIGTERM and not psutil.pid_exists(worker)
-    assert out == "" and err.startswith("mitsim: stopped at once") and err.count("\n") == 1
+    assert (out, err) == ("", "mitsim: stopped at once\n")
+
+
+@pytest.mark.parametrize("advice", ["", "do this next"])
+def test_the_advice_is_that_of_the_command_which_runs(advice: str) -> None:
+    """The worker notes it, and whoever is left repeats it: the worker after a signal, else the parent."""
+    note = f"advise('another')\nadvise({advice!r})\n"
+    more = f"; {advice}" if advice else ""
+    process, _ = started(note + TELL)
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate(timeout=20) == ("", f"mitsim: ended by SIGTERM{more}\n")
+    process, _ = started(note + STUBBORN)
+    for _ in range(2):
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.2)
+    assert process.communicate(timeout=20) == ("", f"mitsim: stopped at once{more}\n")
+    _, err = start(note + "os.abort()").communicate()
+    assert f"(a crash in native code){more}; run: mitsim doctor\n" in err
 
 
 def test_a_killed_parent_takes_the_worker_along() -> None:
@@ -135,3 +158,67 @@ def test_a_process_with_threads_of_drjit_is_not_split() -> None:
     program = "import sys\nsys.modules['drjit'] = sys\nfrom mitsim.core.worker import enter_worker\nenter_worker()"
     late = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert late.returncode == 1 and "do not survive a fork" in late.stderr
+
+
+MITSIM = [sys.executable, "-m", "mitsim"]
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.02, 0.1])
+@pytest.mark.parametrize("moment", [0.0, 0.05, 0.1, 0.2, 0.4])
+def test_control_c_during_start_up_is_one_line(moment: float, gap: float) -> None:
+    """Twice, as a terminal sends it: to both processes. ``moment`` counts from when the worker is there [s].
+
+    Before that Python itself starts, and says in its own way that it was interrupted.
+    """
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(
+        [*MITSIM, "plan", "photograph"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    signal.signal(signal.SIGINT, before)
+    parent = psutil.Process(process.pid)
+    while not parent.children():
+        assert process.poll() is None
+    time.sleep(moment)
+    os.killpg(process.pid, signal.SIGINT)
+    time.sleep(gap)
+    with contextlib.suppress(ProcessLookupError):  # it may be over
+        os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out) == (130, "")
+    assert set(err.splitlines()) <= {"mitsim: interrupted", "mitsim: stopped at once"} and err
+
+
+def limited(kilobytes: int, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """mitsim with a limit on its address space, as ``ulimit -v`` sets it."""
+    import resource
+
+    space = kilobytes * 1024
+    return subprocess.run(
+        [*MITSIM, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (space, space)),
+    )
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems do not hold to RLIMIT_AS")
+@pytest.mark.parametrize("kilobytes", [100_000, 200_000, 300_000, 500_000, 700_000])
+def test_too_little_address_space_is_refused_at_once(kilobytes: int) -> None:
+    """OpenBLAS would try for its buffers for ever at 300 000, and Dr.Jit, LLVM or the kernel would end the process."""
+    done = limited(kilobytes, "plan", "photograph")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(f"mitsim: address space is limited to {kilobytes * 1024 / 2**30:.2g} GiB; at least ")
+    assert "ulimit -v unlimited" in done.stderr
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems do not hold to RLIMIT_AS")
+def test_a_little_more_comes_to_the_check_of_memory(tmp_path: Path) -> None:
+    """What is asked for to start is enough to start: the refusal is then the command's own."""
+    space = worker._SPACE_BYTES + worker._SPACE_BYTES_PER_PROCESSOR * workers()
+    done = limited(int(space / 1024) + 1, "capture", "photograph", "--patterns", "uniform", "-o", str(tmp_path / "run"))
+    assert done.returncode == 2 and "of memory; allowed are" in done.stderr, done.stderr

@@ -1,0 +1,18 @@
+"""Entry point of the program: the worker process first, and in it the command line, which takes time to import."""
+
+from mitsim.core.worker import end_stopped, enter_worker
+
+
+def main() -> None:
+    """:func:`mitsim.cli.run` in a worker process, whose death leaves a clear line and status."""
+    try:
+        enter_worker()
+        from mitsim.cli import run
+
+        run()
+    except KeyboardInterrupt:  # before the command line is there to take it
+        end_stopped()
+
+
+if __name__ == "__main__":
+    main()
