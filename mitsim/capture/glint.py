@@ -21,13 +21,13 @@ class MirrorLight:
 
     def __init__(self, beams: Beams) -> None:
         self.beams = beams
-        self._made: dict[tuple[bytes, CameraGeometry, bytes], ClassFrames] = {}
+        self._made: dict[tuple[bytes, CameraGeometry, Spectrum | None], ClassFrames] = {}
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
         """Frames by class for ``labels`` (n^2,); without a ``spectrum`` the mask's shadow is geometric."""
         if not len(self.beams):
             return None
-        key = labels.tobytes(), geometry, spectrum.wavelengths_nm.tobytes() if spectrum else b""
+        key = labels.tobytes(), geometry, spectrum
         if key not in self._made:
             while len(self._made) >= _KEPT:
                 del self._made[next(iter(self._made))]
