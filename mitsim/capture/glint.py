@@ -22,13 +22,13 @@ class Glint:
 
     def __init__(self, beams: Beams) -> None:
         self.beams = beams
-        self._frames: dict[tuple[bytes, CameraGeometry, bytes], ClassFrames] = {}
+        self._frames: dict[tuple[bytes, CameraGeometry, Spectrum | None], ClassFrames] = {}
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
         """Frames by class for ``labels`` (n^2,); without a ``spectrum`` the mask's shadow is geometric."""
         if not len(self.beams):
             return None
-        key = labels.tobytes(), geometry, spectrum.wavelengths_nm.tobytes() if spectrum else b""
+        key = labels.tobytes(), geometry, spectrum
         if key not in self._frames:
             while len(self._frames) >= _KEPT:
                 del self._frames[next(iter(self._frames))]

@@ -1,6 +1,7 @@
 """Types of arrays that several rooms exchange, and of the progress report that long work takes."""
 
 from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,26 @@ Labels = npt.NDArray[np.int64]
 """Index of the class or row that each item belongs to."""
 Progress = Callable[[str, float], None]
 """Called with a stage's name and its finished part, 0 to 1."""
+
+
+class ByValue:
+    """A dataclass (with ``eq=False``) that compares and hashes by its values, arrays by their bytes."""
+
+    def _values(self) -> tuple[object, ...]:
+        values = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
+        return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ByValue) and type(other) is type(self) and other._values() == self._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
+
+    def _hold(self, **arrays: npt.NDArray[np.generic]) -> None:
+        """Set fields of a frozen dataclass to arrays that nobody can write to."""
+        for name, array in arrays.items():
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
 
 
 def silent(stage: str, fraction: float) -> None:

@@ -20,7 +20,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.shadow import Directions, SeparableTerms
+from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting
@@ -33,15 +33,15 @@ _LARGEST_BASIS = 256
 """Classes whose frames are held to be mixed: 512 MiB of a sensor of 512 pixels."""
 _PROBES = 8
 """Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`_probes`."""
-_SHADOWS = 24
-"""Shadows kept; chosen above what one plan asks for again, a few MiB each."""
 _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+_shadow = lru_cache(maxsize=24)(shadow_terms)
+"""The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What one capture casts on the sensor.
+    """What one shot casts on the sensor.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class FrameOptics:
         self._layers = [
             [
                 (_stack(left, weights), _stack(right, weights))
-                for left, right in _shadow(geometry, _Plain.of(rows), _Plain.of(columns), depth, _lines(spectrum))
+                for left, right in _shadow(geometry, rows, columns, depth, spectrum)
             ]
             for depth in depths
         ]
@@ -197,20 +197,20 @@ class Filed:
     groups: tuple[sparse.csr_array, ...]
 
 
-def frames_in_memory(classes: int, captures: int) -> int:
-    """Frames that :class:`ExpectedFrames` of so many ``classes`` and ``captures`` holds at once."""
-    return (classes if _mixes(classes, captures) else _AT_ONCE) + _AT_ONCE
+def frames_in_memory(classes: int, shots: int) -> int:
+    """Frames that :class:`ExpectedFrames` of so many ``classes`` and ``shots`` holds at once."""
+    return (classes if _mixes(classes, shots) else _AT_ONCE) + _AT_ONCE
 
 
-def _mixes(classes: int, captures: int) -> bool:
-    return classes <= min(_LARGEST_BASIS, captures)
+def _mixes(classes: int, shots: int) -> bool:
+    return classes <= min(_LARGEST_BASIS, shots)
 
 
 class ExpectedFrames:
-    """Frames of every capture of a family, each with the Monte Carlo variance of its mean; iterate as often as needed.
+    """Frames of every shot of a family, each with the Monte Carlo variance of its mean; iterate as often as needed.
 
     Light is linear, so the frames are formed once for a *basis* of light distributions and mixed: the classes of
-    projector pixels that a family always lights together. A family with too many classes is formed capture by capture
+    projector pixels that a family always lights together. A family with too many classes is formed shot by shot
     and never held in memory as a whole.
 
     The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``; with one group there is
@@ -223,11 +223,11 @@ class ExpectedFrames:
         light of the same rows (projector pixels, or classes of them), filed in one kind of cells or more; their groups
         are paired.
     lighting
-        class of each row, and the fraction of full power that each class emits in each capture.
+        class of each row, and the fraction of full power that each class emits in each shot.
     seed
         of the random signs.
     ambient
-        light (1, cells) of every capture, its groups paired with those of ``lights``.
+        light (1, cells) of every shot, its groups paired with those of ``lights``.
     glint
         frames to be added to those of some classes.
     """
@@ -242,9 +242,9 @@ class ExpectedFrames:
     ) -> None:
         self._lights, self._ambient, self._glint = tuple(lights), tuple(ambient), glint
         self._seed, self._weights = seed, lighting.weights
-        (captures, classes), rows = lighting.weights.shape, lighting.labels.size
+        (shots, classes), rows = lighting.weights.shape, lighting.labels.size
         indicator = sparse.csr_array((np.ones(rows), (lighting.labels, np.arange(rows))), shape=(classes, rows))
-        self._mixed = _mixes(classes, captures)
+        self._mixed = _mixes(classes, shots)
         self._shares = np.eye(classes) if self._mixed else self._weights
         self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(self._weights) @ indicator)
         self._formed: tuple[FloatArray, FloatArray] | None = None
@@ -334,7 +334,7 @@ def _probes(pixels: int, seed: int) -> FloatArray:
 
 
 def _mix(weights: FloatArray, basis: FloatArray) -> FloatArray:
-    """(captures, ...) sums of (B, ...) basis arrays by weights (captures, B)."""
+    """(shots, ...) sums of (B, ...) basis arrays by weights (shots, B)."""
     flat = basis.reshape(len(basis), -1)
     mixed = np.empty((len(weights), flat.shape[1]))
 
@@ -367,35 +367,6 @@ def _aligned(flat: IntArray, parts: Sequence[tuple[IntArray, FloatArray]]) -> Fl
     for line, (places, light) in zip(values, parts, strict=True):
         line[order[np.searchsorted(flat[order], places)]] = light
     return values
-
-
-@dataclass(frozen=True)
-class _Plain:
-    """Directions as plain values, which compare and hash."""
-
-    centres: bytes
-    width: float
-
-    @classmethod
-    def of(cls, directions: Directions) -> _Plain:
-        return cls(directions.centres.tobytes(), directions.width)
-
-    @property
-    def directions(self) -> Directions:
-        return Directions(np.frombuffer(self.centres), self.width)
-
-
-def _lines(spectrum: Spectrum | None) -> tuple[bytes, bytes] | None:
-    return None if spectrum is None else (spectrum.wavelengths_nm.tobytes(), spectrum.weights.tobytes())
-
-
-@lru_cache(maxsize=_SHADOWS)
-def _shadow(
-    geometry: CameraGeometry, rows: _Plain, columns: _Plain, depth: float, lines: tuple[bytes, bytes] | None
-) -> SeparableTerms:
-    """The mask's shadow; the last few are kept, for a plan asks for the same ones many times."""
-    spectrum = None if lines is None else Spectrum(np.frombuffer(lines[0]), np.frombuffer(lines[1]))
-    return shadow_terms(geometry, rows.directions, columns.directions, depth, spectrum)
 
 
 def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.profile import Steps
 from mitsim.rig.camera import CameraGeometry
@@ -39,7 +39,7 @@ _WIDE = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Directions:
+class Directions(ByValue):
     """Directions along one axis, seen from the sensor's centre: equal cells, or points.
 
     Attributes
@@ -59,8 +59,7 @@ class Directions:
             raise MitsimError(f"directions of shape {centres.shape} are not finite increasing numbers; sort them")
         if not (np.isfinite(self.width) and self.width >= 0):
             raise MitsimError(f"width of directions is {self.width}; give a finite tan-angle, 0 for points")
-        centres.flags.writeable = False
-        object.__setattr__(self, "centres", centres)
+        self._hold(centres=centres)
 
     @classmethod
     def cells(cls, edges: npt.ArrayLike) -> Directions:
@@ -71,10 +70,6 @@ class Directions:
         if np.abs(widths - width).max() > 1e-6 * width:
             raise MitsimError(f"cells of width {widths.min()} to {widths.max()} are not equal; give equal ones")
         return cls((array[:-1] + array[1:]) / 2, width)
-
-    def same_as(self, columns: Directions) -> bool:
-        """Whether ``columns`` are these, so that one shadow serves both axes."""
-        return self is columns or (self.width == columns.width and np.array_equal(self.centres, columns.centres))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +157,7 @@ def both_axes(
     terms = shadow.mask.terms
     row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
     left = axis(row_profiles, rows)
-    if rows.same_as(columns) and np.array_equal(row_profiles, column_profiles):
+    if rows == columns and np.array_equal(row_profiles, column_profiles):
         return left, left
     return left, axis(column_profiles, columns)
 

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 
 MaskKind = Literal["separable", "flatcam", "open"]
@@ -30,7 +30,7 @@ _TAPS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Mask:
+class Mask(ByValue):
     """An opaque plate with a square grid of features, each open or closed; MitsimError for values out of range.
 
     Attributes
@@ -59,9 +59,7 @@ class Mask:
             raise MitsimError(
                 f"mask code of shape {bits.shape} is not a list of 0 and 1; give one such number a feature"
             )
-        frozen = bits.astype(np.int8)
-        frozen.flags.writeable = False
-        object.__setattr__(self, "bits", frozen)
+        self._hold(bits=bits.astype(np.int8))
 
     @property
     def extent_mm(self) -> float:

@@ -1,7 +1,7 @@
-"""Pattern families: from a name such as ``dots:7`` to the factors P_L, P_R and the captures that show every pattern.
+"""Pattern families: from a name such as ``dots:7`` to the factors P_L, P_R and the shots that show every pattern.
 
 Pattern (i, j) is ``P_L[:, i] P_R[:, j]^T`` over the projector's n x n pixels (paper, section III-B). A family with
-values +-1 cannot be projected as it is: each of its patterns is captured twice, as (1 + P)/2 and (1 - P)/2, and the
+values +-1 cannot be projected as it is: each of its patterns is shown twice, as (1 + P)/2 and (1 - P)/2, and the
 measurement is the difference.
 """
 
@@ -35,20 +35,20 @@ class Capture:
 
     @property
     def names(self) -> tuple[str, int, int, int]:
-        """Names of the capture's random streams."""
+        """Names of the shot's random streams."""
         return ("capture", self.row, self.column, self.sign)
 
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Which light belongs together, and how much of it each capture shows.
+    """Which light belongs together, and how much of it each shot shows.
 
     Attributes
     ----------
     labels
         (n^2,) class of each projector pixel, 0 to C - 1; or of each row of light, where pixels share rows.
     weights
-        (captures, C) fraction 0..1 of full power that each class emits in each capture.
+        (shots, C) fraction 0..1 of full power that each class emits in each shot.
     """
 
     labels: Labels
@@ -56,7 +56,7 @@ class Lighting:
 
     @classmethod
     def uniform(cls, n: int) -> Lighting:
-        """One capture with each of ``n`` x ``n`` projector pixels fully lit."""
+        """One shot with each of ``n`` x ``n`` projector pixels fully lit."""
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
     def shots(self, chosen: list[int] | npt.NDArray[np.int64]) -> Lighting:
@@ -98,24 +98,23 @@ class PatternFamily:
             Capture(i, j, sign) for i in range(self.left.shape[1]) for j in range(self.right.shape[1]) for sign in signs
         )
 
-    def light(self, capture: Capture) -> FloatArray:
-        """(n, n) fraction 0..1 of full power that each projector pixel emits in one ``capture``."""
-        pattern = np.outer(self.left[:, capture.row], self.right[:, capture.column]).astype(np.float64)
-        return np.asarray(pattern if capture.sign == 0 else (1 + capture.sign * pattern) / 2)
+    def light(self, shot: Capture) -> FloatArray:
+        """(n, n) fraction 0..1 of full power that each projector pixel emits in one ``shot``."""
+        pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
+        return np.asarray(pattern if shot.sign == 0 else (1 + shot.sign * pattern) / 2)
 
     @cached_property
     def lighting(self) -> Lighting:
-        """The finest partition of the pixels whose members are always lit alike, and every capture's light of it."""
+        """The finest partition of the pixels whose members are always lit alike, and every shot's light of it."""
         _, row = np.unique(self.left, axis=0, return_inverse=True)
         _, column = np.unique(self.right, axis=0, return_inverse=True)
         label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
         _, first, sorted_label = np.unique(label, return_index=True, return_inverse=True)
-        # Numbered by first appearance, so that shifting dots have one class a capture, in the same order.
+        # Numbered by first appearance, so that shifting dots have one class a shot, in the same order.
         by_appearance = np.argsort(first)
         first, labels = first[by_appearance], np.argsort(by_appearance)[sorted_label.ravel()]
-        captures = self.captures
-        i, j = np.array([c.row for c in captures]), np.array([c.column for c in captures])
-        sign = np.array([c.sign for c in captures])[:, None]
+        i, j, sign = np.array([(shot.row, shot.column, shot.sign) for shot in self.captures]).T
+        sign = sign[:, None]
         pattern = self.left[first // self.n][:, i].T * self.right[first % self.n][:, j].T.astype(np.float64)
         return Lighting(labels, np.where(sign == 0, pattern, (1 + sign * pattern) / 2))
 

@@ -9,15 +9,15 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 
-_UNIT = 1e-3
-"""How far shares may sum from 1: three written digits."""
+_ROUNDING = 1e-6
+"""How far the weights of a spectrum may sum from 1: six written digits."""
 
 
 @dataclass(frozen=True, eq=False)
-class Spectrum:
+class Spectrum(ByValue):
     """Wavelengths and the share of the photons at each; MitsimError for arrays that are none.
 
     Attributes
@@ -39,20 +39,18 @@ class Spectrum:
             )
         if not (np.isfinite(wavelengths).all() and (wavelengths > 0).all()):
             raise MitsimError(f"spectrum has a wavelength of {wavelengths.min()} nm; give finite numbers above 0")
-        if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
+        if not ((weights >= 0).all() and abs(weights.sum() - 1) < _ROUNDING):
             raise MitsimError(
                 f"spectrum weights are at least {weights.min()} and sum to {weights.sum()}; "
                 "give shares of 0 or more that sum to 1"
             )
-        for name, array in (("wavelengths_nm", wavelengths), ("weights", weights)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        self._hold(wavelengths_nm=wavelengths, weights=weights)
 
 
 Nanometres = Annotated[float, Field(ge=1, le=1e6)]
 """Wavelength [nm]: from soft X-rays to a millimetre."""
-Share = Annotated[float, Field(ge=0, le=1)]
-"""Part of a whole."""
+Share = Annotated[float, Field(ge=0, le=1e6)]
+"""Power beside the other lines' power: a millionth is none."""
 
 
 class ProjectorModel(BaseModel):
@@ -70,7 +68,9 @@ class ProjectorModel(BaseModel):
         (), strict=False, max_length=256, description="spectral lines [nm]; none: the effective wavelength"
     )
     """A lamp's visible spectrum in steps of 2 nm has 200; each costs a shadow of its own."""
-    radiant_shares: tuple[Share, ...] = Field((), strict=False, description="part of the power in each line; sum 1")
+    radiant_shares: tuple[Share, ...] = Field(
+        (), strict=False, description="part of the power in each line, relative to their sum"
+    )
     contrast_ratio: float = Field(
         math.inf, gt=1, allow_inf_nan=True, description="light of a white pixel over that of a black one"
     )
@@ -109,8 +109,8 @@ class ProjectorModel(BaseModel):
                 f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares; "
                 "give one share a line"
             )
-        if self.radiant_shares and abs(sum(self.radiant_shares) - 1) > _UNIT:
-            raise ValueError(f"radiant_shares sum to {sum(self.radiant_shares):g}; they must sum to 1")
+        if self.radiant_shares and not sum(self.radiant_shares) > 0:
+            raise ValueError("radiant_shares are all 0; at least one line must have power")
         return self
 
     @model_validator(mode="after")

@@ -149,7 +149,7 @@ def test_equal_edges_make_directions_and_unequal_ones_are_refused():
     at = Directions.cells([-0.2, -0.1, 0.0, 0.1])
     np.testing.assert_allclose(at.centres, [-0.15, -0.05, 0.05], rtol=0, atol=1e-15)
     assert at.width == pytest.approx(0.1)
-    assert at.same_as(Directions([*at.centres], at.width)) and not at.same_as(Directions(at.centres, 0.0))
+    assert at == Directions([*at.centres], at.width) and at != Directions(at.centres, 0.0)
     with pytest.raises(ValueError, match="read-only"):
         at.centres[0] = 1
     with pytest.raises(MitsimError, match="are not equal"):

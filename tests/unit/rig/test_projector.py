@@ -54,12 +54,12 @@ def test_a_value_beyond_any_device_is_refused_with_its_range(field: str, value: 
         validated(ProjectorModel, {**BASE, field: value}, "here")
 
 
-def test_shares_are_parts_of_one() -> None:
-    """They were rescaled in silence."""
+def test_a_spectrum_is_of_photons_and_some_line_has_power() -> None:
+    """Shares are relative to their sum; all 0 gave weights of nan."""
     lines = {**BASE, "wavelengths_nm": [450.0, 600.0]}
-    with pytest.raises(MitsimError, match=r"radiant_shares sum to 0\.9; they must sum to 1"):
-        validated(ProjectorModel, {**lines, "radiant_shares": [0.5, 0.4]}, "here")
-    spectrum = validated(ProjectorModel, {**lines, "radiant_shares": [0.4, 0.6]}, "here").spectrum
+    with pytest.raises(MitsimError, match="radiant_shares are all 0; at least one line must have power"):
+        validated(ProjectorModel, {**lines, "radiant_shares": [0.0, 0.0]}, "here")
+    spectrum = validated(ProjectorModel, {**lines, "radiant_shares": [2.0, 3.0]}, "here").spectrum
     assert spectrum.weights == pytest.approx([180 / 540, 360 / 540])
     assert validated(ProjectorModel, BASE, "here").spectrum.wavelengths_nm.tolist() == [550.0]
 
