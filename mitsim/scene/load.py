@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.check import check_file
+from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 
@@ -31,11 +29,11 @@ class LoadedScene:
 
     path: Path
     files: tuple[Path, ...]
-    scene: Any
-    camera: Any
-    projector: Any
+    scene: mi.Scene
+    camera: mi.Sensor
+    projector: mi.Emitter | None
     grid: ProjectorGrid | None
-    lamps: tuple[Any, ...]
+    lamps: tuple[mi.Emitter, ...]
     mirrors: bool
     glossy: bool
 
@@ -59,18 +57,12 @@ def load_scene(
     MitsimError
         one line that names the file for anything wrong with it.
     """
-    defines = dict(defines or {})
-    files = check_file(path, defines, outside)
-    try:
-        # Without optimize, for that merges rectangles of one material into a mesh that has lost their boxes and names.
-        scene = mi.load_file(str(path), parallel=False, optimize=False, **defines)
-    except MitsimError:
-        raise
-    except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        line = re.search(r"\(line (\d+), col", str(error))
-        place = f"{path}:{line[1]}" if line and str(path) in str(error) else path
-        raise MitsimError(f"{place}: Mitsuba refuses the scene: {_one_line(error)}") from None
-    check_texels(path, scene)
+    checked = check_file(path, defines or {}, outside)
+    checked.config.variant = mi.variant()
+    with looking_beside(checked.outline):
+        scene = mi.parser.instantiate(checked.config, checked.state)
+    check_texels(path, scene, checked.limits)
+    files = checked.files
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
@@ -97,18 +89,8 @@ def load_scene(
     return LoadedScene(path, files, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
 
 
-def _polished(scene: Any) -> tuple[bool, bool]:
+def _polished(scene: mi.Scene) -> tuple[bool, bool]:
     """Whether a surface of the scene has a delta component, and whether one has a glossy component."""
     flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
     delta, glossy = mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy
     return any(mi.has_flag(one, delta) for one in flags), any(mi.has_flag(one, glossy) for one in flags)
-
-
-def _one_line(error: BaseException) -> str:
-    """The last sentence of a Mitsuba message: its first lines repeat the place in Mitsuba's own source."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
-    lines = [re.sub(r"\s+", " ", line).strip(" -*│╰╭─") for line in text.splitlines()]
-    lines = [re.sub(r"^\d{4}-\d\d-\d\d [\d:]+ \w+ +\w* *\[[^\]]*\] *", "", line) for line in lines if line]
-    if "Traceback" in text:  # raised by our own plugin: the last line says what, the rest is Python's stack
-        lines = [re.sub(r" Traceback .*", "", lines[0]), re.sub(r"^[\w.]*Error: ", "", lines[-1])]
-    return " ".join(lines)[:400] if lines else type(error).__name__

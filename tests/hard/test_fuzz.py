@@ -38,7 +38,7 @@ def test_the_scene_that_is_changed_is_good(tmp_path: Path) -> None:
     """With every kind of object, so that few changes reach far."""
     fuzz = Fuzz(tmp_path)
     fuzz.scene.write_text(RICH)
-    assert len(check_file(fuzz.scene, {})) == 5
+    assert len(check_file(fuzz.scene, {}).files) == 5
 
 
 @pytest.mark.parametrize("kind", ["xml", "json"])

@@ -1,32 +1,65 @@
-"""A scene file in, a refusal or the list of its files out: what Mitsuba would crash on, obey or silently accept.
+"""A scene file in, the tree that Mitsuba's parser makes of it out, or a refusal: what Mitsuba would crash on, obey or
+silently accept.
 
-Loading a scene can run native code, read any file or overflow a stack, and it takes NaN, negative light or a
-reflectance of 2 without a word (DESIGN section 9), so the XML and all files that it names are read here first.
-``reading`` gives the elements, ``vocabulary`` the words, ``sanity`` the numbers, ``files`` and ``headers`` the files.
+Making objects of a scene can run native code and read any file, and it takes NaN, negative light or a reflectance of 2
+without a word. So :mod:`mitsim.scene.guard.outline` looks at the bytes, ``mitsuba.parser`` reads them (which loads no
+plugin and needs no variant), and what it read is checked here: ``vocabulary`` knows the plugins, ``limits`` the
+numbers, ``files`` and ``headers`` the files. :func:`mitsim.scene.load.load_scene` makes objects of that same tree.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
+import pydantic
+
+from mitsim.rig.camera import CameraGeometry
+from mitsim.scene.guard import limits
 from mitsim.scene.guard.files import SceneFiles
-from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply, read_spectrum
-from mitsim.scene.guard.reading import DEEPEST, MOST_ELEMENTS, Element, read_scene
-from mitsim.scene.guard.sanity import check_camera, check_numbers, check_reflectance, is_reflectance
-from mitsim.scene.guard.vocabulary import check_words, is_plugin
+from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply
+from mitsim.scene.guard.limits import Range
+from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
+from mitsim.scene.guard.vocabulary import check_plugin
 
 _IMAGES = ("bitmap", "envmap")
+_READERS = (*_IMAGES, "ply", "obj")
 _LARGEST_MATERIAL = 256
-"""Elements of one BSDF: all of them are compiled into every kernel."""
+"""Objects of one BSDF: all of them are compiled into every kernel; shipped materials have up to 4."""
+_Type = mi.Properties.Type
 
 
-def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> tuple[Path, ...]:
-    """Refuse a scene that must not reach Mitsuba, or that lacks a parameter named by ``-D``; else list its files.
+@dataclass(frozen=True)
+class CheckedScene:
+    """A scene that Mitsuba may make objects of.
 
-    The files are the scene, what it includes, its bitmaps, meshes and spectra, each once. They must lie in the scene's
-    folder unless ``outside`` is set.
+    ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
+    the name of the parameter, of the bitmap or of the attribute.
+    """
+
+    outline: Outline
+    config: mi.parser.ParserConfig
+    state: mi.parser.ParserState
+    files: tuple[Path, ...]
+    limits: Mapping[str, Range]
+
+
+def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
+    """Read a scene, and refuse it when it must not become objects or lacks a parameter named by ``defines``.
+
+    Parameters
+    ----------
+    path
+        the scene's XML. What it includes, its bitmaps, meshes and spectra must lie in its folder.
+    defines
+        values of parameters by name, which replace those of ``<default>``.
+    outside
+        allows files outside the scene's folder.
 
     Raises
     ------
@@ -35,124 +68,175 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
         no line is at fault.
     """
     files = SceneFiles(path, outside)
-    root = read_scene(path, defines, files)
-    known: dict[str, Element] = {}
-    texels = 0
-    elements = [*_elements(root, None)]
-    for element, parent in elements:
-        check_words(element, parent)
-    for element, parent in elements:
-        check_numbers(element, parent)
-        _note(element, known)
-        if element.tag == "string":
-            _check_string(element, parent)
-        if element.tag == "spectrum" and "filename" in element.attributes:
-            for _, value in _spectrum(element, files):
-                if value < 0:
-                    raise element.refusal(element.name, value, "light is at least 0")
-        if is_plugin(element) and element.kind in (*_IMAGES, "ply", "obj"):
-            texels += _check_resource(element, files)
-            if texels > MOST_TEXELS:
-                raise element.refusal("texels", texels, f"all bitmaps together may have {MOST_TEXELS}")
-    _check_references(root, known)
-    for element, _ in elements:
-        if element.kind == "mitsim_lensless":
-            check_camera(element)
-        if is_reflectance(element.name):
-            meant = known[element.attributes["id"]] if element.tag == "ref" else element
-            check_reflectance(element.name, meant, lambda child: _spectrum(child, files))
-    return tuple(files.used)
+    outline = Outline(path, defines, files)
+    config = mi.parser.ParserConfig("scalar_rgb")  # any: parsing does not look at it
+    # Without optimize, for that merges rectangles of one material into a mesh that has lost their boxes and names.
+    config.parallel = config.merge_equivalent = config.merge_meshes = False
+    with looking_beside(outline):
+        state = mi.parser.parse_file(config, str(path), **defines)
+        mi.parser.transform_all(config, state)
+    tree = _Tree(outline, files, [mi.parser.SceneNode(node) for node in state.nodes])
+    tree.check()
+    return CheckedScene(outline, config, state, tuple(files.used), tree.limits)
 
 
-def _elements(element: Element, parent: Element | None) -> Iterator[tuple[Element, Element | None]]:
-    """Every element with its parent, in the order of the files; what a file includes belongs to who includes it."""
-    yield element, parent
-    for child in element.children:
-        yield from _elements(child, parent if element.tag == "include" else element)
+@contextmanager
+def looking_beside(outline: Outline) -> Iterator[None]:
+    """Let Mitsuba find files from the folder of the scene of ``outline``; its errors become MitsimError of one line."""
+    before = mi.file_resolver()
+    beside = mi.FileResolver(before)
+    beside.prepend(mi.filesystem.path(str(outline.path.parent)))
+    mi.set_file_resolver(beside)
+    try:
+        yield
+    except (RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise outline.refusal(error) from None
+    finally:
+        mi.set_file_resolver(before)
 
 
-def _note(element: Element, known: dict[str, Element]) -> None:
-    """Remember an element's id, or its other name."""
-    name, meant = element.attributes.get("id", ""), element
-    if element.tag == "ref":
-        return
-    if element.tag == "alias":
-        if name not in known:
-            raise element.refusal("alias", repr(name), "give the id of an element above")
-        name, meant = element.attributes["as"], known[name]
-    if name in known:
-        raise element.refusal("id", repr(name), f"it is that of {known[name].path}:{known[name].line} already")
-    if name:
-        known[name] = meant
+@dataclass
+class _Tree:
+    """Copies of the tree's nodes: Mitsuba takes a property that is read for one that is used."""
+
+    outline: Outline
+    files: SceneFiles
+    nodes: list[mi.parser.SceneNode]
+    limits: dict[str, Range] = field(default_factory=lambda: dict(limits.LIMITS))
+    texels: int = 0
+
+    def check(self) -> None:
+        """MitsimError for the first object that a scene cannot have."""
+        for node in self.nodes:
+            tag, plugin = self.outline.tag(node), node.props.plugin_name()
+            check_plugin(tag, plugin)
+            for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
+                self._check_property(node, name)
+            if plugin in _READERS:
+                self._check_resource(node)
+            if plugin == "mitsim_lensless":
+                self._check_camera(node)
+        self._check_sizes()
+
+    def _check_property(self, node: mi.parser.SceneNode, name: str) -> None:
+        tag, kind, plugin = self.outline.tag(node, name), node.props.type(name), node.props.plugin_name()
+        if kind == _Type.Transform:
+            matrix = np.array(_words(node, name), dtype=np.float64).reshape(4, 4)
+            limits.check_transform(tag, name, matrix, name == "to_world" and plugin in ("mitsim_lensless", "projector"))
+        elif kind == _Type.ResolvedReference:
+            if name in limits.LIMITS:
+                self._check_texture(self._child(node, name), name, limits.LIMITS[name])
+            if plugin == "projector" and name == "irradiance" and "to_uv" in self._child(node, name).props:
+                place = self.outline.tag(self._child(node, name), "to_uv")
+                raise place.refusal(
+                    "to_uv",
+                    "a transform",
+                    "the projector's window is found in the bitmap as it is; remove it, and turn the projector",
+                )
+        elif kind == _Type.String and name not in ("values", "wavelengths"):
+            _check_text(tag, plugin, name, node.props[name])
+        elif kind != _Type.Bool:
+            table = self.outline.tag(node).name in ("texture", "spectrum") and name in limits.TABLES
+            light = table or kind in (_Type.Color, _Type.Spectrum, _Type.String)
+            other = {_Type.Vector: limits.COORDINATE, _Type.Integer: limits.WHOLE}.get(kind, limits.ANY)
+            limits.LIMITS.get(name, limits.LIGHT if light else other).check(tag, name, self._numbers(node, name))
+
+    def _check_texture(self, node: mi.parser.SceneNode, name: str, limit: Range) -> None:
+        """What a texture stands for keeps the limit of the parameter ``name`` that it is given for."""
+        plugin = node.props.plugin_name()
+        if plugin in ("blackbody", "d65") and limit.high <= 1:
+            raise self.outline.tag(node).refusal("type", repr(plugin), f"{name} is no light; give another texture")
+        for meant in (name, node.props.id(), node.props.get("name", "") if plugin == "mesh_attribute" else ""):
+            if meant:
+                known = self.limits.get(meant, limit)
+                self.limits[meant] = min(known, limit, key=lambda one: one.high)
+        for key in limits.TABLES:
+            if key in node.props and node.props.type(key) == _Type.ResolvedReference:
+                self._check_texture(self._child(node, key), key, limit)
+            elif key in node.props:
+                limit.check(self.outline.tag(node, key), name, self._numbers(node, key))
+
+    def _check_resource(self, node: mi.parser.SceneNode) -> None:
+        """The file of a bitmap or mesh."""
+        plugin, tag = node.props.plugin_name(), self.outline.tag(node, "filename")
+        name = node.props.get("filename", None)
+        if not isinstance(name, str):
+            raise tag.refusal("filename", "nothing", f"a {plugin} reads one file")
+        path = self.files.resource(tag, name)
+        try:
+            if plugin in _IMAGES:
+                self.texels += check_image(path)
+            else:
+                (check_ply if plugin == "ply" else check_obj)(path)
+        except (ValueError, OSError) as error:
+            raise tag.refusal("filename", repr(name), f"the file {error}") from None
+        if self.texels > MOST_TEXELS:
+            raise tag.refusal("texels", self.texels, f"all bitmaps together may have {MOST_TEXELS}")
+
+    def _check_camera(self, node: mi.parser.SceneNode) -> None:
+        values = {name: node.props[name] for name in CameraGeometry.model_fields if name in node.props}
+        try:
+            CameraGeometry(**values)
+        except pydantic.ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            name = str((*problem["loc"], "mask_distance")[0])
+            got = values.get(name, "its default")
+            shown = repr(got) if isinstance(got, str) else f"{got:g}"
+            raise self.outline.tag(node, name).refusal(name, shown, problem["msg"]) from None
+
+    def _check_sizes(self) -> None:
+        """What references unfold to is neither deep nor large."""
+        known: dict[int, tuple[int, int]] = {}
+
+        def unfold(index: int, depth: int) -> tuple[int, int]:
+            """Levels and objects from the node downwards, references followed."""
+            node = self.nodes[index]
+            if index not in known and depth <= DEEPEST:
+                parts = [unfold(below, depth + 1) for below in self._below(node)]
+                sides = 2 if node.props.plugin_name() == "twosided" else 1  # each side is a copy
+                deepest = max((levels for levels, _ in parts), default=0)
+                known[index] = 1 + deepest, 1 + sides * sum(size for _, size in parts)
+            levels, size = known.get(index, (DEEPEST + 1, 1))
+            tag = self.outline.tag(node)
+            most = _LARGEST_MATERIAL if tag.name == "bsdf" else MOST_ELEMENTS
+            if levels > DEEPEST or size > most:
+                got = f"{levels} levels of {size} objects with references followed"
+                raise tag.refusal("nesting", got, f"{DEEPEST} levels and {most} objects are allowed")
+            return levels, size
+
+        unfold(0, 0)
+
+    def _below(self, node: mi.parser.SceneNode) -> list[int]:
+        props = node.props
+        return [props[name].index() for name in props.keys() if props.type(name) == _Type.ResolvedReference]  # noqa: SIM118
+
+    def _child(self, node: mi.parser.SceneNode, name: str) -> mi.parser.SceneNode:
+        return self.nodes[node.props[name].index()]
+
+    def _numbers(self, node: mi.parser.SceneNode, name: str) -> list[float]:
+        """Values of a number, point, colour, spectrum or list; wavelengths must rise from above 0."""
+        if node.props.type(name) != _Type.Spectrum:
+            try:
+                return [float(word) for word in _words(node, name)]
+            except ValueError:
+                raise self.outline.tag(node, name).refusal(name, repr(node.props[name]), "give numbers") from None
+        spectrum = node.props[name]
+        limits.WAVELENGTH.check(self.outline.tag(node, name), name, spectrum.wavelengths)
+        return list(spectrum.values)
 
 
-def _check_string(element: Element, parent: Element | None) -> None:
+def _words(node: mi.parser.SceneNode, name: str) -> list[str]:
+    """A property's numbers as text, which needs no variant."""
+    return re.findall(r"[^\s,\[\]\"]+", node.props.as_string(name))
+
+
+def _check_text(tag: Tag, plugin: str, name: str, value: str) -> None:
     """Texts that Mitsuba makes file names of."""
-    name, value = element.name, element.attributes["value"]
     if name == "filename":
-        if parent is None or parent.kind not in (*_IMAGES, "ply", "obj"):
-            raise element.refusal(name, repr(value), "only bitmap, envmap, ply and obj read a file")
+        if plugin not in _READERS:
+            raise tag.refusal(name, repr(value), "only bitmap, envmap, ply and obj read a file")
     elif name == "material":
         if not re.fullmatch(r"[A-Za-z0-9_-]+", value):
-            raise element.refusal(name, repr(value), "give the name of a material, as Au")
+            raise tag.refusal(name, repr(value), "give the name of a material, as Au")
     elif "/" in value or ".." in value:
-        raise element.refusal(name, repr(value), "only filename may hold a path")
-
-
-def _check_resource(element: Element, files: SceneFiles) -> int:
-    """The file of a bitmap or mesh; number of texels."""
-    named = [child for child in element.children if child.tag == "string" and child.name == "filename"]
-    if len(named) != 1:
-        raise element.refusal("filename", f"{len(named)} of them", f"a {element.kind} reads one file")
-    (place,) = named
-    path = files.resource(place, place.attributes["value"])
-    try:
-        if element.kind in _IMAGES:
-            return check_image(path)
-        (check_ply if element.kind == "ply" else check_obj)(path)
-    except (ValueError, OSError) as error:
-        raise place.refusal("filename", repr(place.attributes["value"]), f"the file {error}") from None
-    return 0
-
-
-def _spectrum(element: Element, files: SceneFiles) -> list[tuple[float, float]]:
-    name = element.attributes["filename"]
-    path = files.included(element, name)
-    try:
-        return read_spectrum(path)
-    except (ValueError, OSError) as error:
-        raise element.refusal("filename", repr(name), f"the file {error}") from None
-
-
-def _check_references(root: Element, known: Mapping[str, Element]) -> None:
-    """References lead somewhere, never back, and what they unfold to is neither deep nor large."""
-    found: dict[int, tuple[int, int]] = {}
-    open_: set[int] = set()
-
-    def unfold(element: Element, depth: int) -> tuple[int, int]:
-        """Depth below the element, and number of elements, with references followed."""
-        if element.tag == "ref":
-            name = element.attributes["id"]
-            if name not in known:
-                raise element.refusal("ref", repr(name), "no element has this id")
-            if id(known[name]) in open_:
-                raise element.refusal("ref", repr(name), "it comes back to itself; remove it")
-        if id(element) not in found:
-            below = [known[element.attributes["id"]]] if element.tag == "ref" else element.children
-            if depth > 2 * DEEPEST:
-                raise element.refusal("nesting", f"over {DEEPEST} levels", "flatten the scene")
-            open_.add(id(element))
-            parts = [unfold(child, depth + 1) for child in below]
-            open_.discard(id(element))
-            own = 0 if element.tag in ("ref", "include") else 1
-            sides = 2 if element.kind == "twosided" else 1  # each side is a copy
-            deepest = max((part[0] for part in parts), default=0)
-            found[id(element)] = own + deepest, own + sides * sum(part[1] for part in parts)
-        levels, size = found[id(element)]
-        most = _LARGEST_MATERIAL if element.tag == "bsdf" else MOST_ELEMENTS
-        if levels > DEEPEST or size > most:
-            got = f"{levels} levels of {size} elements with references followed"
-            raise element.refusal("nesting", got, f"{DEEPEST} levels and {most} elements are allowed")
-        return levels, size
-
-    unfold(root, 0)
+        raise tag.refusal(name, repr(value), "only filename may hold a path")

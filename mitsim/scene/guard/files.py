@@ -5,27 +5,29 @@ from __future__ import annotations
 import os
 import stat
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from mitsim.core.errors import MitsimError
 
+if TYPE_CHECKING:
+    from mitsim.scene.guard.outline import Tag
+
 _NATIVE = (".so", ".dylib", ".dll")
 _MOST_BYTES = 512 << 20
-
-
-class Asking(Protocol):
-    """The place in a scene that names a file."""
-
-    path: Path
-
-    def refusal(self, what: str, value: object, rule: str) -> MitsimError:
-        """One line with the place."""
+"""An environment map of 8192 x 4096 texels of float32, as large as one may be, has 400 MiB."""
+_MOST_SPECTRUM = 1 << 20
+"""Some 50 000 lines; measured spectra have 1000."""
 
 
 class SceneFiles:
-    """What one scene may read; ``used`` lists it in the order in which the scene names it.
+    """What one scene may read; ``used`` lists it, the scene first.
 
-    ``outside`` allows files that lie outside the scene's folder.
+    Parameters
+    ----------
+    scene
+        the scene's XML; all else lies in its folder.
+    outside
+        allows files outside that folder.
     """
 
     def __init__(self, scene: Path, outside: bool = False) -> None:
@@ -34,7 +36,7 @@ class SceneFiles:
         self.used: dict[Path, None] = {}
 
     def scene(self, path: Path) -> Path:
-        """The scene itself; MitsimError when it is no plain file, or when native code lies where Mitsuba looks."""
+        """``path`` itself; MitsimError when it is no plain file, or when native code lies where Mitsuba looks."""
         if not path.is_file():
             raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
         self.used[path] = None
@@ -43,29 +45,36 @@ class SceneFiles:
             _check_native(path, folder)
         return path
 
-    def included(self, asking: Asking, name: str) -> Path:
-        """A file of ``<include>`` or of ``<spectrum filename>``: its name counts from the file that names it."""
-        path = self._found(asking, asking.path.parent, name)
-        _check_native(asking.path, path.parent)
+    def included(self, tag: Tag, name: str) -> Path:
+        """The file ``name`` of the ``<include>`` at ``tag``, beside the file that names it; MitsimError as a
+        resource."""
+        path = self._found(tag, tag.path.parent, name)
+        _check_native(tag.path, path.parent)
         return path
 
-    def resource(self, asking: Asking, name: str) -> Path:
-        """A bitmap or mesh: Mitsuba looks for it from the scene's folder, also where an included file names it."""
-        return self._found(asking, self.folder, name)
+    def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
+        """Allow the spectrum ``name`` at ``tag``, where Mitsuba looks for it first; MitsimError as a resource."""
+        if self._found(tag, folder, name).stat().st_size > _MOST_SPECTRUM:
+            raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
 
-    def _found(self, asking: Asking, folder: Path, name: str) -> Path:
+    def resource(self, tag: Tag, name: str) -> Path:
+        """The bitmap or mesh ``name`` at ``tag``: Mitsuba looks for it from the scene's folder, also where an included
+        file names it. MitsimError when it lies elsewhere, or is no plain file of at most 512 MiB."""
+        return self._found(tag, self.folder, name)
+
+    def _found(self, tag: Tag, folder: Path, name: str) -> Path:
         path = folder / name
         try:
             status = path.stat()
             inside = path.resolve().is_relative_to(self.folder.resolve())
         except (OSError, ValueError, RuntimeError):
-            raise asking.refusal("filename", repr(name), f"no such file in {folder}; mend the name") from None
+            raise tag.refusal("filename", repr(name), f"no such file in {folder}; mend the name") from None
         if not (inside or self.outside):
             rule = f"files lie in the scene's folder {self.folder}; copy it there, or use --allow-outside-files"
-            raise asking.refusal("filename", repr(name), rule)
+            raise tag.refusal("filename", repr(name), rule)
         if not stat.S_ISREG(status.st_mode) or not 0 < status.st_size <= _MOST_BYTES:
             rule = f"a plain file of 1 byte to {_MOST_BYTES >> 20} MiB is needed"
-            raise asking.refusal("filename", repr(name), rule)
+            raise tag.refusal("filename", repr(name), rule)
         self.used[path] = None
         return path
 

@@ -1,13 +1,11 @@
-"""What the files of a scene claim to hold, read before Mitsuba allocates it: images, meshes, spectra.
+"""What the files of a scene claim to hold, read before Mitsuba allocates it: images and meshes.
 
 Each function raises ValueError with a sentence that completes "the file ...", or OSError.
 """
 
 from __future__ import annotations
 
-import math
 import re
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ MOST_TEXELS = 1 << 25
 FARTHEST = 1e7
 """Largest coordinate [mm], 10 km: single precision resolves 1 mm there."""
 _HEADER = 1 << 16
+"""Bytes in which a header must end; those of meshes and pictures have some 500."""
 _PLY_TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -39,28 +38,25 @@ _PLY_TYPES = {
     "float64": "f8",
 }
 _MOST_TEXT = 64 << 20
+"""A million vertices with their faces; twice as much is parsed in 5 s."""
 
 
 def check_image(path: Path) -> int:
-    """Number of texels of a PNG, JPEG, OpenEXR, Radiance (.hdr) or PFM image."""
+    """Number of texels of the PNG, JPEG, OpenEXR, Radiance (.hdr) or PFM image at ``path``."""
     with open(path, "rb") as file:
         start = file.read(_HEADER)
-    if start.startswith(b"\x89PNG\r\n\x1a\n") and start[12:16] == b"IHDR" and len(start) >= 24:
-        width, height = struct.unpack(">II", start[16:24])
-    elif start.startswith(exr.MAGIC):
+    if start.startswith(exr.MAGIC):
         header = exr.read_header(path)
         width, height = header.width, header.height
-    elif start.startswith(b"\xff\xd8\xff"):
-        width, height = _jpeg(path)
-    elif found := re.match(rb"#\?[^\n]*\n(?:[^\n]*\n){0,99}?\n?-Y (\d{1,9}) \+X (\d{1,9})\n", start):
-        height, width = int(found[1]), int(found[2])
-    elif found := re.match(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s+", start):
-        width, height = int(found[1]), int(found[2])
+    elif start.startswith(b"#?"):
+        height, width = _two_numbers(rb"-Y (\d{1,9}) \+X (\d{1,9})", _resolution(start))
+    elif start[:2] in (b"PF", b"Pf"):
+        width, height = _two_numbers(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s.*", start)
     else:
-        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
+        width, height = _pillow_size(path, start)
     if width * height == 0 or width * height > MOST_TEXELS:
         raise ValueError(f"has {width}x{height} texels; 1 to {MOST_TEXELS} are allowed")
-    return int(width * height)
+    return width * height
 
 
 def check_ply(path: Path) -> None:
@@ -99,36 +95,36 @@ def check_obj(path: Path) -> None:
     _check_points(points)
 
 
-def read_spectrum(path: Path) -> list[tuple[float, float]]:
-    """Wavelengths [nm] and values of a text file with two numbers a line; ``#`` begins a comment."""
-    if path.stat().st_size > 1 << 20:
-        raise ValueError("is over 1 MiB; a spectrum is smaller")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        pairs = [tuple(map(float, line.split())) for line in lines if line.strip() and not line.startswith("#")]
-    except ValueError:
-        raise ValueError("is no spectrum; give two numbers a line, wavelength in nm and value") from None
-    if len(pairs) < 2 or any(len(pair) != 2 or not all(map(math.isfinite, pair)) for pair in pairs):
-        raise ValueError("is no spectrum; give two finite numbers a line, wavelength in nm and value")
-    return [(pair[0], pair[1]) for pair in pairs]
-
-
 def _check_points(points: npt.NDArray[np.float64]) -> None:
     if not np.isfinite(points).all() or np.abs(points).max(initial=0) > FARTHEST:
         raise ValueError(f"has vertices that are not finite or beyond {FARTHEST:g} mm; mend the mesh")
 
 
-def _jpeg(path: Path) -> tuple[int, int]:
-    """Width and height in the first start-of-frame segment."""
-    data = path.read_bytes()
-    place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[place + 5 : place + 9])
-            return width, height
-        place += 2 + length
-    raise ValueError("is a damaged JPEG image; save it again")
+def _pillow_size(path: Path, start: bytes) -> tuple[int, int]:
+    """Width and height in the header of a PNG or JPEG file. Not by ``PIL.Image.open``, which warns of large images."""
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
+
+    reader = {b"\x89PN": PngImageFile, b"\xff\xd8\xff": JpegImageFile}.get(start[:3])
+    if reader is None:
+        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
+    try:
+        with reader(path) as image:
+            return image.size
+    except (SyntaxError, OSError, ValueError):
+        raise ValueError("is a damaged PNG or JPEG image; save it again") from None
+
+
+def _resolution(start: bytes) -> bytes:
+    """The first line that Mitsuba could take for the size of a Radiance image."""
+    return next((line for line in start.split(b"\n") if b"-Y" in line), b"")
+
+
+def _two_numbers(pattern: bytes, header: bytes) -> tuple[int, int]:
+    match = re.fullmatch(pattern, header, re.DOTALL)
+    if not match:
+        raise ValueError("is a damaged Radiance or PFM image; save it again")
+    return int(match[1]), int(match[2])
 
 
 _Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]

@@ -1,0 +1,265 @@
+"""A scene's bytes in; the place of every tag out, or a refusal of what Mitsuba's parser must not be given.
+
+Mitsuba's parser reads the scene (:mod:`mitsim.scene.guard.check`). Left to this module is what that does not do
+(names of cases in tests/hard/hostile.py): it calls itself for each level, until its stack overflows ("depth of
+100000"). It opens what ``<include>`` and ``<spectrum>`` name while it reads, a pipe or a file outside too ("included
+pipe", "include above"), and each include again ("million includes"); ``<path>`` lets it find native code. It reads
+``$albedo2`` as the value of ``$albedo`` and a 2 ("longer name with a known beginning"), an empty number as 0 ("empty
+number"), and a matrix without its last row ("last row"). Of two objects of one name it takes the second ("name
+twice"). It knows the lines of objects, not those of their numbers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.parsers import expat
+
+from mitsim.core.errors import MitsimError, cut
+from mitsim.scene.guard.files import SceneFiles
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+DEEPEST = 16
+"""Elements inside elements, references followed: shipped scenes have 5; Mitsuba's stack ends at some 10 000."""
+MOST_ELEMENTS = 10_000
+"""Forty times the largest shipped scene; they are read and checked in 0.5 s."""
+_MOST_INCLUDES = 64
+"""Files that one scene is spread over; each is opened and read anew."""
+_DEEPEST_INCLUDE = 8
+"""Below the 15 at which Mitsuba's parser ends."""
+_MOST_BYTES = 4 << 20
+"""``MOST_ELEMENTS`` of 400 bytes."""
+_PARAMETER = re.compile(r"\$([A-Za-z0-9_]*)")
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_VERSION = re.compile(r"[23]\.[0-9]{1,3}\.[0-9]{1,3}")
+_TRIPLES = ("point", "rotate", "scale", "translate", "vector")
+_NUMBERS = (*_TRIPLES, "float", "integer", "lookat", "matrix", "rgb")
+
+
+@dataclass(frozen=True)
+class Tag:
+    """One tag as it is written in a file."""
+
+    path: Path
+    line: int
+    name: str
+    attributes: Mapping[str, str]
+
+    def __str__(self) -> str:
+        written = "".join(f" {key}={cut(text)!r}" for key, text in self.attributes.items())
+        return f"<{cut(self.name + written, 200)}>"
+
+    def refusal(self, what: str, value: object, rule: str) -> MitsimError:
+        """``file:line: what: got value in <tag ...>; rule``, to be raised."""
+        got = cut(value if isinstance(value, str) else f"{value:g}")
+        return MitsimError(f"{self.path}:{self.line}: {cut(what)}: got {got} in {self}; {rule}")
+
+
+class Outline:
+    """Where the tags of a scene and of all that it includes stand.
+
+    Parameters
+    ----------
+    path
+        the scene's XML.
+    defines
+        values of parameters by name, which come before those of ``<default>``.
+    files
+        what the scene may read; takes a note of what is included.
+
+    Raises
+    ------
+    MitsimError
+        for what is no well-formed scene XML, too large or nested too deep, for files that ``files`` does not allow,
+        and for parameters that are missing, unknown or not plain.
+    """
+
+    def __init__(self, path: Path, defines: Mapping[str, str], files: SceneFiles) -> None:
+        self._files = files
+        self._values = dict(defines)
+        self._defaults: set[str] = set()
+        self.path = path
+        self._tags: dict[tuple[int, int, str], Tag] = {}
+        self._places: dict[tuple[str, str, str], Tag] = {}
+        self._opened = self._elements = 0
+        for name, value in defines.items():
+            if "$" in value or "\\" in value or not value.isprintable():
+                raise MitsimError(
+                    f"-D {cut(name)}={cut(value)!r}: give a plain value without $, backslash or line breaks"
+                )
+        self._read(files.scene(path), path.parent, ())
+        for name in defines:
+            if name not in self._defaults or name in ("config", "filename"):  # Mitsuba's own arguments
+                known = ", ".join(sorted(self._defaults)) or "none"
+                place = f"{path} has no <default name={cut(name)!r}>"
+                raise MitsimError(f"-D {cut(name)}={cut(defines[name])}: {place}; it knows {known}")
+
+    def tag(self, node: mi.parser.SceneNode, name: str = "") -> Tag:
+        """The tag of an object, or that of its property ``name``."""
+        key = node.file_index, node.offset
+        return self._tags.get((*key, name)) or self._tags[(*key, "")]
+
+    def refusal(self, error: BaseException) -> MitsimError:
+        """One line for an ``error`` of Mitsuba's, with the last place that it names."""
+        message = one_line(error)
+        places = [*re.finditer(r"[Ww]hile loading (.+?) \(line (\d+), col (\d+)\): ", message)]
+        if not places:
+            return MitsimError(f"{self.path}: Mitsuba refuses the scene: {message}")
+        file, line, column = places[-1].groups()
+        what = self._places.get((file, line, column), "the scene")
+        return MitsimError(f"{file}:{line}: Mitsuba refuses {what}: {message[places[-1].end() :]}")
+
+    def _read(self, path: Path, beside: Path, above: tuple[Path, ...]) -> None:
+        """One file and what it includes; Mitsuba looks for the spectra of a file from ``beside``, its includer."""
+        content = _content(path)
+        file, self._opened = self._opened, self._opened + 1
+        parser = expat.ParserCreate()
+        open_tags: list[int] = []
+
+        def refuse(what: str) -> MitsimError:
+            return MitsimError(f"{path}:{parser.CurrentLineNumber}: {what}")
+
+        def declared(version: str, encoding: str | None, standalone: int) -> None:
+            if encoding is not None and encoding.lower() not in ("utf-8", "us-ascii"):
+                raise refuse(f"encoding: got {cut(encoding)!r}; write the scene in UTF-8")
+
+        def doctype(*_: object) -> None:
+            raise refuse("DTDs and entities are not allowed in a scene; remove <!DOCTYPE ...>")
+
+        def instruction(target: str, _: str) -> None:
+            raise refuse(f"processing instructions are not allowed in a scene; remove <?{cut(target)} ...?>")
+
+        def start(name: str, attributes: dict[str, str]) -> None:
+            self._elements += 1
+            if len(open_tags) >= DEEPEST:
+                raise refuse(f"elements are nested over {DEEPEST} deep (<{cut(name)}>); flatten the scene")
+            if self._elements > MOST_ELEMENTS:
+                raise refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
+            tag = Tag(path, parser.CurrentLineNumber, name, attributes)
+            texts = {key: self._resolved(tag, text) for key, text in attributes.items()}
+            if not open_tags:
+                _check_root(tag, above)
+            elif name not in ("default", "include") and texts.get("name"):
+                key = file, open_tags[-1], texts["name"]
+                if key in self._tags:
+                    raise tag.refusal("name", repr(texts["name"]), f"line {self._tags[key].line} has it already")
+                self._tags[key] = tag
+            open_tags.append(parser.CurrentByteIndex + 1)  # Mitsuba counts to the tag's name
+            self._tags[file, open_tags[-1], ""] = tag
+            self._places[str(path), str(tag.line), str(parser.CurrentColumnNumber + 2)] = tag
+            if name == "path":
+                rule = "it can load native code; remove it and name files relative to the scene"
+                raise tag.refusal("path", repr(texts.get("value", "")), rule)
+            if name == "default":
+                self._default(tag)
+            elif name == "include":
+                self._include(tag, texts.get("filename", ""), (*above, path.resolve()))
+            elif name == "spectrum" and "filename" in texts:
+                self._files.spectrum(tag, beside, texts["filename"])
+            elif name in _NUMBERS:
+                _check_numbers(tag, texts)
+
+        parser.XmlDeclHandler = declared
+        parser.StartDoctypeDeclHandler = doctype
+        parser.ProcessingInstructionHandler = instruction
+        parser.StartElementHandler = start
+        parser.EndElementHandler = lambda _: open_tags.pop()
+        try:
+            parser.Parse(content, True)
+        except expat.ExpatError as error:
+            reason = f"column {error.offset}: {expat.ErrorString(error.code)}"
+            raise MitsimError(f"{path}:{error.lineno}: not well-formed XML ({reason}); mend the file") from None
+        except ValueError as error:  # an encoding that Python does not know
+            raise MitsimError(f"{path}:1: not well-formed XML ({error}); write the scene in UTF-8") from None
+
+    def _resolved(self, tag: Tag, text: str) -> str:
+        """The text with its parameters put in."""
+        if "\\" in text:
+            raise tag.refusal("text", repr(text), "backslashes are not allowed")
+
+        def value(match: re.Match[str]) -> str:
+            if match[1] not in self._values:
+                known = ", ".join(sorted(self._values)) or "none"
+                raise tag.refusal("parameter", match[0], f"parameters that are set by then: {known}")
+            return self._values[match[1]]
+
+        return text if tag.name == "default" else _PARAMETER.sub(value, text)
+
+    def _default(self, tag: Tag) -> None:
+        name, value = (tag.attributes.get(key, "") for key in ("name", "value"))
+        if not _NAME.fullmatch(name) or "$" in value:
+            rule = "its name has letters, digits and _ only, and it has a plain value without $"
+            raise tag.refusal("default", repr(name), rule)
+        self._defaults.add(name)
+        self._values.setdefault(name, value)
+
+    def _include(self, tag: Tag, name: str, above: tuple[Path, ...]) -> None:
+        path = self._files.included(tag, name)
+        if path.resolve() in above:
+            raise tag.refusal("include", path.name, "it comes back to itself; remove one of the two")
+        if self._opened > _MOST_INCLUDES or len(above) > _DEEPEST_INCLUDE:
+            rule = f"{_MOST_INCLUDES} includes, {_DEEPEST_INCLUDE} deep, are allowed; join some"
+            raise tag.refusal("include", path.name, rule)
+        self._read(path, tag.path.parent, above)
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a file of UTF-8."""
+    try:
+        with open(path, "rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise MitsimError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    if len(content) > _MOST_BYTES:
+        raise MitsimError(
+            f"{path}: over {_MOST_BYTES >> 20} MiB; a scene is smaller, its meshes have files of their own"
+        )
+    try:
+        content.decode("utf-8")
+        wrong = content.find(b"\0")  # where Mitsuba's parser would end
+    except UnicodeDecodeError as error:
+        wrong = error.start
+    if wrong >= 0:
+        line = content.count(b"\n", 0, wrong) + 1
+        raise MitsimError(f"{path}:{line}: not well-formed XML (no UTF-8, or a zero byte); write the scene in UTF-8")
+    return content
+
+
+def _check_root(tag: Tag, above: tuple[Path, ...]) -> None:
+    if tag.name != "scene" and not above:
+        place = f"{tag.path}:{tag.line}"
+        raise MitsimError(f"{place}: the root element is <{cut(tag.name)}>; a Mitsuba scene starts with <scene>")
+    version = tag.attributes.get("version", "")
+    if not _VERSION.fullmatch(version):
+        raise tag.refusal("version", version or "none", 'give the scene version="3.0.0"; 2 and 3 are read')
+
+
+def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
+    """What Mitsuba's parser takes without a word, or refuses without its line."""
+    name, words = texts.get("name", tag.name), re.split(r"[\s,]+", texts.get("value", "").strip())
+    for text in texts.values():
+        if not text.strip():
+            raise tag.refusal(name, repr(text), "give a number")
+    if tag.name in _TRIPLES and "value" in texts and (len(words) not in (1, 3) or {"x", "y", "z"} & texts.keys()):
+        raise tag.refusal(name, repr(texts["value"]), "give value with 1 or 3 numbers, or x, y and z")
+    if (
+        tag.name == "matrix"
+        and len(words) == 16
+        and not re.fullmatch(r"([+-]?0*\.?0* ){3}[+]?0*1\.?0*", " ".join(words[12:]))
+    ):
+        raise tag.refusal("matrix", f"last row {' '.join(words[12:])}", "it must be 0 0 0 1")
+
+
+def one_line(error: BaseException) -> str:
+    """The last sentence of an ``error`` of Mitsuba's: its first lines repeat the place in Mitsuba's own source."""
+    text = re.sub(r"\x1b\[[0-9;]*m|\[\w+\.cpp:\d+\] ", "", str(error))
+    lines = [re.sub(r"\s+", " ", line).strip(" -*│╰╭─") for line in text.splitlines()]
+    lines = [re.sub(r"^\d{4}-\d\d-\d\d [\d:]+ \w+ +\w* *\[[^\]]*\] *", "", line) for line in lines if line]
+    if "Traceback" in text:  # raised by our own plugin: the last line says what, the rest is Python's stack
+        lines = [re.sub(r" Traceback .*", "", lines[0]), re.sub(r"^[\w.]*Error: ", "", lines[-1])]
+    return " ".join(lines)[:400] if lines else type(error).__name__
