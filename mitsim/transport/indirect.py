@@ -13,36 +13,41 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import Deposits
-from mitsim.transport.paths import Walk, camera_part, survival, walked
-from mitsim.transport.rays import ProjectorRays
-from mitsim.transport.receiver import Receiver
+from mitsim.transport.paths import LEAST_CHANCE, Tracer, Walk, camera_part, survival
+from mitsim.transport.receiver import Receiver, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
-from mitsim.transport.source import Projector
+from mitsim.transport.source import Projector, ProjectorRays
 
 
-class IndirectTracer:
-    """Prepared once for a scene and a projector; each seed is an independent estimate."""
+class IndirectTracer(Tracer):
+    """Indirect light of a projector, and its caustics, at the sensor's centre."""
 
     def __init__(
         self,
-        scene: Any,
-        camera: Any,
+        scene: mi.Scene,
+        camera: mi.Sensor,
         projector: Projector,
         mirrors: bool,
         interreflection: bool,
         geometry: CameraGeometry | None = None,
     ) -> None:
-        """``mirrors``: paths over delta reflections and transmissions; ``interreflection``: over other surfaces.
+        """Which paths are followed.
 
-        ``geometry`` stands in for the camera's own.
+        Parameters
+        ----------
+        scene, camera, projector
+            what light meets, the sensor it is received on, and where it comes from.
+        mirrors
+            over delta reflections and transmissions.
+        interreflection
+            over other surfaces.
+        geometry
+            stands in for the camera's own.
         """
         self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
@@ -52,15 +57,8 @@ class IndirectTracer:
         """Paths of one sample: one per projector pixel."""
         return self.projector.n**2
 
-    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
-        """Samples ``first`` .. ``first + samples - 1`` of every pixel, as if ``samples`` of them were all.
-
-        Raises
-        ------
-        MitsimError
-            when the scene sends NaN or infinite light to the camera.
-        """
-        return walked(partial(_Walk, self, seed), self.lanes, first, samples)
+    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        return _Walk(self, seed, sample, lane).deposits(further=True)
 
 
 class _Walk(Walk):
@@ -68,13 +66,13 @@ class _Walk(Walk):
 
     STATE = ("active", "ray", "strength", "bounce", "scattered", "rng", "kept")
 
-    def __init__(self, tracer: IndirectTracer, seed: int, sample: Any, pixel: Any) -> None:
+    def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> None:
         super().__init__()
         self.tracer, self.scene, self.pixel = tracer, tracer.scene, pixel
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, self.rng = streams(seed, pixel, sample)
         self.first_turn = stratified(sample, shared)
-        wavelengths, spectral = tracer.receiver.wavelengths(self.rng)
+        wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, self.rng)
         jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         self.ray = tracer.rays.sample(pixel, jitter, self.rng, wavelengths)
         self.flux = tracer.rays.flux(pixel, wavelengths) * spectral
@@ -88,17 +86,16 @@ class _Walk(Walk):
             self._connect(si)
         self._leave(si, first)
 
-    def _connect(self, si: Any) -> None:
+    def _connect(self, si: mi.SurfaceInteraction3f) -> None:
         """Light that this surface sends to the sensor's centre."""
-        found = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active)
-        value = panchromatic(found.irradiance * self.flux * self.strength)
+        reception = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active)
+        value = panchromatic(reception.irradiance * self.flux * self.strength)
         caustic = self.scattered == 0
-        value *= dr.select(caustic, 1, 1 - camera_part(found.pdf))
+        value *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
-            light = dr.select(chosen, value, 0)
-            self.keep(kind, light, self.pixel, found.tau_row, found.tau_column, found.near, self.rng)
+            self.keep(kind, reception.sightings(dr.select(chosen, value, 0), self.pixel), self.rng)
 
-    def _leave(self, si: Any, first: bool) -> None:
+    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
         toward = -self.ray.d
         si.wi = si.to_local(toward)
@@ -121,7 +118,7 @@ class _Walk(Walk):
         if not first:
             chance = survival(self.strength, (self.scattered == 0) & delta, self.bounce)
             going &= self.rng.next_float32() < chance
-            self.strength *= dr.rcp(dr.maximum(chance, 1e-6))
+            self.strength *= dr.rcp(dr.maximum(chance, LEAST_CHANCE))
         self.active = going & (dr.max(self.strength) > 0)
         self.scattered += dr.select(delta, mi.UInt32(0), mi.UInt32(1))
         self.ray = si.spawn_ray(onward)
