@@ -1,6 +1,6 @@
 """Glint: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors alone.
 
-A path projector - mirror - sensor has a delta at both ends, so no camera-side path finds it: it is traced from the
+A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
 projector instead (:mod:`mitsim.transport.mirrors`). Rays go through a grid of points of each projector pixel. Four
 neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided
 until the map from the projector's window to the sensor is bilinear over each. :mod:`mitsim.optics.beams` turns beams

@@ -29,7 +29,7 @@ from mitsim.transport.cells import CellAxis, CellGrid
 from mitsim.transport.connection import ProjectorConnector
 from mitsim.transport.coordinates import x_y
 from mitsim.transport.histogram import Deposits, Sightings
-from mitsim.transport.paths import LEAST_CHANCE, Tracer, Walk, camera_part, survival
+from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.receiver import sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 from mitsim.transport.source import Projector
@@ -63,19 +63,7 @@ class CameraTracer(Tracer):
         paths: Paths,
         geometry: CameraGeometry | None = None,
     ) -> None:
-        """Which paths are followed.
-
-        Parameters
-        ----------
-        scene, camera, projector
-            what light meets, the sensor it is received on, and a light that it comes from.
-        grid
-            cells of directions that paths start in, one each.
-        paths
-            which light.
-        geometry
-            stands in for the camera's own.
-        """
+        """Paths start in the cells of ``grid``, one each; ``geometry`` stands in for the camera's own."""
         self.geometry: CameraGeometry = geometry or camera.geometry
         self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
         self.connector = ProjectorConnector(projector)
@@ -98,9 +86,9 @@ class _Walk(Walk):
     )
 
     def __init__(self, tracer: CameraTracer, seed: int, sample: mi.UInt32, cell: mi.UInt32) -> None:
-        super().__init__()
+        super().__init__(tracer.scene, tracer.paths.mirrors, tracer.paths.interreflection)
         self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
-        self.scene, self.connector = tracer.scene, tracer.connector
+        self.connector = tracer.connector
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
         shared, self.rng = streams(seed, cell, sample)
         jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, shared)
@@ -156,7 +144,7 @@ class _Walk(Walk):
         for emitter in self.paths.emitters:
             self._light(si, bsdf, emitter)
         if self.paths.mirrors or self.paths.interreflection:
-            self._leave(si, bsdf, first)
+            self._leave(si, first)
 
     def _connect(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
         """Light of the projector that this vertex sends on along its path."""
@@ -179,7 +167,7 @@ class _Walk(Walk):
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
         # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
         share = dr.select(ds.delta, 1, self._share(ds.pdf, pdf)) if self.paths.interreflection else 1
-        self._keep("ambient", active, self._radiance(value * light) * share, self._lamps())
+        self._keep_seen("ambient", active, self._radiance(value * light) * share, self._lamps())
 
     def _emitter_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a lamp that the path has run into."""
@@ -190,7 +178,7 @@ class _Walk(Walk):
         ds = mi.DirectionSample3f(self.scene, si, before)
         pdf = emitter.pdf_direction(before, ds, lamp & ~self.by_delta)
         share = dr.select(self.by_delta, 1, self._share(self.came_pdf, pdf))
-        self._keep("ambient", lamp, self._radiance(emitter.eval(si, lamp)) * share, self._lamps())
+        self._keep_seen("ambient", lamp, self._radiance(emitter.eval(si, lamp)) * share, self._lamps())
 
     def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a projector's lens that the path has run into.
@@ -203,29 +191,17 @@ class _Walk(Walk):
         share = dr.select(self.by_delta, 1, self._share(self.came_pdf, hit.pdf))
         self._keep_of_projector(hit.met, self._radiance(hit.radiance) * share, hit.pixel, self.surfaces - 1)
 
-    def _leave(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, first: bool) -> None:
+    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
-        number = self.rng.next_float32()
-        point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        sample, value = bsdf.sample(mi.BSDFContext(), si, number, point, self.active)
-        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        going = self.active & (sample.pdf > 0)
-        if not self.paths.interreflection:
-            going &= delta
-        elif not self.paths.mirrors:
-            going &= ~delta
+        sample, value, going = self._sampled(si, mi.TransportMode.Radiance)
+        delta = is_delta(sample)
         if first:
             self.in_mirror = mi.Bool(delta)
             self.part = dr.select(delta, 1, camera_part(sample.pdf))
             if not self.paths.emitters:
                 going &= self.part > 0
-        self.strength *= mi.unpolarized_spectrum(value)
-        self.bounce += 1
-        if not first:
-            chance = survival(self.strength, self.mirrored, self.bounce)
-            going &= self.rng.next_float32() < chance
-            self.strength *= dr.rcp(dr.maximum(chance, LEAST_CHANCE))
-        self.active = going & (dr.max(self.strength) > 0)
+        self.strength *= value
+        self._end_some(going, self.mirrored, first)
         self.mirrored &= delta
         self.surfaces = dr.select(delta, self.surfaces, self.surfaces + 1)
         self.travelled += si.t
@@ -248,13 +224,13 @@ class _Walk(Walk):
 
     def _keep_of_projector(self, active: mi.Bool, value: mi.Float, pixel: mi.UInt32, surfaces: mi.UInt32) -> None:
         """``surfaces``: those on the light's way that are no mirrors."""
-        self._keep("direct", active & (surfaces == 1), value * self.part, pixel)
+        self._keep_seen("direct", active & (surfaces == 1), value * self.part, pixel)
         if self.paths.interreflection:
-            self._keep("indirect", active & (surfaces > 1), value * self.part, pixel)
+            self._keep_seen("indirect", active & (surfaces > 1), value * self.part, pixel)
 
-    def _keep(self, kind: str, active: mi.Bool, value: mi.Float, pixel: mi.UInt32) -> None:
+    def _keep_seen(self, kind: str, active: mi.Bool, value: mi.Float, pixel: mi.UInt32) -> None:
         light = dr.select(active, value, 0)
-        self.keep(kind, Sightings(light, pixel, self.row, self.column, self.inverse_depth), self.rng)
+        self._keep(kind, Sightings(light, pixel, self.row, self.column, self.inverse_depth))
 
 
 def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:

@@ -36,20 +36,10 @@ class DirectTracer(Tracer):
         spread: bool = False,
         pixels: IntArray | None = None,
     ) -> None:
-        """What is lit, and from where it is seen.
+        """``anchors``: sensor points a side that light is connected to; ``geometry`` stands in for the camera's own.
 
-        Parameters
-        ----------
-        scene, camera, projector
-            what light meets, the sensor it is received on, and where it comes from.
-        anchors
-            sensor points a side that every lit point is connected to.
-        geometry
-            stands in for the camera's own.
-        spread
-            connects to random points of the sensor instead, all filed as one anchor: the mean over the sensor.
-        pixels
-            (m,) pixels of the projector that are traced; all of them without it.
+        ``spread`` connects to random points of the sensor, all filed as one anchor: the mean over the sensor.
+        ``pixels`` (m,) are those of the projector that are traced, all of them without it.
         """
         self._pixels = np.arange(projector.n**2) if pixels is None else pixels
         self.scene, self.projector, self.anchors, self.spread = scene, projector, anchors, spread

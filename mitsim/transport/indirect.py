@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import Deposits
-from mitsim.transport.paths import LEAST_CHANCE, Tracer, Walk, camera_part, survival
+from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.receiver import Receiver, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 from mitsim.transport.source import Projector, ProjectorRays
@@ -36,18 +36,9 @@ class IndirectTracer(Tracer):
         interreflection: bool,
         geometry: CameraGeometry | None = None,
     ) -> None:
-        """Which paths are followed.
+        """``mirrors``: paths over delta reflections and transmissions; ``interreflection``: over other surfaces.
 
-        Parameters
-        ----------
-        scene, camera, projector
-            what light meets, the sensor it is received on, and where it comes from.
-        mirrors
-            over delta reflections and transmissions.
-        interreflection
-            over other surfaces.
-        geometry
-            stands in for the camera's own.
+        ``geometry`` stands in for the camera's own.
         """
         self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
@@ -67,8 +58,8 @@ class _Walk(Walk):
     STATE = ("active", "ray", "strength", "bounce", "scattered", "rng", "kept")
 
     def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> None:
-        super().__init__()
-        self.tracer, self.scene, self.pixel = tracer, tracer.scene, pixel
+        super().__init__(tracer.scene, tracer.mirrors, tracer.interreflection)
+        self.tracer, self.pixel = tracer, pixel
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, self.rng = streams(seed, pixel, sample)
         self.first_turn = stratified(sample, shared)
@@ -93,32 +84,19 @@ class _Walk(Walk):
         caustic = self.scattered == 0
         value *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
-            self.keep(kind, reception.sightings(dr.select(chosen, value, 0), self.pixel), self.rng)
+            self._keep(kind, reception.sightings(dr.select(chosen, value, 0), self.pixel))
 
     def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
         toward = -self.ray.d
         si.wi = si.to_local(toward)
-        number, point = self.rng.next_float32(), mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        point = self.first_turn if first else point
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        sample, value = si.bsdf().sample(context, si, number, point, self.active)
-        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        going = self.active & (sample.pdf > 0)
-        if not self.tracer.interreflection:
-            going &= delta
-        elif not self.tracer.mirrors:
-            going &= ~delta
+        sample, value, going = self._sampled(si, mi.TransportMode.Importance, self.first_turn if first else None)
+        delta = is_delta(sample)
         onward = si.to_world(sample.wo)
         # Light that is followed forward sees shading normals the other way round (Veach 1997, 5.3).
         turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
         turned /= mi.Frame3f.cos_theta(sample.wo) * dr.dot(si.n, toward)
-        self.strength *= mi.unpolarized_spectrum(value) * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
-        self.bounce += 1
-        if not first:
-            chance = survival(self.strength, (self.scattered == 0) & delta, self.bounce)
-            going &= self.rng.next_float32() < chance
-            self.strength *= dr.rcp(dr.maximum(chance, LEAST_CHANCE))
-        self.active = going & (dr.max(self.strength) > 0)
+        self.strength *= value * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
+        self._end_some(going, (self.scattered == 0) & delta, first)
         self.scattered += dr.select(delta, mi.UInt32(0), mi.UInt32(1))
         self.ray = si.spawn_ray(onward)

@@ -96,7 +96,7 @@ class MirrorTracer:
     """Follows rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
 
     At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends
-    there: that light is the camera-side estimators'.
+    there: that light is found from the camera.
     """
 
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: Projector, max_depth: int) -> None:

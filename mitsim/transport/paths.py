@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -28,7 +28,7 @@ _LONGEST = 0.999
 In a closed room of reflectance rho the light of a path grows by rho / chance a reflection, and its second moment is
 finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the light at reflectance 0.99, 79 % at 0.999.
 """
-LEAST_CHANCE = 1e-6
+_LEAST_CHANCE = 1e-6
 """Strength is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
 
@@ -60,19 +60,9 @@ def camera_part(pdf: mi.Float) -> mi.Float:
     return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)
 
 
-def survival(strength: mi.Spectrum, mirrored: mi.Bool, bounce: mi.UInt32) -> mi.Float:
-    """Chance that a path goes on: what it still carries; chains of mirrors are short and full of light.
-
-    Parameters
-    ----------
-    strength
-        part of its light that the path carries.
-    mirrored
-        whether it has met mirrors alone.
-    bounce
-        surfaces that it has left.
-    """
-    return dr.select(mirrored & (bounce < _MIRRORS), 1, dr.minimum(dr.max(strength), _LONGEST))
+def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
+    """Whether the direction of ``sample`` is a mirror's, or straight on."""
+    return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
 
 
 class Tracer(ABC):
@@ -115,26 +105,50 @@ class Walk(ABC):
 
     STATE: ClassVar[tuple[str, ...]]
 
-    def __init__(self) -> None:
+    active: mi.Bool
+    strength: mi.Spectrum
+    bounce: mi.UInt32
+    rng: mi.PCG32
+
+    def __init__(self, scene: mi.Scene, mirrors: bool, interreflection: bool) -> None:
+        """``mirrors``: paths over delta reflections and transmissions; ``interreflection``: over other surfaces."""
+        self.scene, self.mirrors, self.interreflection = scene, mirrors, interreflection
         self.kept = {kind: Sightings.none() for kind in _KINDS}
 
     @abstractmethod
     def vertex(self, first: bool) -> None:
         """Find the next surface of every path (its ``first`` or a later one), connect it, and leave it."""
 
-    def keep(self, kind: str, seen: Sightings, rng: mi.PCG32) -> None:
-        """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both.
+    def _keep(self, kind: str, seen: Sightings) -> None:
+        """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
+        self.kept[kind] = self.kept[kind].joined_by(seen, self.rng)
 
-        Parameters
-        ----------
-        kind
-            "direct", "indirect" or "ambient".
-        seen
-            the connection's light.
-        rng
-            random numbers that choose.
+    def _sampled(
+        self, si: mi.SurfaceInteraction3f, mode: mi.TransportMode, chosen: mi.Point2f | None = None
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum, mi.Bool]:
+        """Where each path could go on, the light it would keep, and whether such turns are followed.
+
+        The point ``chosen`` stands in for a random one.
         """
-        self.kept[kind] = self.kept[kind].joined_by(seen, rng)
+        number, point = self.rng.next_float32(), mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        point = point if chosen is None else chosen
+        sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, self.active)
+        going = self.active & (sample.pdf > 0)
+        if not self.interreflection:
+            going &= is_delta(sample)
+        elif not self.mirrors:
+            going &= ~is_delta(sample)
+        return sample, mi.unpolarized_spectrum(value), going
+
+    def _end_some(self, going: mi.Bool, mirrored: mi.Bool, first: bool) -> None:
+        """Go on with a chance: what a path still carries; but chains of mirrors are short and full of light."""
+        self.bounce += 1
+        if not first:
+            carried = dr.minimum(dr.max(self.strength), _LONGEST)
+            chance = dr.select(mirrored & (self.bounce < _MIRRORS), 1, carried)
+            going &= self.rng.next_float32() < chance
+            self.strength *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
+        self.active = going & (dr.max(self.strength) > 0)
 
     def deposits(self, further: bool) -> list[Deposits]:
         """Light on the host of every path, followed to its end or, unless ``further``, to the first surface only."""
@@ -144,14 +158,14 @@ class Walk(ABC):
         dr.eval(self.kept)
         return [Deposits.fetched(seen, _KINDS[kind]) for kind, seen in self.kept.items()]
 
-    def _body(self, *values: Any) -> tuple[Any, ...]:
+    def _body(self, *values: object) -> tuple[object, ...]:
         self._load(values)
         self.vertex(first=False)
         return self._values()
 
-    def _values(self) -> tuple[Any, ...]:
+    def _values(self) -> tuple[object, ...]:
         return tuple(getattr(self, name) for name in self.STATE)
 
-    def _load(self, values: tuple[Any, ...]) -> None:
+    def _load(self, values: tuple[object, ...]) -> None:
         for name, value in zip(self.STATE, values, strict=True):
             setattr(self, name, value)
