@@ -115,18 +115,18 @@ class Deposits:
         check_finite(light)
         lit = np.flatnonzero(light)
 
-        def taken(values: Any, kind: type) -> Any:
-            return np.array(values)[lit].astype(kind)
+        def lit_ones(values: mi.Float, dtype: type) -> npt.NDArray[Any]:
+            return np.array(values)[lit].astype(dtype)
 
         none = np.zeros(lit.size, np.int64)
         return cls(
-            source=taken(seen.pixel, np.int64),
-            anchor_row=none if anchors is None else taken(anchors[0], np.int64),
-            anchor_column=none if anchors is None else taken(anchors[1], np.int64),
-            row=taken(seen.row, np.float64),
-            column=taken(seen.column, np.float64),
-            inverse_depth=taken(seen.inverse_depth, np.float64),
-            value=taken(light, np.float64),
+            source=lit_ones(seen.pixel, np.int64),
+            anchor_row=none if anchors is None else lit_ones(anchors[0], np.int64),
+            anchor_column=none if anchors is None else lit_ones(anchors[1], np.int64),
+            row=lit_ones(seen.row, np.float64),
+            column=lit_ones(seen.column, np.float64),
+            inverse_depth=lit_ones(seen.inverse_depth, np.float64),
+            value=lit_ones(light, np.float64),
             order=np.full(lit.size, kind, dtype=np.int16),
         )
 
