@@ -5,8 +5,8 @@ what it casts on the plane at unit distance, pi x scale x texture. A ray of a pi
 ``phi = pi scale texture a / N``, a being the pixel's area on that plane: the same through every point of a lens. Every
 pixel has its own rays, so light is never attributed to a pixel by chance.
 
-The map is written once (:class:`CanvasMap`, and :class:`Projector` for the window) and used in two kinds of numbers: in
-the renderer's float32, a lane each (:class:`ProjectorRays`), and in float64 on the host (:class:`PinholeRays`).
+The map is written once (:class:`CanvasMap`, and :class:`Projector` for the window) and used in two kinds of
+numbers: the renderer's float32, a lane each (:class:`ProjectorRays`), and the host's float64 (:class:`PinholeRays`).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Projector:
     def pixel_size(self) -> tuple[float, float]:
         """Size (x, y) of a pixel on the plane at unit distance [mm], as the emitter's own float32 tells it.
 
-        :class:`CanvasMap` knows it better, by 1e-5; but frames of a blurred spot are equal bit for bit from version to
+        :class:`CanvasMap` knows it better, by 1e-4; but frames of a blurred spot are equal bit for bit from version to
         version only with this.
         """
         probe = dr.zeros(mi.SurfaceInteraction3f, 2)
@@ -110,7 +110,15 @@ class CanvasMap:
         return cls(turn, origin, fits[0], fits[1])
 
     def tangents(self, u: Numbers, v: Numbers, number: Callable[[float], Numbers] = float) -> tuple[Numbers, Numbers]:
-        """Local tan-angles (x, y) of canvas points ``u``, ``v``; ``number`` turns the map's own into theirs."""
+        """Local tan-angles (x, y) of points of the canvas.
+
+        Parameters
+        ----------
+        u, v
+            canvas coordinates, 0..1.
+        number
+            turns the map's numbers into numbers of their kind.
+        """
         x, y = ([number(float(value)) for value in axis] for axis in (self.x, self.y))
         return x[0] * u + x[1], y[0] * v + y[1]
 
