@@ -50,27 +50,29 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.transport.pinhole import PinholeMap
+from mitsim.transport.coordinates import RIGID, rigidity_error
+from mitsim.transport.registering import register_once
+from mitsim.transport.source import CanvasMap
 
 PLUGIN = "mitsim_projector"
-_REGISTERED: set[str] = set()
 
 
 def register() -> None:
     """Make ``mitsim_projector`` known to the current variant; calling it again does nothing."""
-    variant = mi.variant()
-    if variant is None:
-        raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
-    if variant not in _REGISTERED:
-        mi.register_emitter(PLUGIN, _emitter_class())
-        _REGISTERED.add(variant)
+    register_once("emitter", PLUGIN, _emitter_class)
 
 
-def aperture_scene_parts(projector: Any, radius: float, focus: float) -> dict[str, Any]:
-    """Scene parts that replace a stock ``projector`` emitter: its aperture as a disk that shines as it does.
+def aperture_scene_parts(projector: mi.Emitter, radius: float, focus: float) -> dict[str, Any]:
+    """Scene parts that replace a stock projector: its aperture as a disk that shines as it does.
 
-    ``radius`` of the aperture and distance ``focus`` of the sharp plane in mm. The bitmap is taken to be nearest and
-    clamped, as the scenes have it.
+    Parameters
+    ----------
+    projector
+        stock ``projector`` emitter; its bitmap is taken to be nearest and clamped, as the scenes have it.
+    radius
+        of the aperture [mm].
+    focus
+        distance of the sharp plane from the aperture [mm].
 
     Raises
     ------
@@ -83,16 +85,16 @@ def aperture_scene_parts(projector: Any, radius: float, focus: float) -> dict[st
     parameters = mi.traverse(projector)
     if "irradiance.data" not in parameters:
         raise MitsimError("projector aperture: the projector's irradiance is not a bitmap; give it a raw bitmap")
-    place = PinholeMap.of(projector)
-    if np.abs(place.turn.T @ place.turn - np.eye(3)).max() > 1e-4:
+    canvas = CanvasMap.of(projector)
+    if rigidity_error(canvas.turn) > RIGID:
         raise MitsimError("projector aperture: the projector's to_world scales or shears; move and turn it only")
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = place.turn, place.origin
-    to_world = mi.ScalarAffineTransform4f(matrix.tolist())
+    to_world = mi.ScalarAffineTransform4f(
+        np.block([[canvas.turn, canvas.origin[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]).tolist()
+    )
     emitter = {
         "type": PLUGIN,
         "to_world": to_world,
-        "fov": math.degrees(2 * math.atan(abs(float(place.x[0])) / 2)),
+        "fov": math.degrees(2 * math.atan(abs(float(canvas.x[0])) / 2)),
         "scale": float(np.array(parameters["scale"]).ravel()[0]),
         "focus": float(focus),
         "irradiance": {
@@ -108,7 +110,7 @@ def aperture_scene_parts(projector: Any, radius: float, focus: float) -> dict[st
     return {"projector_aperture": {"type": "disk", "to_world": disk, "bsdf": black, "emitter": emitter}}
 
 
-def _number(props: Any, name: str, low: float, high: float) -> float:
+def _number(props: mi.Properties, name: str, low: float, high: float) -> float:
     if name not in props:
         raise MitsimError(f"{PLUGIN}: {name} is missing; give a number above {low:g}")
     value = float(props[name])
@@ -121,7 +123,7 @@ def _emitter_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class ApertureProjector(mi.Emitter):  # type: ignore[misc]
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
             self.m_needs_sample_3 = True
@@ -135,7 +137,9 @@ def _emitter_class() -> type:
             self.aspect = float(width) / float(height)
             self.rig = mi.Transform4f(props.get("to_world", mi.ScalarAffineTransform4f()).matrix)
 
-        def _power(self, point: Any, direction: Any, wavelengths: Any, active: Any) -> tuple[Any, Any]:
+        def _power(
+            self, point: mi.Point3f, direction: mi.Vector3f, wavelengths: mi.Color0f, active: mi.Bool
+        ) -> tuple[mi.Spectrum, mi.Float]:
             """pi scale texture of the ray that leaves the aperture, and its cosine to the axis."""
             inverse = self.rig.inverse()
             o, d = inverse @ point, inverse @ direction
@@ -148,37 +152,45 @@ def _emitter_class() -> type:
             active &= (dr.abs(x) <= 1) & (dr.abs(y) <= 1)
             return dr.select(active, dr.pi * self.scale * self.irradiance.eval(si, active), 0), d.z
 
-        def _radiance(self, point: Any, direction: Any, wavelengths: Any, active: Any) -> Any:
+        def _radiance(
+            self, point: mi.Point3f, direction: mi.Vector3f, wavelengths: mi.Color0f, active: mi.Bool
+        ) -> mi.Spectrum:
             power, cosine = self._power(point, direction, wavelengths, active)
             return dr.select(cosine > 0, power / (self.get_shape().surface_area() * dr.square(dr.square(cosine))), 0)
 
-        def eval(self, si: Any, active: Any = True) -> Any:
+        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
             active &= si.wi.z > 0
             return mi.depolarizer(self._radiance(si.p, si.to_world(si.wi), si.wavelengths, active))
 
-        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample_direction(
+            self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
             ds = self.get_shape().sample_direction(it, sample, active)
             active &= (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
             light = self._radiance(ds.p, -ds.d, it.wavelengths, active) / ds.pdf
             ds.emitter = mi.EmitterPtr(self)
             return ds, mi.depolarizer(light) & active
 
-        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
             active &= dr.dot(ds.d, ds.n) < 0
             return dr.select(active, self.get_shape().pdf_direction(it, ds, active), 0)
 
-        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
             active &= dr.dot(ds.d, ds.n) < 0
             return mi.depolarizer(self._radiance(ds.p, -ds.d, it.wavelengths, active))
 
-        def sample_position(self, time: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample_position(
+            self, time: mi.Float, sample: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.PositionSample3f, mi.Float]:
             ps = self.get_shape().sample_position(time, sample, active)
             return ps, dr.select(active & (ps.pdf > 0), dr.rcp(ps.pdf), 0)
 
-        def pdf_position(self, ps: Any, active: Any = True) -> Any:
+        def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
             return self.get_shape().pdf_position(ps, active)
 
-        def sample_wavelengths(self, si: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample_wavelengths(
+            self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
+        ) -> tuple[mi.Color0f, mi.Spectrum]:
             none = dr.zeros(mi.Ray3f).wavelengths
             # Spectral variants take several wavelengths at once, evenly apart.
             places = [sample + i / max(1, len(none)) for i in range(len(none))]
@@ -186,7 +198,9 @@ def _emitter_class() -> type:
             wavelengths, weight = self.irradiance.sample_spectrum(si, shifted, active)
             return wavelengths, weight * self.scale
 
-        def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        def sample_ray(
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:
             """A point of the aperture and one of the picture, both even: the weight is pi scale texture x its area."""
             ps, _ = self.sample_position(time, sample2, active)
             near = mi.Vector3f((1 - 2 * sample3.x) * self.reach, (1 - 2 * sample3.y) * self.reach / self.aspect, 1)
@@ -199,7 +213,7 @@ def _emitter_class() -> type:
             area = 4 * self.reach**2 / self.aspect
             return ray, mi.depolarizer(weight * (dr.pi * area)) & active
 
-        def bbox(self) -> Any:
+        def bbox(self) -> mi.BoundingBox3f:
             return self.get_shape().bbox()
 
         def to_string(self) -> str:

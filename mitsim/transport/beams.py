@@ -1,6 +1,6 @@
-"""Light that reaches the sensor over perfect mirrors only: from a scene and a pinhole projector to beams of rays.
+"""Glint: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors alone.
 
-A path projector - mirror - sensor has a delta at both ends, so no camera-side path finds it: it is traced from the
+A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
 projector instead (:mod:`mitsim.transport.mirrors`). Rays go through a grid of points of each projector pixel. Four
 neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided
 until the map from the projector's window to the sensor is bilinear over each. :mod:`mitsim.optics.beams` turns beams
@@ -17,42 +17,51 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.beams import Beams
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.mirrors import Crossings, MirrorTracer, delta_bsdfs
+from mitsim.transport.mirrors import Crossings, IntArray, Mask, MirrorTracer, delta_bsdfs
 from mitsim.transport.source import Projector
 
-IntArray = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 _UNIT = 2**10
-"""Lattice points a projector pixel's side: the finest division."""
+"""Lattice points a projector pixel's side, the finest division: a pixel of 1000 sensor pixels still ends at one."""
 _COARSE = 128
-"""Least number of coarse beams along the window's side."""
+"""Least number of coarse beams along the window's side: a mirror of a hundredth of the window is seen."""
 _TOLERANCE = 0.02
-"""Largest departure from a bilinear map, in sensor pixels."""
+"""Largest departure from a bilinear map, in sensor pixels: twice what float32 leaves of a place at the sensor."""
 _SHADES = 0.01
-"""The same for the light left, relative: a painted mirror."""
+"""The same for the light left, relative: of a painted mirror, whose paint is seldom known better."""
 _SMALL = 2.0
-"""Whole beams below this many sensor pixels are not divided further."""
+"""Whole beams below this many sensor pixels are not divided further: what varies inside is finer than frames show."""
 _RIM = 0.5
-"""The same for beams that an edge cuts: those are given up if the edge is a rim, and kept if it is one of paint."""
+"""The same for beams that an edge cuts: those are given up if the edge is a rim, and kept if it is one of paint.
+
+Half a pixel, which a frame does not resolve; each halving doubles the beams along every rim.
+"""
 _MARGIN = 0.02
-"""Sine by which the field stop is widened when squares are left out."""
+"""Sine by which the field stop is widened when squares are left out: 1 degree, more than a square's rays curve."""
 
 
-def has_specular(scene: Any) -> bool:
-    """Whether some surface of the scene reflects or refracts like a perfect mirror or lens."""
+def has_specular(scene: mi.Scene) -> bool:
+    """Whether some surface of the ``scene`` reflects or refracts like a perfect mirror or lens."""
     return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
 
 
-def trace_beams(scene: Any, camera: Any, projector: Projector, max_depth: int = 16) -> Beams:
-    """All beams that leave the projector, meet 1 to ``max_depth`` perfect mirrors or lenses, and reach the sensor.
+def trace_beams(scene: mi.Scene, camera: mi.Sensor, projector: Projector, max_depth: int = 16) -> Beams:
+    """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
 
     A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
+
+    Parameters
+    ----------
+    scene, camera
+        what light meets, and the sensor with its ``geometry``.
+    projector
+        where it comes from; taken as a pinhole.
+    max_depth
+        mirrors that a beam may meet, at least 1.
 
     Raises
     ------
@@ -60,9 +69,9 @@ def trace_beams(scene: Any, camera: Any, projector: Projector, max_depth: int = 
         for a depth below 1.
     """
     if max_depth < 1:
-        raise MitsimError(f"max_depth of mirror light is {max_depth}; give at least 1")
+        raise MitsimError(f"max_depth of glints is {max_depth}; give at least 1")
     if not has_specular(scene):
-        return _join([], 0.0)
+        return _joined([], 0.0)
     tracer = MirrorTracer(scene, camera, projector, max_depth)
     n, geometry = projector.n, camera.geometry
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
@@ -71,18 +80,17 @@ def trace_beams(scene: Any, camera: Any, projector: Projector, max_depth: int = 
     crossings = tracer.follow(np.stack([row, column], axis=1) / _UNIT)
     low_row, low_column = (axis.ravel() for axis in np.meshgrid(line[:-1], line[:-1], indexing="ij"))
     first = np.arange(len(line) - 1)
-    corner = (first[:, None] * len(line) + first).ravel()[:, None, None] + np.array(
-        [[0, 1], [len(line), len(line) + 1]]
-    )
+    neighbours = np.array([[0, 1], [len(line), len(line) + 1]])
+    corner = (first[:, None] * len(line) + first).ravel()[:, None, None] + neighbours
     parts, unresolved = [], 0.0
     for chain in np.unique(crossings.chain):
         nodes = _nodes(crossings, chain, row.size)
         squares = nodes.take(corner)
         chosen = _near(squares, squares, geometry)
-        found, lost = _refine(tracer, chain, low_row[chosen], low_column[chosen], step, n, geometry)
-        parts += found
+        beams, lost = _refine(tracer, chain, low_row[chosen], low_column[chosen], step, n, geometry)
+        parts += beams
         unresolved += lost
-    return _join(parts, unresolved)
+    return _joined(parts, unresolved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +105,12 @@ class _Nodes:
     def take(self, index: Any) -> _Nodes:
         return _Nodes(self.valid[index], self.sensor[index], self.tangent[index], self.throughput[index])
 
-    def at(self, *index: Any) -> _Nodes:
-        return self.take((slice(None), *index))
+    def quarter(self, i: int, j: int) -> _Nodes:
+        """The corners (q, 2, 2) of a quarter of squares that are known at (q, 3, 3) nodes."""
+        return self.take((slice(None), slice(i, i + 2), slice(j, j + 2)))
 
 
-def _nodes(crossings: Crossings, chain: Any, count: int) -> _Nodes:
+def _nodes(crossings: Crossings, chain: np.uint64, count: int) -> _Nodes:
     """The crossings of one chain, by number of the ray."""
     mine = crossings.chain == chain
     ray = crossings.ray[mine]
@@ -114,7 +123,7 @@ def _nodes(crossings: Crossings, chain: Any, count: int) -> _Nodes:
 
 
 def _refine(
-    tracer: MirrorTracer, chain: Any, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
+    tracer: MirrorTracer, chain: np.uint64, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], float]:
     """Beams of one chain inside squares of the lattice (first row and column, ``size``), and the flux not resolved."""
     parts: list[Beams] = []
@@ -132,30 +141,20 @@ def _refine(
         share = nodes.throughput.mean(axis=(1, 2)) * _fluxes(tracer, row, column, size, n)
         unresolved += float(share[lost & _near(nodes, nodes, geometry)].sum())
         for i, j in np.ndindex(2, 2):
-            quarter = nodes.at(slice(i, i + 2), slice(j, j + 2)).take(done)
+            corners = nodes.quarter(i, j).take(done)
             at = row[done] + i * half, column[done] + j * half
-            parts.append(
-                Beams(
-                    (at[0] // _UNIT) * n + at[1] // _UNIT,
-                    _fluxes(tracer, *at, half, n),
-                    quarter.sensor,
-                    quarter.tangent,
-                    quarter.throughput,
-                    0.0,
-                )
-            )
-        open_ = ~done & ~lost
+            pixel, flux = _pixel(*at, n), _fluxes(tracer, *at, half, n)
+            parts.append(Beams(pixel, flux, corners.sensor, corners.tangent, corners.throughput, 0.0))
         following = []
         for i, j in np.ndindex(2, 2):
-            quarter = nodes.at(slice(i, i + 2), slice(j, j + 2))
-            goes_on = open_ & _near(quarter, nodes, geometry)
+            goes_on = ~done & ~lost & _near(nodes.quarter(i, j), nodes, geometry)
             following.append((row[goes_on] + i * half, column[goes_on] + j * half))
         row, column = (np.concatenate(part) for part in zip(*following, strict=True))
         size = half
     return parts, unresolved
 
 
-def _trace_squares(tracer: MirrorTracer, chain: Any, row: IntArray, column: IntArray, half: int) -> _Nodes:
+def _trace_squares(tracer: MirrorTracer, chain: np.uint64, row: IntArray, column: IntArray, half: int) -> _Nodes:
     """Nodes (q, 3, 3) at corners, edge middles and centre of squares; shared points are traced once."""
     step = half * np.arange(3)
     rows, columns = np.broadcast_arrays(row[:, None, None] + step[:, None], column[:, None, None] + step)
@@ -190,20 +189,18 @@ def _near(nodes: _Nodes, parent: _Nodes, geometry: CameraGeometry) -> Mask:
     sine = geometry.tan_half_fov / np.hypot(1, geometry.tan_half_fov)
     whole = nodes.valid.all(axis=(1, 2))
     near = nodes.valid.any(axis=(1, 2))
-    for of, reach in ((_place, geometry.half_width + geometry.pixel_pitch), (_sine, sine + _MARGIN)):
-        low, high = _box(nodes.valid, of(nodes))
-        above = _size(*_box(parent.valid, of(parent)))
+    of_places = nodes.sensor, parent.sensor, geometry.half_width + geometry.pixel_pitch
+    for values, above_values, reach in (of_places, (_sines(nodes), _sines(parent), sine + _MARGIN)):
+        low, high = _box(nodes.valid, values)
+        above = _size(*_box(parent.valid, above_values))
         margin = np.where(whole, _size(low, high) / 2, np.where(above > 0, above, np.inf))[:, None]
         with np.errstate(invalid="ignore"):
             near &= ((low - margin < reach) & (high + margin > -reach)).all(axis=1)
     return np.asarray(near)
 
 
-def _place(nodes: _Nodes) -> FloatArray:
-    return nodes.sensor
-
-
-def _sine(nodes: _Nodes) -> FloatArray:
+def _sines(nodes: _Nodes) -> FloatArray:
+    """Sines of the rays' angles to the axis, along rows and columns."""
     return np.asarray(nodes.tangent / np.sqrt(1 + np.square(nodes.tangent).sum(axis=-1, keepdims=True)))
 
 
@@ -216,18 +213,18 @@ def _departure(values: FloatArray) -> FloatArray:
 
 def _fluxes(tracer: MirrorTracer, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
     """(q,) flux into squares of the lattice [W m^-2 mm^2]."""
-    power = tracer.rays.power.mean(axis=1)[(row // _UNIT) * n + column // _UNIT]
+    power = tracer.rays.power.mean(axis=1)[_pixel(row, column, n)]
     return np.asarray(power * tracer.rays.area * (size / _UNIT) ** 2)
 
 
-def _join(parts: list[Beams], unresolved: float) -> Beams:
+def _pixel(row: IntArray, column: IntArray, n: int) -> IntArray:
+    """(q,) projector pixel of points of the lattice."""
+    return (row // _UNIT) * n + column // _UNIT
+
+
+def _joined(parts: list[Beams], unresolved: float) -> Beams:
     pair = np.zeros((0, 2, 2, 2))
-    every = [Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0), *parts]
-    return Beams(
-        np.concatenate([part.pixel for part in every]),
-        np.concatenate([part.flux for part in every]),
-        np.concatenate([part.sensor for part in every]),
-        np.concatenate([part.tangent for part in every]),
-        np.concatenate([part.throughput for part in every]),
-        unresolved,
-    )
+    none = Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0)
+    names = ("pixel", "flux", "sensor", "tangent", "throughput")
+    arrays = {name: np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names}
+    return Beams(**arrays, unresolved=unresolved)

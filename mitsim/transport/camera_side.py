@@ -1,4 +1,4 @@
-"""Light followed from the camera: of lamps, in mirrors, and over sharp turns before the sensor.
+"""From-camera light, followed from the camera's side: of lamps, in mirrors, and over sharp turns before the sensor.
 
 A path starts at the sensor's centre, goes through a cell of directions, and connects to the lights at its vertices; a
 connection to the projector names the projector pixel that it used. The mask and the sensor pixels are applied
@@ -20,20 +20,22 @@ keeps the estimate unbiased; there is no last bounce.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.cells import CellGrid
-from mitsim.transport.histogram import Deposits
-from mitsim.transport.paths import Walk, camera_part, survival, walked
+from mitsim.transport.cells import CellAxis, CellGrid
+from mitsim.transport.connection import ProjectorConnector
+from mitsim.transport.coordinates import x_y
+from mitsim.transport.histogram import Deposits, Sightings
+from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
+from mitsim.transport.receiver import sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
-from mitsim.transport.source import Projector, Source
+from mitsim.transport.source import Projector
 
 _MARGIN = 1e-4
+"""Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
 
 
 @dataclass(frozen=True)
@@ -46,89 +48,78 @@ class Paths:
 
     mirrors: bool = False
     interreflection: bool = False
-    emitters: tuple[Any, ...] = ()
+    emitters: tuple[mi.Emitter, ...] = ()
 
 
-class CameraTracer:
-    """Prepared once for a scene and a cell grid; each seed is an independent estimate."""
+class CameraTracer(Tracer):
+    """From-camera light of a scene, at the sensor's centre."""
 
     def __init__(
         self,
-        scene: Any,
-        camera: Any,
+        scene: mi.Scene,
+        camera: mi.Sensor,
         projector: Projector,
         grid: CellGrid,
         paths: Paths,
         geometry: CameraGeometry | None = None,
     ) -> None:
-        """``geometry`` stands in for the camera's own."""
+        """Paths start in the cells of ``grid``, one each; ``geometry`` stands in for the camera's own."""
         self.geometry: CameraGeometry = geometry or camera.geometry
         self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
-        self.source = Source(projector)
+        self.connector = ProjectorConnector(projector)
 
     @property
     def lanes(self) -> int:
         """Paths in one sample: one per cell."""
         return self.grid.shape[0] * self.grid.shape[1]
 
-    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
-        """Samples ``first`` .. ``first + samples - 1`` of the sequence ``seed``, a path each a cell.
-
-        Raises
-        ------
-        MitsimError
-            when the scene sends NaN or infinite light to the camera.
-        """
-        return walked(
-            partial(_Walk, self, seed), self.lanes, first, samples, self.paths.mirrors or self.paths.interreflection
-        )
+    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        return _Walk(self, seed, sample, lane).deposits(self.paths.mirrors or self.paths.interreflection)
 
 
 class _Walk(Walk):
     """Paths from the camera, with light of the projector, direct or indirect, and of lamps."""
 
     STATE = (
-        *("active", "ray", "strength", "part", "bounce", "order", "in_mirror", "mirrored", "by_delta", "travelled"),
-        *("rng", "near", "came_from", "came_pdf", "kept"),
+        *("active", "ray", "strength", "part", "bounce", "surfaces", "in_mirror", "mirrored", "by_delta", "travelled"),
+        *("rng", "inverse_depth", "came_from", "came_pdf", "kept"),
     )
 
-    def __init__(self, tracer: CameraTracer, seed: int, sample: Any, cell: Any) -> None:
-        super().__init__()
-        self.tracer, self.paths, self.source, self.geometry = tracer, tracer.paths, tracer.source, tracer.geometry
-        self.scene = tracer.scene
+    def __init__(self, tracer: CameraTracer, seed: int, sample: mi.UInt32, cell: mi.UInt32) -> None:
+        super().__init__(tracer.scene, tracer.paths.mirrors, tracer.paths.interreflection)
+        self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
+        self.connector = tracer.connector
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
         shared, self.rng = streams(seed, cell, sample)
         jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, shared)
         self.strength, self.part = mi.Spectrum(1), mi.Float(1)
-        self.travelled, self.bounce, self.order = mi.Float(0), mi.UInt32(0), mi.UInt32(1)
+        self.travelled, self.bounce, self.surfaces = mi.Float(0), mi.UInt32(0), mi.UInt32(1)
         self.by_delta, self.mirrored, self.in_mirror = mi.Bool(True), mi.Bool(True), mi.Bool(False)
         self.came_from, self.came_pdf = dr.zeros(mi.Point3f), mi.Float(0)
         self._aim(cell, jitter)
 
     # ---- the camera's side ------------------------------------------------------------------------------------------
 
-    def _aim(self, cell: Any, jitter: Any) -> None:
+    def _aim(self, cell: mi.UInt32, jitter: mi.Point2f) -> None:
         """Rays from the sensor's centre through the cells, and the weight of each."""
         tracer, grid = self.tracer, self.tracer.grid
         columns = dr.opaque(mi.UInt32, grid.shape[1])
-        self.tau_row = _place(grid.rows, cell // columns, jitter.x)
-        self.tau_column = _place(grid.columns, cell % columns, jitter.y)
-        squared = 1 + dr.square(self.tau_row) + dr.square(self.tau_column)
+        self.row = _place(grid.rows, cell // columns, jitter.x)
+        self.column = _place(grid.columns, cell % columns, jitter.y)
+        squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
-        wavelengths, spectral = tracer.camera.sample_wavelengths(
-            dr.zeros(mi.SurfaceInteraction3f), self.rng.next_float32(), True
-        )
+        wavelengths, spectral = sampled_wavelengths(tracer.camera, self.rng)
         to_world = tracer.camera.world_transform()
-        direction = mi.Vector3f(-self.tau_column, -self.tau_row, 1) * self.slope
+        direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
         self.ray = mi.Ray3f(to_world @ mi.Point3f(0), to_world @ direction, 0.0, wavelengths)
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
-        self.active = (dr.abs(self.tau_row) <= stop) & (dr.abs(self.tau_column) <= stop)
+        self.active = (dr.abs(self.row) <= stop) & (dr.abs(self.column) <= stop)
         # dt of a cell times (1 + t^2)^-2, and a pixel's response cos^n.
         solid = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) / dr.square(squared)
         if self.geometry.angular_exponent > 0:
             solid *= dr.power(squared, -0.5 * dr.opaque(mi.Float, self.geometry.angular_exponent))
         self.weight = spectral * solid
-        self.near = mi.Float(0)
+        self.inverse_depth = mi.Float(0)
 
     # ---- one vertex -------------------------------------------------------------------------------------------------
 
@@ -137,9 +128,11 @@ class _Walk(Walk):
         si = self.scene.ray_intersect(mi.RayDifferential3f(self.ray), mi.RayFlags.All, first, self.active)
         if first or self.paths.mirrors:
             # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
-            self.near = dr.select(self.mirrored, dr.rcp((self.travelled + si.t) * self.slope), self.near)
+            self.inverse_depth = dr.select(
+                self.mirrored, dr.rcp((self.travelled + si.t) * self.slope), self.inverse_depth
+            )
         if first:
-            self.active &= self.near < 1 / dr.opaque(mi.Float, self.geometry.mask_distance)
+            self.active &= self.inverse_depth < 1 / dr.opaque(mi.Float, self.geometry.mask_distance)
         elif self.tracer.projector.aperture > 0:
             self._projector_hit(si)
         if self.paths.emitters:
@@ -151,21 +144,21 @@ class _Walk(Walk):
         for emitter in self.paths.emitters:
             self._light(si, bsdf, emitter)
         if self.paths.mirrors or self.paths.interreflection:
-            self._leave(si, bsdf, first)
+            self._leave(si, first)
 
-    def _connect(self, si: Any, bsdf: Any) -> None:
+    def _connect(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
         """Light of the projector that this vertex sends on along its path."""
-        found = self.source.connect(si, self.rng, self.active)
-        active = found.valid & ~self.scene.ray_test(si.spawn_ray_to(found.target), found.valid)
-        toward = si.to_local(found.direction)
+        connection = self.connector.connect(si, self.rng, self.active)
+        active = connection.valid & ~self.scene.ray_test(si.spawn_ray_to(connection.target), connection.valid)
+        toward = si.to_local(connection.direction)
         if self.tracer.projector.aperture > 0 and self.paths.interreflection:
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, toward, active)
-            value *= self._share(found.pdf, pdf)
+            value *= self._share(connection.pdf, pdf)
         else:
             value = bsdf.eval(mi.BSDFContext(), si, toward, active)
-        self._keep_of_projector(active, self._radiance(value * found.weight), found.pixel, self.order)
+        self._keep_of_projector(active, self._radiance(value * connection.weight), connection.pixel, self.surfaces)
 
-    def _light(self, si: Any, bsdf: Any, emitter: Any) -> None:
+    def _light(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, emitter: mi.Emitter) -> None:
         """The same for another light of the scene."""
         point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         ds, light = emitter.sample_direction(si, point, self.active)
@@ -174,9 +167,9 @@ class _Walk(Walk):
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
         # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
         share = dr.select(ds.delta, 1, self._share(ds.pdf, pdf)) if self.paths.interreflection else 1
-        self._keep("ambient", active, self._radiance(value * light) * share, self._lamps())
+        self._keep_seen("ambient", active, self._radiance(value * light) * share, self._lamps())
 
-    def _emitter_hit(self, si: Any) -> None:
+    def _emitter_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a lamp that the path has run into."""
         emitter = si.emitter(self.scene, self.active)
         before = dr.zeros(mi.Interaction3f)
@@ -185,74 +178,62 @@ class _Walk(Walk):
         ds = mi.DirectionSample3f(self.scene, si, before)
         pdf = emitter.pdf_direction(before, ds, lamp & ~self.by_delta)
         share = dr.select(self.by_delta, 1, self._share(self.came_pdf, pdf))
-        self._keep("ambient", lamp, self._radiance(emitter.eval(si, lamp)) * share, self._lamps())
+        self._keep_seen("ambient", lamp, self._radiance(emitter.eval(si, lamp)) * share, self._lamps())
 
-    def _projector_hit(self, si: Any) -> None:
+    def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a projector's lens that the path has run into.
 
         Over mirrors alone it is the beams' (:mod:`mitsim.transport.beams`); over one other surface, unless that is
         seen in a mirror, it is the projector's side's.
         """
-        active = self.active & (self.order > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
-        radiance, pdf, pixel, met = self.source.hit(self.ray, si.t, self.rng, active)
-        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, pdf))
-        self._keep_of_projector(met, self._radiance(radiance) * share, pixel, self.order - 1)
+        active = self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
+        hit = self.connector.hit(self.ray, si.t, self.rng, active)
+        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, hit.pdf))
+        self._keep_of_projector(hit.met, self._radiance(hit.radiance) * share, hit.pixel, self.surfaces - 1)
 
-    def _leave(self, si: Any, bsdf: Any, first: bool) -> None:
+    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
-        number = self.rng.next_float32()
-        point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        sample, value = bsdf.sample(mi.BSDFContext(), si, number, point, self.active)
-        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        going = self.active & (sample.pdf > 0)
-        if not self.paths.interreflection:
-            going &= delta
-        elif not self.paths.mirrors:
-            going &= ~delta
+        sample, value, going = self._sampled(si, mi.TransportMode.Radiance)
+        delta = is_delta(sample)
         if first:
             self.in_mirror = mi.Bool(delta)
             self.part = dr.select(delta, 1, camera_part(sample.pdf))
             if not self.paths.emitters:
                 going &= self.part > 0
-        self.strength *= mi.unpolarized_spectrum(value)
-        self.bounce += 1
-        if not first:
-            chance = survival(self.strength, self.mirrored, self.bounce)
-            going &= self.rng.next_float32() < chance
-            self.strength *= dr.rcp(dr.maximum(chance, 1e-6))
-        self.active = going & (dr.max(self.strength) > 0)
+        self.strength *= value
+        self._end_some(going, self.mirrored, first)
         self.mirrored &= delta
-        self.order = dr.select(delta, self.order, self.order + 1)
+        self.surfaces = dr.select(delta, self.surfaces, self.surfaces + 1)
         self.travelled += si.t
         self.came_from, self.came_pdf, self.by_delta = mi.Point3f(si.p), mi.Float(sample.pdf), mi.Bool(delta)
         self.ray = si.spawn_ray(si.to_world(sample.wo))
 
     # ---- light that is kept -----------------------------------------------------------------------------------------
 
-    def _radiance(self, light: Any) -> Any:
+    def _radiance(self, light: mi.Spectrum) -> mi.Float:
         """One number for the light of a connection, as irradiance at the sensor's centre."""
         return panchromatic(mi.unpolarized_spectrum(light) * self.strength * self.weight)
 
-    def _lamps(self) -> Any:
+    def _lamps(self) -> mi.UInt32:
         return mi.UInt32(self.tracer.projector.n**2)
 
     @staticmethod
-    def _share(own: Any, other: Any) -> Any:
+    def _share(own: mi.Float, rival: mi.Float) -> mi.Float:
         """Balance heuristic of two ways to find the same light; a pdf of 0 means that a way cannot find it."""
-        return dr.select(own > 0, own / (own + other), 1)
+        return dr.select(own > 0, own / (own + rival), 1)
 
-    def _keep_of_projector(self, active: Any, value: Any, pixel: Any, order: Any) -> None:
-        """``order``: surfaces on the light's way that are no mirrors."""
-        self._keep("direct", active & (order == 1), value * self.part, pixel)
+    def _keep_of_projector(self, active: mi.Bool, value: mi.Float, pixel: mi.UInt32, surfaces: mi.UInt32) -> None:
+        """``surfaces``: those on the light's way that are no mirrors."""
+        self._keep_seen("direct", active & (surfaces == 1), value * self.part, pixel)
         if self.paths.interreflection:
-            self._keep("indirect", active & (order > 1), value * self.part, pixel)
+            self._keep_seen("indirect", active & (surfaces > 1), value * self.part, pixel)
 
-    def _keep(self, kind: str, active: Any, value: Any, source: Any) -> None:
+    def _keep_seen(self, kind: str, active: mi.Bool, value: mi.Float, pixel: mi.UInt32) -> None:
         light = dr.select(active, value, 0)
-        self.keep(kind, light, source, self.tau_row, self.tau_column, self.near, self.rng)
+        self._keep(kind, Sightings(light, pixel, self.row, self.column, self.inverse_depth))
 
 
-def _place(axis: Any, index: Any, jitter: Any) -> Any:
+def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
     """Tan-angle of a place in a cell."""
     start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, axis.size)
     return start + (mi.Float(index) + jitter) * size

@@ -62,7 +62,7 @@ Python: ``register(); mi.load_dict({"type": "mitsim_grating", "grooves": "linear
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
 import drjit as dr
@@ -72,10 +72,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import read_toml, shipped, validated
 from mitsim.core.errors import MitsimError
+from mitsim.transport.registering import register_once
 
 PLUGIN = "mitsim_grating"
-_REGISTERED: set[str] = set()
 _ORDERS = 16
+"""Highest order: a compact disc, 1600 nm, sends visible light to 4 at most; each costs a lobe in every evaluation."""
 _ROUNDING = 1e-6
 """How far above 1 a sum of decimals may come out; float32 when it was read back from Mitsuba."""
 
@@ -86,12 +87,7 @@ Share = Annotated[float, Field(ge=0, le=1e9)]
 
 def register() -> None:
     """Make ``mitsim_grating`` known to the current variant; calling it again does nothing."""
-    variant = mi.variant()
-    if variant is None:
-        raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
-    if variant not in _REGISTERED:
-        mi.register_bsdf(PLUGIN, _bsdf_class())
-        _REGISTERED.add(variant)
+    register_once("bsdf", PLUGIN, _bsdf_class)
 
 
 class GratingModel(BaseModel):
@@ -140,7 +136,7 @@ class GratingModel(BaseModel):
         return dict(sorted({**below, **above}.items()))
 
 
-def _model(props: Any) -> GratingModel:
+def _model(props: mi.Properties) -> GratingModel:
     light = read_toml(shipped("calibration", "mp_cl1.toml"))
     values: dict[str, Any] = {}
     if "wavelengths" not in props:
@@ -169,7 +165,7 @@ def _bsdf_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class Grating(mi.BSDF):  # type: ignore[misc]
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.model = _model(props)
             if mi.is_rgb and len(self.model.wavelengths) != 3:
@@ -195,25 +191,25 @@ def _bsdf_class() -> type:
         def _parameters() -> tuple[str, ...]:
             return ("pitch", "sigma", "sigma_groove", "diffuse", "reflectance", "efficiencies")
 
-        def traverse(self, callback: Any) -> None:
+        def traverse(self, callback: mi.TraversalCallback) -> None:
             for name in self._parameters():
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
-        def parameters_changed(self, keys: Any = ()) -> None:
-            found = {name: np.array(dr.detach(getattr(self, name)), dtype=np.float64) for name in self._parameters()}
-            parts = found.pop("efficiencies")
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            changed = {name: np.array(dr.detach(getattr(self, name)), dtype=np.float64) for name in self._parameters()}
+            parts = changed.pop("efficiencies")
             if len(parts) != len(self.orders):
                 raise MitsimError(
                     f"{PLUGIN}: efficiencies: got {len(parts)} numbers; orders {self.orders} have one each"
                 )
             zero = self.orders.index(0)
-            values = {name: float(value.ravel()[0]) for name, value in found.items()}
+            values = {name: float(value.ravel()[0]) for name, value in changed.items()}
             lists = {"efficiencies": parts[zero:].tolist(), "negative_efficiencies": parts[:zero][::-1].tolist()}
             self.model = GratingModel.checked(**{**self.model.model_dump(), **values, **lists})
 
         # ---- what the derivation in the module's docstring says
 
-        def _grating_vector(self, si: Any) -> Any:
+        def _grating_vector(self, si: mi.SurfaceInteraction3f) -> mi.Vector2f:
             """g in the local frame; at a disc's centre, and where a linear grating is seen end on, any will do."""
             circular = self.model.grooves == "circular"
             across = si.to_local(si.dp_du if circular else mi.Vector3f(self.model.direction))
@@ -221,7 +217,7 @@ def _bsdf_class() -> type:
             length = dr.norm(flat)
             return dr.select(length > 0, flat / length, mi.Vector2f(1, 0))
 
-        def _lines(self, si: Any) -> Iterable[tuple[float, Any]]:
+        def _lines(self, si: mi.SurfaceInteraction3f) -> Iterable[tuple[float, mi.UnpolarizedSpectrum]]:
             """Share and wavelength [nm] of the lines, the wavelength with one entry for each channel."""
             if mi.is_spectral:
                 return [(1.0, mi.UnpolarizedSpectrum(si.wavelengths))]
@@ -229,18 +225,18 @@ def _bsdf_class() -> type:
                 return [(1.0, mi.UnpolarizedSpectrum(list(self.model.wavelengths)))]
             return zip(self._shares, map(mi.UnpolarizedSpectrum, self.model.wavelengths), strict=True)
 
-        def _lobes(self, si: Any) -> Iterator[tuple[Any, Any]]:
+        def _lobes(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.Float, mi.UnpolarizedSpectrum]]:
             """Reflected part and shift m lambda / pitch (by channel) of every line's orders."""
             for share, wavelength in self._lines(si):
                 for index, order in enumerate(self.orders):
                     part = share * dr.gather(mi.Float, self.efficiencies, index)
                     yield part, order * wavelength / self.pitch
 
-        def _total(self) -> Any:
+        def _total(self) -> mi.Float:
             """Everything that is reflected without the factor ``reflectance``: lobes are drawn by their part of it."""
             return self.diffuse + dr.sum(self.efficiencies)
 
-        def _distribution(self, si: Any, wo: Any) -> Any:
+        def _distribution(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.UnpolarizedSpectrum:
             """Sum of eta D + diffuse / pi, by channel, without reflectance and cosine."""
             g = self._grating_vector(si)
             q = mi.Vector2f(si.wi.x + wo.x, si.wi.y + wo.y)
@@ -253,7 +249,9 @@ def _bsdf_class() -> type:
 
         # ---- Mitsuba's interface
 
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+        def eval_pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> tuple[mi.Spectrum, mi.Float]:
             if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
                 return mi.Spectrum(0), mi.Float(0)
             cosine_i, cosine_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
@@ -264,13 +262,24 @@ def _bsdf_class() -> type:
             pdf = dr.select(active & (total > 0), dr.mean(density) / total, 0)
             return mi.depolarizer(dr.select(active, self.reflectance * density, 0)), pdf
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def eval(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> mi.Spectrum:
             return self.eval_pdf(ctx, si, wo, active)[0]
 
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> mi.Float:
             return self.eval_pdf(ctx, si, wo, active)[1]
 
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            sample1: mi.Float,
+            sample2: mi.Point2f,
+            active: mi.Bool = True,
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             chosen = sample1 * self._total()
             reached = mi.Float(self.diffuse)
             lambertian = chosen < reached

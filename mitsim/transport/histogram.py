@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -23,7 +24,36 @@ from mitsim.transport.cells import CellGrid
 
 IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
-"""Kinds of light, the ``order`` of a deposit."""
+"""Kinds of light: of lamps, of the projector over one surface that is no mirror, and over several."""
+
+
+@dataclass
+class Sightings:
+    """Light of connections, a lane each, and where the camera sees it; meaning and units as in :class:`Deposits`."""
+
+    value: mi.Float
+    pixel: mi.UInt32
+    row: mi.Float
+    column: mi.Float
+    inverse_depth: mi.Float
+
+    @classmethod
+    def none(cls) -> Sightings:
+        """No light yet."""
+        return cls(mi.Float(0), mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0))
+
+    def joined_by(self, more: Sightings, rng: mi.PCG32) -> Sightings:
+        """Of these and ``more`` one, drawn by ``rng`` in proportion to its light, which carries the light of both."""
+        total = self.value + more.value
+        new = rng.next_float32() * total < more.value
+        places = ((getattr(more, name), getattr(self, name)) for name in ("pixel", "row", "column", "inverse_depth"))
+        return Sightings(total, *(dr.select(new, theirs, mine) for theirs, mine in places))
+
+
+def check_finite(light: npt.NDArray[Any]) -> None:
+    """Refuse ``light`` toward the camera that is NaN or infinite: MitsimError."""
+    if not np.isfinite(light).all():
+        raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +73,7 @@ class Deposits:
     value
         (m,) irradiance [W m^-2].
     order
-        (m,) 1 for direct light of the projector, 2 for its indirect light, 0 for ambient light.
+        (m,) :data:`DIRECT` or :data:`INDIRECT` light of the projector, or :data:`AMBIENT` light.
     """
 
     source: IntArray
@@ -57,23 +87,22 @@ class Deposits:
 
     @classmethod
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
-        """All parts in one; no light where there are none."""
+        """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
     @classmethod
-    def fetched(
-        cls,
-        value: Any,
-        source: Any,
-        row: Any,
-        column: Any,
-        inverse_depth: Any,
-        order: int,
-        anchor_row: Any = None,
-        anchor_column: Any = None,
-    ) -> Deposits:
-        """Lit connections of one kind from the renderer's arrays; those of the first anchor when none is named.
+    def fetched(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> Deposits:
+        """Lit connections of one kind from the renderer's arrays.
+
+        Parameters
+        ----------
+        seen
+            the connections, a lane each.
+        kind
+            :data:`DIRECT`, :data:`INDIRECT` or :data:`AMBIENT`.
+        anchors
+            rows and columns of their anchors; the first anchor without them.
 
         Raises
         ------
@@ -81,24 +110,24 @@ class Deposits:
             when the light is NaN or infinite.
         """
         # Together: one by one, each would trace all paths again.
-        dr.eval(value, source, row, column, inverse_depth, anchor_row, anchor_column)
-        light = np.array(value)
-        if not np.isfinite(light).all():
-            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+        dr.eval(seen, anchors)
+        light = np.array(seen.value)
+        check_finite(light)
         lit = np.flatnonzero(light)
 
-        def taken(values: Any, kind: type) -> Any:
-            return np.zeros(lit.size, kind) if values is None else np.array(values)[lit].astype(kind)
+        def lit_ones(values: mi.Float, dtype: type) -> npt.NDArray[Any]:
+            return np.array(values)[lit].astype(dtype)
 
+        none = np.zeros(lit.size, np.int64)
         return cls(
-            source=taken(source, np.int64),
-            anchor_row=taken(anchor_row, np.int64),
-            anchor_column=taken(anchor_column, np.int64),
-            row=taken(row, np.float64),
-            column=taken(column, np.float64),
-            inverse_depth=taken(inverse_depth, np.float64),
-            value=light[lit].astype(np.float64),
-            order=np.full(lit.size, order, dtype=np.int16),
+            source=lit_ones(seen.pixel, np.int64),
+            anchor_row=none if anchors is None else lit_ones(anchors[0], np.int64),
+            anchor_column=none if anchors is None else lit_ones(anchors[1], np.int64),
+            row=lit_ones(seen.row, np.float64),
+            column=lit_ones(seen.column, np.float64),
+            inverse_depth=lit_ones(seen.inverse_depth, np.float64),
+            value=lit_ones(light, np.float64),
+            order=np.full(lit.size, kind, dtype=np.int16),
         )
 
     @classmethod
@@ -109,12 +138,12 @@ class Deposits:
 
     def averaged(self, weights: FloatArray) -> Deposits:
         """Light of one anchor: the mean over all of them, with ``weights`` (anchors,) along rows and columns."""
-        none = np.zeros_like(self.source)
+        first = np.zeros_like(self.source)
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
-        return replace(self, anchor_row=none, anchor_column=none, value=value)
+        return replace(self, anchor_row=first, anchor_column=first, value=value)
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> Deposits:
-        """The chosen entries."""
+        """The entries that are ``chosen`` (m,)."""
         return Deposits(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
@@ -146,19 +175,29 @@ class Bundle:
         """Places for light in all."""
         return len(self.depths) * self.anchors**2 * self.cells[0] * self.cells[1]
 
-    def file(self, found: Deposits, labels: IntArray, samples: int = 1) -> sparse.csr_array:
-        """(C + 1, size) light a row, divided by ``samples``; ``labels`` (n^2,) gives the row 0..C-1 of each pixel."""
-        inside = self.grid.rows.holds(found.row) & self.grid.columns.holds(found.column)
+    def file(self, deposits: Deposits, labels: IntArray, samples: int = 1) -> sparse.csr_array:
+        """(C + 1, size) light of C classes of pixels and of lamps, per sample; light outside of all cells is dropped.
+
+        Parameters
+        ----------
+        deposits
+            light of ``samples`` samples.
+        labels
+            (n^2,) class 0..C-1 of each projector pixel.
+        samples
+            that the light is divided by.
+        """
+        inside = self.grid.rows.holds(deposits.row) & self.grid.columns.holds(deposits.column)
         if not inside.all():
-            found = found.where(inside)
+            deposits = deposits.where(inside)
         width = self.anchors * self.cells[1]
         plane = self.anchors * self.cells[0] * width
         count = int(labels.max()) + 1
-        row = np.append(labels, count)[found.source]
-        line = found.anchor_row * self.cells[0] + self.grid.rows.cell(found.row)
-        place = line * width + found.anchor_column * self.cells[1] + self.grid.columns.cell(found.column)
-        layers = self._layers(found.inverse_depth)
-        values = np.concatenate([found.value * (share / samples) for _, share in layers])
+        row = np.append(labels, count)[deposits.source]
+        line = deposits.anchor_row * self.cells[0] + self.grid.rows.cell(deposits.row)
+        place = line * width + deposits.anchor_column * self.cells[1] + self.grid.columns.cell(deposits.column)
+        layers = self._layers(deposits.inverse_depth)
+        values = np.concatenate([deposits.value * (share / samples) for _, share in layers])
         flat = np.concatenate([layer * plane + place for layer, _ in layers])
         shape = (count + 1, self.size)
         # 32-bit indices sort twice as fast.
@@ -170,18 +209,18 @@ class Bundle:
         return light
 
     def repeated(self, light: sparse.csr_array) -> sparse.csr_array:
-        """Light that was filed with one anchor, (rows, size / anchors^2), as if every anchor saw it."""
-        found = light.tocoo()
+        """``light`` that was filed with one anchor, (rows, size / anchors^2), as if every anchor saw it."""
+        entries = light.tocoo()
         height, width = self.cells
-        layer, place = np.divmod(found.col.astype(np.int64), height * width)
+        layer, place = np.divmod(entries.col.astype(np.int64), height * width)
         row, column = np.divmod(place, width)
         places = [
             ((layer * self.anchors + a) * height + row) * self.anchors * width + b * width + column
             for a, b in np.ndindex(self.anchors, self.anchors)
         ]
         copies = self.anchors**2
-        entries = np.tile(found.data, copies), (np.tile(found.row, copies), np.concatenate(places))
-        return sparse.coo_array(entries, shape=(light.shape[0], self.size)).tocsr()
+        copied = np.tile(entries.data, copies), (np.tile(entries.row, copies), np.concatenate(places))
+        return sparse.coo_array(copied, shape=(light.shape[0], self.size)).tocsr()
 
     def _layers(self, inverse_depth: FloatArray) -> list[tuple[IntArray, FloatArray]]:
         """Pairs of layers that share the light, each with its part; beyond the first or the last all goes to it."""

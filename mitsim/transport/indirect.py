@@ -13,28 +13,24 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import Deposits
-from mitsim.transport.paths import Walk, camera_part, survival, walked
-from mitsim.transport.rays import ProjectorRays
-from mitsim.transport.receiver import Receiver
+from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
+from mitsim.transport.receiver import Receiver, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
-from mitsim.transport.source import Projector
+from mitsim.transport.source import Projector, ProjectorRays
 
 
-class IndirectTracer:
-    """Prepared once for a scene and a projector; each seed is an independent estimate."""
+class IndirectTracer(Tracer):
+    """Indirect light of a projector, and its caustics, at the sensor's centre."""
 
     def __init__(
         self,
-        scene: Any,
-        camera: Any,
+        scene: mi.Scene,
+        camera: mi.Sensor,
         projector: Projector,
         mirrors: bool,
         interreflection: bool,
@@ -52,15 +48,8 @@ class IndirectTracer:
         """Paths of one sample: one per projector pixel."""
         return self.projector.n**2
 
-    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
-        """Samples ``first`` .. ``first + samples - 1`` of every pixel, as if ``samples`` of them were all.
-
-        Raises
-        ------
-        MitsimError
-            when the scene sends NaN or infinite light to the camera.
-        """
-        return walked(partial(_Walk, self, seed), self.lanes, first, samples)
+    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        return _Walk(self, seed, sample, lane).deposits(further=True)
 
 
 class _Walk(Walk):
@@ -68,13 +57,13 @@ class _Walk(Walk):
 
     STATE = ("active", "ray", "strength", "bounce", "scattered", "rng", "kept")
 
-    def __init__(self, tracer: IndirectTracer, seed: int, sample: Any, pixel: Any) -> None:
-        super().__init__()
-        self.tracer, self.scene, self.pixel = tracer, tracer.scene, pixel
+    def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> None:
+        super().__init__(tracer.scene, tracer.mirrors, tracer.interreflection)
+        self.tracer, self.pixel = tracer, pixel
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, self.rng = streams(seed, pixel, sample)
         self.first_turn = stratified(sample, shared)
-        wavelengths, spectral = tracer.receiver.wavelengths(self.rng)
+        wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, self.rng)
         jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         self.ray = tracer.rays.sample(pixel, jitter, self.rng, wavelengths)
         self.flux = tracer.rays.flux(pixel, wavelengths) * spectral
@@ -88,40 +77,26 @@ class _Walk(Walk):
             self._connect(si)
         self._leave(si, first)
 
-    def _connect(self, si: Any) -> None:
+    def _connect(self, si: mi.SurfaceInteraction3f) -> None:
         """Light that this surface sends to the sensor's centre."""
-        found = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active)
-        value = panchromatic(found.irradiance * self.flux * self.strength)
+        reception = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active)
+        value = panchromatic(reception.irradiance * self.flux * self.strength)
         caustic = self.scattered == 0
-        value *= dr.select(caustic, 1, 1 - camera_part(found.pdf))
+        value *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
-            light = dr.select(chosen, value, 0)
-            self.keep(kind, light, self.pixel, found.tau_row, found.tau_column, found.near, self.rng)
+            self._keep(kind, reception.sightings(dr.select(chosen, value, 0), self.pixel))
 
-    def _leave(self, si: Any, first: bool) -> None:
+    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
         toward = -self.ray.d
         si.wi = si.to_local(toward)
-        number, point = self.rng.next_float32(), mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        point = self.first_turn if first else point
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        sample, value = si.bsdf().sample(context, si, number, point, self.active)
-        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        going = self.active & (sample.pdf > 0)
-        if not self.tracer.interreflection:
-            going &= delta
-        elif not self.tracer.mirrors:
-            going &= ~delta
+        sample, value, going = self._sampled(si, mi.TransportMode.Importance, self.first_turn if first else None)
+        delta = is_delta(sample)
         onward = si.to_world(sample.wo)
         # Light that is followed forward sees shading normals the other way round (Veach 1997, 5.3).
         turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
         turned /= mi.Frame3f.cos_theta(sample.wo) * dr.dot(si.n, toward)
-        self.strength *= mi.unpolarized_spectrum(value) * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
-        self.bounce += 1
-        if not first:
-            chance = survival(self.strength, (self.scattered == 0) & delta, self.bounce)
-            going &= self.rng.next_float32() < chance
-            self.strength *= dr.rcp(dr.maximum(chance, 1e-6))
-        self.active = going & (dr.max(self.strength) > 0)
+        self.strength *= value * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
+        self._end_some(going, (self.scattered == 0) & delta, first)
         self.scattered += dr.select(delta, mi.UInt32(0), mi.UInt32(1))
         self.ray = si.spawn_ray(onward)

@@ -49,42 +49,36 @@ Importance sampling of the mask is left out on purpose: the reference is the jud
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.rig.camera import CameraGeometry
+from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin
+from mitsim.transport.registering import register_once
 
 PLUGIN = "mitsim_lensless"
-_REGISTERED: set[str] = set()
-_RIGID = 1e-4
+_BOX_RADIUS = 0.5 + 1e-4
+"""Radius [pixels] of a filter that keeps light in its pixel; Mitsuba's box says 0.5 in float32."""
 
 
 def register() -> None:
     """Make ``mitsim_lensless`` known to the current variant; calling it again does nothing."""
-    variant = mi.variant()
-    if variant is None:
-        raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
-    if variant not in _REGISTERED:
-        mi.register_sensor(PLUGIN, _sensor_class())
-        _REGISTERED.add(variant)
+    register_once("sensor", PLUGIN, _sensor_class)
 
 
-def _geometry(props: Any, size: Any) -> CameraGeometry:
+def _geometry(props: mi.Properties, size: mi.ScalarVector2u) -> CameraGeometry:
     values = {name: props[name] for name in CameraGeometry.model_fields if name != "pixels" and name in props}
     if size[0] != size[1]:
         raise MitsimError(f"{PLUGIN}: film is {size[0]}x{size[1]} pixels; the sensor must be square")
     return CameraGeometry.checked(PLUGIN, pixels=int(size[0]), **values)
 
 
-def _check_rigid(matrix: npt.NDArray[np.float64]) -> None:
-    rotation = matrix[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if not (np.isfinite(matrix).all() and error < _RIGID and np.linalg.det(rotation) > 0):
+def _check_rigid(transform: mi.AffineTransform4f) -> None:
+    turn, origin = turn_and_origin(transform)
+    error = rigidity_error(turn)
+    if not (np.isfinite(turn).all() and np.isfinite(origin).all() and error < RIGID and np.linalg.det(turn) > 0):
         raise MitsimError(
             f"{PLUGIN}: to_world is no rotation and translation (it scales, shears or mirrors: R^T R is {error:.2g} "
             "from 1); lengths are mm everywhere, so move and turn the camera only"
@@ -95,16 +89,16 @@ def _sensor_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class Lensless(mi.Sensor):  # type: ignore[misc]
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.m_needs_sample_3 = True
-            if self.film().rfilter().radius() > 0.5 + 1e-4:
+            if self.film().rfilter().radius() > _BOX_RADIUS:
                 raise MitsimError(
                     f"{PLUGIN}: the film's filter spreads light between pixels; use <rfilter type='box'/>"
                 )
             if list(self.film().crop_size()) != list(self.film().size()):
                 raise MitsimError(f"{PLUGIN}: the film is cropped; the whole sensor is simulated, remove the crop")
-            _check_rigid(np.array(self.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0])
+            _check_rigid(self.world_transform())
             self.geometry = _geometry(props, self.film().size())
             terms = self.geometry.build_mask().terms
             self._weights = [weight for weight, _, _ in terms]
@@ -113,8 +107,8 @@ def _sensor_class() -> type:
             self._features = len(terms[0][1])
 
         def sample_ray(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
-        ) -> tuple[Any, Any]:
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:
             geometry = self.geometry
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             u = (1 - 2 * self._active(sample2)) * geometry.half_width
@@ -136,12 +130,12 @@ def _sensor_class() -> type:
             return ray, spectral_weight * weight
 
         def sample_ray_differential(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
-        ) -> tuple[Any, Any]:
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
 
-        def _active(self, sample: Any) -> Any:
+        def _active(self, sample: mi.Point2f) -> mi.Point2f:
             """Film points (0..1) drawn together into the active square of their pixels."""
             geometry = self.geometry
             if geometry.pixel_fill_factor == 1:
@@ -149,10 +143,11 @@ def _sensor_class() -> type:
             middle = (dr.floor(sample * geometry.pixels) + 0.5) / geometry.pixels
             return middle + (sample - middle) * (geometry.active_side / geometry.pixel_pitch)
 
-        def _transmission(self, point: Any, active: Any) -> Any:
+        def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
             """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""
-            row = dr.floor(-point.y / self.geometry.mask_feature + 0.5 * self._features)
-            column = dr.floor(-point.x / self.geometry.mask_feature + 0.5 * self._features)
+            row, column = rows_columns(point.x, point.y)
+            row = dr.floor(row / self.geometry.mask_feature + 0.5 * self._features)
+            column = dr.floor(column / self.geometry.mask_feature + 0.5 * self._features)
             inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)
             inside &= active
             row, column = mi.UInt32(dr.maximum(row, 0)), mi.UInt32(dr.maximum(column, 0))
@@ -162,7 +157,7 @@ def _sensor_class() -> type:
                 total += weight * left * dr.gather(mi.Float, columns, column, inside)
             return total
 
-        def bbox(self) -> Any:
+        def bbox(self) -> mi.ScalarBoundingBox3f:
             return mi.ScalarBoundingBox3f()
 
         def to_string(self) -> str:

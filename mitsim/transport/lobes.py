@@ -11,22 +11,24 @@ a connection by x I. So N connections see the light L of the lobes as ``N L^2 / 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
+from mitsim.transport.histogram import check_finite
 from mitsim.transport.paths import launches
-from mitsim.transport.rays import ProjectorRays
-from mitsim.transport.receiver import Receiver
+from mitsim.transport.receiver import Receiver, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, streams
-from mitsim.transport.source import Projector
+from mitsim.transport.source import Projector, ProjectorRays
 
 _SHARP = 100.0
-"""Density [1/sr] of a turn above which its lobe counts as sharp; a GGX lobe of roughness 0.03 has that."""
+"""Density [1/sr] of a turn above which its lobe counts as sharp, as a GGX lobe of roughness 0.03 does.
+
+Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
+"""
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,18 @@ class SharpLight:
 
 
 def sharp_light(
-    scene: Any, camera: Any, projector: Projector, geometry: CameraGeometry, seed: int, samples: int
+    scene: mi.Scene, camera: mi.Sensor, projector: Projector, geometry: CameraGeometry, seed: int, samples: int
 ) -> SharpLight:
-    """Direct light over lobes too sharp for connections, from ``samples`` rays of every projector pixel.
+    """Direct light over lobes too sharp for connections.
+
+    Parameters
+    ----------
+    scene, camera, projector
+        what light meets, the sensor it is received on, and where it comes from.
+    geometry
+        of the camera.
+    seed, samples
+        of the random numbers, and rays of every projector pixel.
 
     Raises
     ------
@@ -52,12 +63,12 @@ def sharp_light(
         when the scene sends NaN or infinite light to the camera.
     """
     lanes = projector.n**2
-    parts = _Lobes(scene, camera, projector, geometry)
+    lobes = _Lobes(scene, camera, projector, geometry)
     total = squares = moment = 0.0
     for sample, pixel in launches(lanes, 0, samples):
-        mean, connected = parts.meet(seed, sample, pixel)
-        if not (np.isfinite(mean).all() and np.isfinite(connected).all()):
-            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+        mean, connected = lobes.meet(seed, sample, pixel)
+        check_finite(mean)
+        check_finite(connected)
         total += float(mean.sum())
         squares += float(np.square(mean).sum())
         moment += float((mean * connected).sum())
@@ -68,15 +79,15 @@ def sharp_light(
 class _Lobes:
     """Rays of the projector that a sharp lobe of the first surface sends to the sensor."""
 
-    def __init__(self, scene: Any, camera: Any, projector: Projector, geometry: CameraGeometry) -> None:
+    def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: Projector, geometry: CameraGeometry) -> None:
         self.scene, self.camera, self.geometry = scene, camera, geometry
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
 
-    def meet(self, seed: int, sample: Any, pixel: Any) -> tuple[Any, Any]:
+    def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> tuple[FloatArray, FloatArray]:
         """Two (lanes,) arrays: estimates x of the mean irradiance, and light I of a connection to the point met."""
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-        wavelengths, spectral = self.receiver.wavelengths(rng)
+        wavelengths, spectral = sampled_wavelengths(self.camera, rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         si = self.scene.ray_intersect(ray)
         toward = -ray.d
@@ -92,9 +103,9 @@ class _Lobes:
         local = start + onward * reach
         half = dr.opaque(mi.Float, self.geometry.half_width)
         active &= (onward.z < 0) & (reach > 0) & (dr.abs(local.x) <= half) & (dr.abs(local.y) <= half)
-        found = self.receiver.receive(si, toward, mi.Point3f(local.x, local.y, 0), active)
-        light = panchromatic(found.irradiance * self.rays.flux(pixel, wavelengths) * spectral)
-        active &= (found.pdf > dr.opaque(mi.Float, _SHARP)) & (density > 0)
+        reception = self.receiver.receive(si, toward, mi.Point3f(local.x, local.y, 0), active)
+        light = panchromatic(reception.irradiance * self.rays.flux(pixel, wavelengths) * spectral)
+        active &= (reception.pdf > dr.opaque(mi.Float, _SHARP)) & (density > 0)
         per_area = density * -onward.z / dr.square(reach)
         mean = dr.select(active, light / (4 * dr.square(half) * per_area), 0)
         light = dr.select(active, light, 0)

@@ -8,8 +8,8 @@ float32: nothing for a mirror that faces the axis squarely, 1e-4 mm for a steel 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,25 +17,33 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.transport.pinhole import PinholeRays, channels, host, vectors, wavelength_sets
-from mitsim.transport.source import Projector
+from mitsim.transport.coordinates import rows_columns, turn_and_origin
+from mitsim.transport.host import channels, per_lane, vectors
+from mitsim.transport.source import PinholeRays, Projector, wavelength_sets
 
 IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
 Mask = npt.NDArray[np.bool_]
 _FAINTEST = 1e-5
+"""Part of its light below which a ray ends, after three or four reflections of glass: a hundredth of accuracy 1e-3."""
 _AGREEMENT = 1e-4
+"""Largest distance of our direction to Mitsuba's: float32 agrees to some 1e-6, another law of bending is far beyond."""
 _OFFSET = 1e-4
+"""How far a ray starts off its surface, for each mm of its coordinates: Mitsuba's own ray epsilon, 1500 roundings."""
+_GRAZING = 0.02
+"""Least cosine that this distance is divided by, so that a grazing ray does not start centimetres away."""
+_CHAIN = np.uint64(0x9E3779B97F4A7C15)
+"""Multiplier of a chain's number, 2^64 over the golden ratio: it scatters neighbouring sequences (Knuth)."""
 
 
-def delta_bsdfs(scene: Any, kinds: int) -> list[Any]:
-    """The scene's materials with a part of one of these ``mi.BSDFFlags`` (added up)."""
-    found: list[Any] = []
+def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
+    """Materials of a ``scene`` with a part of one of the ``kinds``, ``mi.BSDFFlags`` added up."""
+    materials: list[mi.BSDF] = []
     for shape in scene.shapes():
         bsdf = shape.bsdf()
-        if bsdf is not None and bsdf.flags() & kinds and bsdf not in found:
-            found.append(bsdf)
-    return found
+        if bsdf is not None and bsdf.flags() & kinds and bsdf not in materials:
+            materials.append(bsdf)
+    return materials
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +68,13 @@ class Crossings:
     tangent: FloatArray
     throughput: FloatArray
 
+    @classmethod
+    def joined(cls, parts: Sequence[Crossings]) -> Crossings:
+        """All ``parts`` in one."""
+        pair = np.zeros((0, 2))
+        none = cls(np.zeros(0, np.int64), np.zeros(0, np.uint64), pair, pair, np.zeros(0))
+        return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in vars(none)))
+
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
@@ -72,30 +87,30 @@ class _Rays:
     chain: Chains
     spectrum: FloatArray
 
-    def __getitem__(self, chosen: Any) -> _Rays:
-        parts = (self.index, self.origin, self.direction, self.start, self.chain, self.spectrum)
-        return _Rays(*(part[chosen] for part in parts))
+    @classmethod
+    def joined(cls, parts: Sequence[_Rays]) -> _Rays:
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
 class MirrorTracer:
     """Follows rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
 
     At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends
-    there: that light is the camera-side estimators'.
+    there: that light is found from the camera.
     """
 
-    def __init__(self, scene: Any, camera: Any, projector: Projector, max_depth: int) -> None:
+    def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: Projector, max_depth: int) -> None:
+        """``max_depth``: surfaces that a ray may meet between ``projector`` and ``camera``."""
         self._scene, self._max_depth = scene, max_depth
         self._wavelengths = wavelength_sets()
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
         self._lobes = [lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)]
-        matrix = np.array(camera.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
-        self._camera_turn, self._camera_place = matrix[:3, :3], matrix[:3, 3]
+        self._camera_turn, self._camera_place = turn_and_origin(camera.world_transform())
 
     def follow(self, points: FloatArray) -> Crossings:
-        """Send rays through window points (row, column) (k, 2), in projector pixels."""
+        """Send rays through window ``points`` (row, column) (k, 2), in projector pixels."""
         count = len(points)
         origin = np.broadcast_to(self.rays.origin, (count, 3))
         rays = _Rays(
@@ -106,21 +121,21 @@ class MirrorTracer:
             np.zeros(count, dtype=np.uint64),
             np.ones((count, len(self._colour))),
         )
-        found = [Crossings(np.zeros(0, np.int64), rays.chain[:0], np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))]
+        crossings = []
         for depth in range(self._max_depth + 1):
-            if not len(rays.index):
-                break
             si = self._intersect(rays)
-            distance = np.where(host(si.is_valid(), len(rays.index)), host(si.t, len(rays.index)), np.inf)
+            distance = np.where(per_lane(si.is_valid(), len(rays.index)), per_lane(si.t, len(rays.index)), np.inf)
             distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
             crossing, arrived = self._cross(rays, distance)
             if depth:
-                found.append(crossing)
-            rays = self._bounce(rays, si, ~arrived & np.isfinite(distance))
-        parts = zip(*((c.ray, c.chain, c.sensor, c.tangent, c.throughput) for c in found), strict=True)
-        return Crossings(*(np.concatenate(part) for part in parts))
+                crossings.append(crossing)
+            onward = self._bounce(rays, si, ~arrived & np.isfinite(distance))
+            if not onward:
+                break
+            rays = _Rays.joined(onward)
+        return Crossings.joined(crossings)
 
-    def _intersect(self, rays: _Rays) -> Any:
+    def _intersect(self, rays: _Rays) -> mi.SurfaceInteraction3f:
         ray = mi.Ray3f(mi.Point3f(rays.start.T.astype(np.float32)), mi.Vector3f(rays.direction.T.astype(np.float32)))
         si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
         dr.eval(si)
@@ -138,42 +153,40 @@ class MirrorTracer:
         crossing = Crossings(
             rays.index[arrived],
             rays.chain[arrived],
-            -(o + d * r)[:, 1::-1],
-            -(d[:, :2] / d[:, 2:])[:, ::-1],
+            _rows_columns(o + d * r),
+            _rows_columns(d / d[:, 2:]),
             rays.spectrum[arrived] @ self._colour,
         )
         return crossing, arrived
 
-    def _bounce(self, rays: _Rays, si: Any, active: Mask) -> _Rays:
-        """The rays that go on, polished; see the module."""
+    def _bounce(self, rays: _Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[_Rays]:
+        """The rays that go on, polished, by lobe; see the module."""
         count = len(active)
         point, geometric, normal = _polished(rays, si)
-        shapes = host(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
+        shapes = per_lane(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
         onward: list[_Rays] = []
         for lobe in self._lobes:
             here = mi.Bool(active) & (si.bsdf() == mi.BSDFPtr(lobe.bsdf))
             if not dr.any(here):
                 continue
             sample, weight = self._sampled(lobe, si, here)
-            kind, eta = host(sample.sampled_type, count), host(sample.eta, count)
+            kind, eta = per_lane(sample.sampled_type, count), per_lane(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
-            chosen = np.flatnonzero(host(here, count) & single & ((spectrum @ self._colour) > _FAINTEST))
+            chosen = np.flatnonzero(per_lane(here, count) & single & ((spectrum @ self._colour) > _FAINTEST))
             traced = vectors(si.to_world(sample.wo), count)[chosen]
             direction = _redirected(rays.direction[chosen], normal[chosen], kind[chosen], eta[chosen], traced)
             slope = np.abs((direction * geometric[chosen]).sum(axis=1))
-            clear = _OFFSET * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, 0.02)
+            clear = _OFFSET * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
             reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
             code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
-            chain = rays.chain[chosen] * np.uint64(0x9E3779B97F4A7C15) + code
+            chain = rays.chain[chosen] * _CHAIN + code
             start = point[chosen] + direction * clear[:, None]
-            onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
-        if not onward:
-            return rays[np.zeros(0, dtype=np.int64)]
-        names = ("index", "origin", "direction", "start", "chain", "spectrum")
-        return _Rays(*(np.concatenate([getattr(part, name) for part in onward]) for name in names))
+            if len(chosen):
+                onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
+        return onward
 
-    def _sampled(self, lobe: _Lobe, si: Any, active: Any) -> tuple[Any, FloatArray]:
+    def _sampled(self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.BSDFSample3f, FloatArray]:
         """Direction sample, and weights (k, channels) over all wavelength sets."""
         weights = []
         for wavelengths in self._wavelengths:
@@ -192,13 +205,13 @@ class _Lobe:
     If so, Mitsuba has divided the weight by the probability of the choice, which is the sample's ``pdf``.
     """
 
-    bsdf: Any
-    context: Any
+    bsdf: mi.BSDF
+    context: mi.BSDFContext
     choice: float = 0.5
     by_chance: bool = False
 
 
-def _lobes(bsdf: Any) -> list[_Lobe]:
+def _lobes(bsdf: mi.BSDF) -> list[_Lobe]:
     """Every delta part of a material, so that nothing is left to chance.
 
     Parts are chosen by type, because components of a ``twosided`` are not numbered alike on both sides; those of a
@@ -224,7 +237,7 @@ def _lobes(bsdf: Any) -> list[_Lobe]:
     return lobes
 
 
-def _polished(rays: _Rays, si: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Hit point, geometric and shading normal (k, 3), the ray met in float64 with the surface's tangent plane."""
     count = len(rays.index)
     hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
@@ -249,8 +262,13 @@ def _redirected(
     reflected = direction - 2 * cosine * normal
     inside = 1 - (1 - cosine**2) / eta[:, None] ** 2
     refracted = (direction - cosine * normal) / eta[:, None] + np.sign(cosine) * np.sqrt(np.maximum(inside, 0)) * normal
-    exact = np.where((kind & int(mi.BSDFFlags.DeltaTransmission))[:, None] != 0, refracted, direction)
-    exact = np.where((kind & int(mi.BSDFFlags.DeltaReflection))[:, None] != 0, reflected, exact)
-    agrees = np.linalg.norm(exact - traced, axis=1, keepdims=True) < _AGREEMENT
-    chosen = np.where(agrees, exact, traced)
+    polished = np.where((kind & int(mi.BSDFFlags.DeltaTransmission))[:, None] != 0, refracted, direction)
+    polished = np.where((kind & int(mi.BSDFFlags.DeltaReflection))[:, None] != 0, reflected, polished)
+    agrees = np.linalg.norm(polished - traced, axis=1, keepdims=True) < _AGREEMENT
+    chosen = np.where(agrees, polished, traced)
     return np.asarray(chosen / np.linalg.norm(chosen, axis=1, keepdims=True))
+
+
+def _rows_columns(points: FloatArray) -> FloatArray:
+    """(k, 2) index coordinates of points (k, 3) of the camera's frame."""
+    return np.stack(rows_columns(points[:, 0], points[:, 1]), axis=1)

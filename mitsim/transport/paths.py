@@ -3,31 +3,45 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
+from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits, Sightings
 
 _KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 _LANES_PER_LAUNCH = 2**22
+"""Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
 _SHARP = 1.0
-"""Density [1/sr] of sampling a turn above which its light is looked for from the camera; 0.32 is a matt surface's."""
+"""Density [1/sr] of sampling a turn above which its light is looked for from the camera.
+
+Three times a matt surface's 0.32, so that none of its light is, and low enough for connections to hold the rest.
+"""
 _MIRRORS = 16
+"""Mirrors that a path meets without the risk to end there: as many as the depth of glints."""
 _LONGEST = 0.999
 """Largest chance to go on: paths end even where nothing is absorbed.
 
 In a closed room of reflectance rho the light of a path grows by rho / chance a reflection, and its second moment is
 finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the light at reflectance 0.99, 79 % at 0.999.
 """
+_LEAST_CHANCE = 1e-6
+"""Strength is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
 
-def launches(lanes: int, first: int, samples: int) -> Iterator[tuple[Any, Any]]:
-    """(sample, lane) of samples ``first`` .. ``first + samples - 1`` of ``lanes`` lanes each, one kernel at a time."""
+def launches(lanes: int, first: int, samples: int) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
+    """(sample, lane) of every path, one kernel's at a time.
+
+    Parameters
+    ----------
+    lanes
+        paths of one sample.
+    first, samples
+        samples ``first`` .. ``first + samples - 1`` are meant.
+    """
     total, start = lanes * samples, lanes * first
     for done in range(0, total, _LANES_PER_LAUNCH):
         index = dr.arange(mi.UInt64, min(_LANES_PER_LAUNCH, total - done)) + dr.opaque(mi.UInt64, start + done)
@@ -36,7 +50,7 @@ def launches(lanes: int, first: int, samples: int) -> Iterator[tuple[Any, Any]]:
         yield mi.UInt32(index // per_sample), mi.UInt32(index % per_sample)
 
 
-def camera_part(pdf: Any) -> Any:
+def camera_part(pdf: mi.Float) -> mi.Float:
     """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
 
     ``pdf`` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to
@@ -46,36 +60,40 @@ def camera_part(pdf: Any) -> Any:
     return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)
 
 
-def survival(strength: Any, mirrored: Any, bounce: Any) -> Any:
-    """Chance that a path goes on: what it still carries; chains of mirrors are short and full of light."""
-    return dr.select(mirrored & (bounce < _MIRRORS), 1, dr.minimum(dr.max(strength), _LONGEST))
+def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
+    """Whether the direction of ``sample`` is a mirror's, or straight on."""
+    return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
 
 
-@dataclass
-class Reservoir:
-    """Of many connections, one drawn in proportion to its light, which carries the light of all: ``value``.
+class Tracer(ABC):
+    """Light of a scene; prepared once, each seed is an independent estimate."""
 
-    ``source`` is its projector pixel, the rest where it is filed.
-    """
+    @property
+    @abstractmethod
+    def lanes(self) -> int:
+        """Paths, or connections, of one sample."""
 
-    value: Any
-    source: Any
-    tau_row: Any
-    tau_column: Any
-    near: Any
+    @abstractmethod
+    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        """Light of the paths of one kernel."""
 
-    @classmethod
-    def empty(cls) -> Reservoir:
-        """No light yet."""
-        return cls(mi.Float(0), mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0))
+    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
+        """Light of some samples, their sum.
 
-    def joined_by(self, value: Any, source: Any, tau_row: Any, tau_column: Any, near: Any, rng: Any) -> Reservoir:
-        """With one more connection, which stands for all with the chance of its part."""
-        total = self.value + value
-        new = rng.next_float32() * total < value
-        mine = (self.source, self.tau_row, self.tau_column, self.near)
-        chosen = (dr.select(new, a, b) for a, b in zip((source, tau_row, tau_column, near), mine, strict=True))
-        return Reservoir(total, *chosen)
+        Parameters
+        ----------
+        seed
+            of the random numbers.
+        first, samples
+            samples ``first`` .. ``first + samples - 1`` of the seed's sequence are traced.
+
+        Raises
+        ------
+        MitsimError
+            when the scene sends NaN or infinite light to the camera.
+        """
+        launched = [self._launch(seed, *launch) for launch in launches(self.lanes, first, samples)]
+        return Deposits.joined([deposits for parts in launched for deposits in parts])
 
 
 class Walk(ABC):
@@ -87,42 +105,67 @@ class Walk(ABC):
 
     STATE: ClassVar[tuple[str, ...]]
 
-    def __init__(self) -> None:
-        self.kept = {kind: Reservoir.empty() for kind in _KINDS}
+    active: mi.Bool
+    strength: mi.Spectrum
+    bounce: mi.UInt32
+    rng: mi.PCG32
+
+    def __init__(self, scene: mi.Scene, mirrors: bool, interreflection: bool) -> None:
+        """``mirrors``: paths over delta reflections and transmissions; ``interreflection``: over other surfaces."""
+        self.scene, self.mirrors, self.interreflection = scene, mirrors, interreflection
+        self.kept = {kind: Sightings.none() for kind in _KINDS}
 
     @abstractmethod
     def vertex(self, first: bool) -> None:
-        """Find the next surface of every path, connect it, and leave it."""
+        """Find the next surface of every path (its ``first`` or a later one), connect it, and leave it."""
 
-    def keep(self, kind: str, value: Any, source: Any, tau_row: Any, tau_column: Any, near: Any, rng: Any) -> None:
-        """Light of one connection, and where it is filed."""
-        self.kept[kind] = self.kept[kind].joined_by(value, source, tau_row, tau_column, near, rng)
+    def _keep(self, kind: str, seen: Sightings) -> None:
+        """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
+        self.kept[kind] = self.kept[kind].joined_by(seen, self.rng)
+
+    def _sampled(
+        self, si: mi.SurfaceInteraction3f, mode: mi.TransportMode, chosen: mi.Point2f | None = None
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum, mi.Bool]:
+        """Where each path could go on, the light it would keep, and whether such turns are followed.
+
+        The point ``chosen`` stands in for a random one.
+        """
+        number, point = self.rng.next_float32(), mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        point = point if chosen is None else chosen
+        sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, self.active)
+        going = self.active & (sample.pdf > 0)
+        if not self.interreflection:
+            going &= is_delta(sample)
+        elif not self.mirrors:
+            going &= ~is_delta(sample)
+        return sample, mi.unpolarized_spectrum(value), going
+
+    def _end_some(self, going: mi.Bool, mirrored: mi.Bool, first: bool) -> None:
+        """Go on with a chance: what a path still carries; but chains of mirrors are short and full of light."""
+        self.bounce += 1
+        if not first:
+            carried = dr.minimum(dr.max(self.strength), _LONGEST)
+            chance = dr.select(mirrored & (self.bounce < _MIRRORS), 1, carried)
+            going &= self.rng.next_float32() < chance
+            self.strength *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
+        self.active = going & (dr.max(self.strength) > 0)
 
     def deposits(self, further: bool) -> list[Deposits]:
-        """Follow every path to its end, or to the first surface only, and take its light to the host."""
+        """Light on the host of every path, followed to its end or, unless ``further``, to the first surface only."""
         self.vertex(first=True)
         if further:
             self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
         dr.eval(self.kept)
-        return [
-            Deposits.fetched(kept.value, kept.source, kept.tau_row, kept.tau_column, kept.near, _KINDS[kind])
-            for kind, kept in self.kept.items()
-        ]
+        return [Deposits.fetched(seen, _KINDS[kind]) for kind, seen in self.kept.items()]
 
-    def _body(self, *values: Any) -> tuple[Any, ...]:
+    def _body(self, *values: object) -> tuple[object, ...]:
         self._load(values)
         self.vertex(first=False)
         return self._values()
 
-    def _values(self) -> tuple[Any, ...]:
+    def _values(self) -> tuple[object, ...]:
         return tuple(getattr(self, name) for name in self.STATE)
 
-    def _load(self, values: tuple[Any, ...]) -> None:
+    def _load(self, values: tuple[object, ...]) -> None:
         for name, value in zip(self.STATE, values, strict=True):
             setattr(self, name, value)
-
-
-def walked(walk: Callable[[Any, Any], Walk], lanes: int, first: int, samples: int, further: bool = True) -> Deposits:
-    """Light of samples ``first`` .. ``first + samples - 1``; ``walk`` makes the paths of some (samples, lanes)."""
-    parts = [walk(*one).deposits(further) for one in launches(lanes, first, samples)]
-    return Deposits.joined([deposits for part in parts for deposits in part])

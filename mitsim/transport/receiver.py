@@ -13,38 +13,57 @@ where every path counts for a pixel that is known from the start.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mitsim.rig.camera import CameraGeometry
+from mitsim.transport.coordinates import rows_columns
+from mitsim.transport.histogram import Sightings
 
 
 @dataclass
 class Reception:
     """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
 
-    ``tau_row``, ``tau_column`` and ``near`` (1/z) as in :class:`mitsim.transport.histogram.Deposits`; ``pdf`` is that
-    of sampling the turn at P from the sensor's side.
+    ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.histogram.Deposits`; ``pdf`` is that of
+    sampling the turn at P from the sensor's side.
     """
 
-    irradiance: Any
-    tau_row: Any
-    tau_column: Any
-    near: Any
-    pdf: Any
+    irradiance: mi.Spectrum
+    row: mi.Float
+    column: mi.Float
+    inverse_depth: mi.Float
+    pdf: mi.Float
+
+    def sightings(self, value: mi.Float, pixel: mi.UInt32) -> Sightings:
+        """Light ``value`` [W m^-2] of projector pixels ``pixel``, seen from here."""
+        return Sightings(value, pixel, self.row, self.column, self.inverse_depth)
 
 
 class Receiver:
     """Prepared once for a scene and a camera; ``geometry`` stands in for the camera's own."""
 
-    def __init__(self, scene: Any, camera: Any, geometry: CameraGeometry | None = None) -> None:
+    def __init__(self, scene: mi.Scene, camera: mi.Sensor, geometry: CameraGeometry | None = None) -> None:
         self.scene, self.camera = scene, camera
         self.geometry: CameraGeometry = geometry or camera.geometry
 
-    def receive(self, si: Any, toward: Any, local: Any, active: Any) -> Reception:
-        """Connect surface points, lit from directions ``toward``, to sensor points ``local`` in the camera's frame."""
+    def receive(
+        self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool
+    ) -> Reception:
+        """Connect lit surface points to sensor points.
+
+        Parameters
+        ----------
+        si
+            the surface points.
+        toward
+            unit directions that they are lit from, in the world.
+        local
+            sensor points in the camera's frame [mm].
+        active
+            lanes that count.
+        """
         to_world = self.camera.world_transform()
         point = to_world.inverse() @ si.p
         sensor = to_world @ local
@@ -62,13 +81,13 @@ class Receiver:
         geometric = dr.abs(dr.dot(si.n, direction)) * cosine / (squared * dr.abs(dr.dot(si.n, toward)))
         if self.geometry.angular_exponent > 0:
             geometric *= dr.power(cosine, dr.opaque(mi.Float, self.geometry.angular_exponent))
-        near = dr.rcp(point.z)
+        inverse_depth = dr.rcp(point.z)
         irradiance = dr.select(active, mi.unpolarized_spectrum(reflected) * geometric, 0)
-        return Reception(irradiance, -point.y * near, -point.x * near, near, pdf)
+        row, column = rows_columns(point.x, point.y)
+        return Reception(irradiance, row * inverse_depth, column * inverse_depth, inverse_depth, pdf)
 
-    def wavelengths(self, rng: Any) -> tuple[Any, Any]:
-        """Wavelengths of a path, and the weight of its light; neither matters but in spectral variants."""
-        found: tuple[Any, Any] = self.camera.sample_wavelengths(
-            dr.zeros(mi.SurfaceInteraction3f), rng.next_float32(), True
-        )
-        return found
+
+def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
+    """Wavelengths of a path to ``camera``, drawn by ``rng``, and its weight; but in spectral variants, none and 1."""
+    wavelengths, weight = camera.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_float32(), True)
+    return wavelengths, weight

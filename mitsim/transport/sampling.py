@@ -8,45 +8,50 @@ unbiased. The other dimensions are plain random numbers.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
-SEQUENCE_BITS = 20
-"""Samples a cell may get: 2^20."""
+_SEQUENCE_BITS = 20
+"""Bits of a sample's number that count: 2^20 samples of a stream differ; each bit costs every sample a step."""
 
 
-def generator(seed: Any, stream: Any) -> Any:
-    """An independent PCG32 for each stream; neighbouring streams are scattered by the cipher TEA, as in Mitsuba."""
+def generator(seed: mi.UInt32, stream: mi.UInt32) -> mi.PCG32:
+    """An independent PCG32 for each ``stream`` of a ``seed``; the cipher TEA scatters neighbours, as in Mitsuba."""
     state, sequence = mi.sample_tea_32(seed, stream)
     return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 
 
-def streams(seed: int, stream: Any, sample: Any) -> tuple[Any, Any]:
-    """Two generators for one sample of a stream: one that all its samples share, which :func:`stratified` scrambles
-    them by, and one of its own."""
+def streams(seed: int, stream: mi.UInt32, sample: mi.UInt32) -> tuple[mi.PCG32, mi.PCG32]:
+    """Two generators for one sample of a stream.
+
+    Parameters
+    ----------
+    seed, stream
+        of the one that all the stream's samples share, which :func:`stratified` scrambles them by.
+    sample
+        number of the sample, which has the other for its own.
+    """
     shared = dr.opaque(mi.UInt32, seed)
     return generator(shared, stream), generator(shared ^ (sample * 0x9E3779B9 + 1), stream)
 
 
-def stratified(index: Any, rng: Any) -> Any:
+def stratified(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
     """Point ``index`` of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
     first = _scrambled(dr.brev(index), rng.next_uint32())
     second = _scrambled(_second_dimension(index), rng.next_uint32())
     return mi.Point2f(_unit(first), _unit(second))
 
 
-def _second_dimension(index: Any) -> Any:
+def _second_dimension(index: mi.UInt32) -> mi.UInt32:
     """Dimension 2 of Sobol's sequence, 32-bit fixed point: direction numbers of the polynomial x + 1."""
     result, direction = mi.UInt32(0), 1 << 31
-    for bit in range(SEQUENCE_BITS):
+    for bit in range(_SEQUENCE_BITS):
         result = dr.select((index & (1 << bit)) != 0, result ^ direction, result)
         direction ^= direction >> 1
     return result
 
 
-def _scrambled(bits: Any, seed: Any) -> Any:
+def _scrambled(bits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Nested uniform scrambling: each bit is flipped by a hash of those above it."""
     x = dr.brev(bits) + seed
     for multiplier in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
@@ -54,13 +59,13 @@ def _scrambled(bits: Any, seed: Any) -> Any:
     return dr.brev(x)
 
 
-def _unit(bits: Any) -> Any:
+def _unit(bits: mi.UInt32) -> mi.Float:
     """[0, 1) from the upper 24 bits, all that a float32 holds."""
     return mi.Float(bits >> 8) * (1 / 2**24)
 
 
-def panchromatic(radiance: Any) -> Any:
-    """One number for a spectrum, by a flat response: the mean over channels, or over wavelength 360-830 nm.
+def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
+    """One number for a spectrum of ``radiance``, by a flat response: the mean over channels, or over 360-830 nm.
 
     In spectral variants the radiance has been divided by the density of its sampled wavelengths, so the mean over
     samples is an integral; dividing by the range makes a flat spectrum of 1 count as 1, as in the other variants.

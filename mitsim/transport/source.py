@@ -1,19 +1,37 @@
-"""The projector as a light source: from points of the scene to connections that name the projector pixel they used.
+"""The projector as tracers see it: from a pixel of its window to the ray through it, its area, and the flux it sends.
 
-A pinhole is the stock Mitsuba ``projector``. With a lens of finite radius, a point q of the lens shows the pattern that
-is sharp on the focus plane: a ray from q through surface point p carries the projector pixel whose image lies where the
-ray meets that plane. Radiance is ``pi scale texture / (A cos^4 theta)``, so that a small lens of area A casts the
-pinhole's irradiance. A blurred spot moves each connection by a normal deviate in projector pixels.
+A stock ``projector`` emitter does not tell its field of view, so it is asked for the uv of many points; its power is
+what it casts on the plane at unit distance, pi x scale x texture. A ray of a pixel that is cut into N rays carries
+``phi = pi scale texture a / N``, a being the pixel's area on that plane: the same through every point of a lens. Every
+pixel has its own rays, so light is never attributed to a pixel by chance.
+
+The map is written once (:class:`CanvasMap`, and :class:`Projector` for the window) and used in two kinds of
+numbers: the renderer's float32, a lane each (:class:`ProjectorRays`), and the host's float64 (:class:`PinholeRays`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.transport.coordinates import Numbers, turn_and_origin
+from mitsim.transport.host import channels, per_lane
+
+_WAVELENGTH_SETS = 8
+"""Sets of four wavelengths: 15 nm apart, finer than any measured spectrum that a scene would hold."""
+_FAR = 1000.0
+"""Depth [mm] at which the emitter is asked: large beside its place, so that float32 coordinates do not matter."""
+_PROBES = 24
+"""Points a side that the map is fitted to: 24^2 bring float32's 6e-8 of the canvas a point to 3e-9."""
+_FIRST_REACH = 0.02
+"""Tan-angle of the first points: inside the picture of any projector of more than 2.3 degrees."""
+_PROBE_STEP = 1e-2
+"""Tan-angle between the two points that a pixel's size is read from: inside the same pictures."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +42,7 @@ class Projector:
     standard deviation of a projector pixel's spot, in projector pixels.
     """
 
-    emitter: Any
+    emitter: mi.Emitter
     n: int
     first_row: int
     first_column: int
@@ -38,99 +56,197 @@ class Projector:
         """A pinhole with sharp pixels."""
         return self.aperture == 0 and self.blur == 0
 
+    def canvas_point(self, row: Numbers, column: Numbers) -> tuple[Numbers, Numbers]:
+        """Canvas coordinates (u, v), 0..1, of the window's point ``row``, ``column`` in pixels."""
+        return (column + self.first_column) / self.canvas[1], (row + self.first_row) / self.canvas[0]
 
-@dataclass
-class Connection:
-    """From a scene point to the projector: unit direction, lens point, weight (radiance / pdf), pdf [1/sr], pixel.
+    def pixel_at(self, uv: mi.Point2f) -> mi.UInt32:
+        """The window's pixel (row-major) at canvas point ``uv``; outside of the window, the nearest."""
+        rows, columns = self.canvas
+        row = dr.clip(dr.floor(uv.y * rows) - self.first_row, 0, self.n - 1)
+        column = dr.clip(dr.floor(uv.x * columns) - self.first_column, 0, self.n - 1)
+        return mi.UInt32(row * self.n + column)
 
-    ``pdf`` is 0 for a pinhole, which no sampled direction can find.
+    def pixel_size(self) -> tuple[float, float]:
+        """Size (x, y) of a pixel on the plane at unit distance [mm], as the emitter's own float32 tells it.
+
+        :class:`CanvasMap` knows it better, by 1e-4; but frames of a blurred spot are equal bit for bit from version to
+        version only with this.
+        """
+        probe = dr.zeros(mi.SurfaceInteraction3f, 2)
+        probe.p = self.emitter.world_transform() @ mi.Point3f([0.0, _PROBE_STEP], [0.0, _PROBE_STEP], [1.0, 1.0])
+        sample, _ = self.emitter.sample_direction(probe, mi.Point2f(0.5))
+        u, v = per_lane(sample.uv.x, 2), per_lane(sample.uv.y, 2)
+        rows, columns = self.canvas
+        return _PROBE_STEP / (abs(u[1] - u[0]) * columns), _PROBE_STEP / (abs(v[1] - v[0]) * rows)
+
+
+@dataclass(frozen=True, eq=False)
+class CanvasMap:
+    """Where a stock ``projector`` sends its canvas: local tan-angles x = x[0] u + x[1], y = y[0] v + y[1].
+
+    ``turn`` (3, 3) and ``origin`` (3,) [mm] take local points to the world.
     """
 
-    direction: Any
-    target: Any
-    weight: Any
-    pdf: Any
-    pixel: Any
-    valid: Any
+    turn: FloatArray
+    origin: FloatArray
+    x: FloatArray
+    y: FloatArray
+
+    @classmethod
+    def of(cls, emitter: mi.Emitter) -> CanvasMap:
+        """The map of an ``emitter``, fitted in float64 to what it says in float32 (6e-8 of the canvas a point)."""
+        turn, origin = turn_and_origin(mi.traverse(emitter)["to_world"])
+        reach = _FIRST_REACH
+        for _ in range(2):  # first near the axis, to learn the field of view, then over all of it
+            x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-reach, reach, _PROBES)] * 2))
+            local = np.stack([x, y, np.ones(x.size)], axis=1)
+            uv = _asked(emitter, turn, origin, local, None)[0].uv
+            fits = [
+                np.linalg.lstsq(np.stack([per_lane(part, x.size), np.ones(x.size)], axis=1), tangent, rcond=None)[0]
+                for part, tangent in ((uv.x, x), (uv.y, y))
+            ]
+            reach = 0.49 * min(abs(fits[0][0]), abs(fits[1][0]))
+        return cls(turn, origin, fits[0], fits[1])
+
+    def tangents(self, u: Numbers, v: Numbers, number: Callable[[float], Numbers] = float) -> tuple[Numbers, Numbers]:
+        """Local tan-angles (x, y) of points of the canvas.
+
+        Parameters
+        ----------
+        u, v
+            canvas coordinates, 0..1.
+        number
+            turns the map's numbers into numbers of their kind.
+        """
+        x, y = ([number(float(value)) for value in axis] for axis in (self.x, self.y))
+        return x[0] * u + x[1], y[0] * v + y[1]
+
+    def pixel_area(self, canvas: Sequence[int]) -> float:
+        """Area [mm^2] of a pixel of a ``canvas`` (rows, columns) on the plane at unit distance."""
+        return float(abs(self.x[0] * self.y[0]) / (canvas[0] * canvas[1]))
 
 
-class Source:
-    """Connections to one projector; prepared once."""
+class ProjectorRays:
+    """Rays of a projector, with its lens and its blur, a lane each.
+
+    Prepared once; numbers are opaque, so one compiled kernel serves all projectors of a kind.
+    """
 
     def __init__(self, projector: Projector) -> None:
-        self.projector, self.emitter = projector, projector.emitter
-        if not projector.ideal:
-            self._to_world = self.emitter.world_transform()
-            self._pixel_at_unit = self._pixel_size()
+        self.projector, self._map = projector, CanvasMap.of(projector.emitter)
 
-    def connect(self, si: Any, rng: Any, active: Any) -> Connection:
-        """Connect surface points to the projector; visibility is the caller's."""
-        if self.projector.ideal:
-            ds, weight = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
-            return Connection(ds.d, ds.p, weight, mi.Float(0), self._pixel(ds.uv), active & (ds.pdf > 0))
-        local = self._to_world.inverse() @ si.p
-        lens = mi.Point3f(0)
-        if self.projector.aperture > 0:
-            disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
-            lens = mi.Point3f(disk.x, disk.y, 0) * dr.opaque(mi.Float, self.projector.aperture)
-        offset = local - lens
-        pixel, strength, valid = self._seen(lens, offset, rng, active & (local.z > 0))
-        distance = dr.norm(offset)
-        cosine = offset.z / distance
-        # Irradiance on a plane z = const is pi scale texture / z^2 from every point of the lens.
-        weight = strength / (dr.square(local.z) * cosine)
-        target = self._to_world @ lens
-        pdf = dr.square(distance) / (cosine * self._area) if self.projector.aperture > 0 else mi.Float(0)
-        return Connection(dr.normalize(target - si.p), target, weight, pdf, pixel, valid)
+    def sample(self, pixel: mi.UInt32, jitter: mi.Point2f, rng: mi.PCG32, wavelengths: mi.Color0f) -> mi.Ray3f:
+        """A ray through each pixel, and through random points of the lens and of the blurred spot.
 
-    def hit(self, ray: Any, reach: Any, rng: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """Sampled rays that meet the lens before ``reach``: radiance, pdf of :meth:`connect`, pixel, whether it is met.
-
-        Needs a finite aperture.
+        Parameters
+        ----------
+        pixel
+            number of the projector pixel, row-major.
+        jitter
+            point of the pixel (column, row), 0..1.
+        rng
+            random numbers for lens and spot, if there are any.
+        wavelengths
+            of the ray [nm].
         """
-        inverse = self._to_world.inverse()
-        origin, direction = inverse @ ray.o, inverse @ ray.d
-        distance = -origin.z / direction.z
-        lens = origin + direction * distance
-        radius = dr.opaque(mi.Float, self.projector.aperture)
-        met = active & (origin.z > 0) & (direction.z < 0) & (distance < reach)
-        met &= dr.square(lens.x) + dr.square(lens.y) <= dr.square(radius)
-        pixel, strength, met = self._seen(lens, -direction, rng, met)
-        cosine = -direction.z
-        radiance = strength / (self._area * dr.square(dr.square(cosine)))
-        return radiance, dr.square(distance) / (cosine * self._area), pixel, met
+        projector = self.projector
+        n = dr.opaque(mi.UInt32, projector.n)
+        row, column = mi.Float(pixel // n) + jitter.y, mi.Float(pixel % n) + jitter.x
+        if projector.blur > 0:
+            spot = mi.warp.square_to_std_normal(mi.Point2f(rng.next_float32(), rng.next_float32()))
+            spread = dr.opaque(mi.Float, projector.blur)
+            row, column = row + spread * spot.y, column + spread * spot.x
+        image = self._image(row, column)
+        lens = mi.Vector3f(0)
+        if projector.aperture > 0:
+            disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
+            lens = mi.Vector3f(disk.x, disk.y, 0) * dr.opaque(mi.Float, projector.aperture)
+            image = image - lens / dr.opaque(mi.Float, projector.focus)
+        turn = mi.Matrix3f(self._map.turn.tolist())
+        return mi.Ray3f(self._origin + turn @ lens, dr.normalize(turn @ image), 0.0, wavelengths)
+
+    def flux(self, pixel: mi.UInt32, wavelengths: mi.Color0f) -> mi.Spectrum:
+        """Flux of each ``pixel`` at ``wavelengths`` [W m^-2 mm^2]: irradiance at unit distance times area there."""
+        n = dr.opaque(mi.UInt32, self.projector.n)
+        centre = self._image(mi.Float(pixel // n) + 0.5, mi.Float(pixel % n) + 0.5)
+        at = dr.zeros(mi.SurfaceInteraction3f)
+        at.wavelengths = wavelengths
+        at.p = self._origin + mi.Matrix3f(self._map.turn.tolist()) @ (centre * _FAR)
+        _, weight = self.projector.emitter.sample_direction(at, mi.Point2f(0.5), True)
+        area = self._map.pixel_area(self.projector.canvas)
+        return weight * (_FAR**2 * dr.rsqrt(dr.squared_norm(centre)) * area)
 
     @property
-    def _area(self) -> Any:
-        return dr.pi * dr.square(dr.opaque(mi.Float, self.projector.aperture))
+    def _origin(self) -> mi.Point3f:
+        return mi.Point3f(self._map.origin.tolist())
 
-    def _seen(self, lens: Any, direction: Any, rng: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Pixel, pi scale texture, and validity of the light that leaves a lens point in a direction (both local)."""
-        focus = dr.opaque(mi.Float, self.projector.focus)
-        image = lens + direction * (focus / direction.z)
-        if self.projector.blur > 0:
-            spot = mi.warp.square_to_std_normal(mi.Point2f(rng.next_float32(), rng.next_float32()))
-            step = dr.opaque(mi.Float, self.projector.blur) * focus
-            image += mi.Vector3f(spot.x * self._pixel_at_unit[0], spot.y * self._pixel_at_unit[1], 0) * step
-        at = dr.zeros(mi.SurfaceInteraction3f)
-        # A point plus a vector is a vector to Mitsuba, and vectors are not moved.
-        at.p = self._to_world @ mi.Point3f(image)
-        ds, weight = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
-        strength = weight * (dr.square(image.z) * image.z / dr.norm(image))
-        return self._pixel(ds.uv), strength, active & (ds.pdf > 0)
+    def _image(self, row: mi.Float, column: mi.Float) -> mi.Vector3f:
+        """Where a point of the window lies on the plane at unit distance, in the projector's frame."""
+        canvas_point = self.projector.canvas_point(row, column)
+        return mi.Vector3f(*self._map.tangents(*canvas_point, lambda value: dr.opaque(mi.Float, value)), 1)
 
-    def _pixel(self, uv: Any) -> Any:
-        rows, columns = self.projector.canvas
-        last = self.projector.n - 1
-        row = dr.clip(dr.floor(uv.y * rows) - self.projector.first_row, 0, last)
-        column = dr.clip(dr.floor(uv.x * columns) - self.projector.first_column, 0, last)
-        return mi.UInt32(row * self.projector.n + column)
 
-    def _pixel_size(self) -> tuple[float, float]:
-        """Size (x, y) of a projector pixel on the plane at unit distance [mm]."""
-        probe = dr.zeros(mi.SurfaceInteraction3f, 2)
-        probe.p = self._to_world @ mi.Point3f([0.0, 1e-2], [0.0, 1e-2], [1.0, 1.0])
-        ds, _ = self.emitter.sample_direction(probe, mi.Point2f(0.5))
-        u, v = (np.array(axis, dtype=np.float64) for axis in (ds.uv.x, ds.uv.y))
-        rows, columns = self.projector.canvas
-        return 1e-2 / (abs(u[1] - u[0]) * columns), 1e-2 / (abs(v[1] - v[0]) * rows)
+def wavelength_sets() -> list[mi.Color0f | None]:
+    """Wavelengths [nm] at which spectra are taken: none but for spectral variants, there evenly over the range."""
+    if not mi.is_spectral:
+        return [None]
+    size = len(dr.zeros(mi.UnpolarizedSpectrum))
+    step = (mi.MI_CIE_MAX - mi.MI_CIE_MIN) / (_WAVELENGTH_SETS * size)
+    even = mi.MI_CIE_MIN + step * (np.arange(_WAVELENGTH_SETS * size) + 0.5)
+    return [type(dr.zeros(mi.Ray3f).wavelengths)(*even[i::_WAVELENGTH_SETS].tolist()) for i in range(_WAVELENGTH_SETS)]
+
+
+class PinholeRays:
+    """Rays of a projector without lens and blur, in float64.
+
+    Attributes
+    ----------
+    origin
+        (3,) pinhole in world coordinates [mm].
+    area
+        area of one pixel on the plane at unit distance [mm^2 at 1 mm].
+    power
+        (n * n, channels) irradiance on that plane that each pixel casts, by colour channel or wavelength [W m^-2].
+    """
+
+    def __init__(self, projector: Projector, wavelengths: Sequence[mi.Color0f | None]) -> None:
+        """``wavelengths``: sets at which spectra are taken, from :func:`wavelength_sets`."""
+        self._projector, n = projector, projector.n
+        self._map = CanvasMap.of(projector.emitter)
+        self.origin = self._map.origin
+        self.area = self._map.pixel_area(projector.canvas)
+        centre = np.stack(np.divmod(np.arange(n * n), n), axis=1) + 0.5
+        self.power = np.concatenate([self._irradiance(centre, chosen) for chosen in wavelengths], axis=1)
+
+    def directions(self, points: FloatArray) -> FloatArray:
+        """(k, 3) world directions of unit length through window ``points`` (row, column) (k, 2) in projector pixels."""
+        world = self._local(points) @ self._map.turn.T
+        return np.asarray(world / np.linalg.norm(world, axis=1, keepdims=True))
+
+    def _local(self, points: FloatArray) -> FloatArray:
+        tangents = self._map.tangents(*self._projector.canvas_point(points[:, 0], points[:, 1]))
+        return np.stack([*tangents, np.ones(len(points))], axis=1)
+
+    def _irradiance(self, points: FloatArray, wavelengths: mi.Color0f | None) -> FloatArray:
+        """(k, channels) irradiance on the plane at unit distance that window points (k, 2) cast [W m^-2]."""
+        _, emitted, depth, cosine = _asked(
+            self._projector.emitter, self._map.turn, self.origin, self._local(points), wavelengths
+        )
+        return channels(mi.unpolarized_spectrum(emitted), len(points)) * (cosine * depth**2)[:, None]
+
+
+def _asked(
+    emitter: mi.Emitter, turn: FloatArray, origin: FloatArray, local: FloatArray, wavelengths: mi.Color0f | None
+) -> tuple[mi.DirectionSample3f, mi.Spectrum, float, FloatArray]:
+    """A projector's direction sample at points in ``local`` directions (k, 3): sample, light, depth [mm], cosines."""
+    depth = _FAR * max(1.0, float(np.abs(origin).max()) / 100)
+    forward = turn[:, 2] / np.linalg.norm(turn[:, 2])
+    world = local @ turn.T
+    world *= depth / (world @ forward)[:, None]
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(local))
+    interaction.p = mi.Point3f((origin + world).T.astype(np.float32))
+    if wavelengths is not None:
+        interaction.wavelengths = wavelengths
+    sample, emitted = emitter.sample_direction(interaction, mi.Point2f(0.5), True)
+    return sample, emitted, depth, depth / np.linalg.norm(world, axis=1)

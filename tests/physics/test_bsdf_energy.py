@@ -87,7 +87,7 @@ def worst_asymmetry(evaluate: Callable[..., np.ndarray]) -> float:
 def test_no_bsdf_is_left_out() -> None:
     found = set()
     for path in Path(mitsim.transport.__file__).parent.glob("*.py"):
-        if "mi.register_bsdf(" in path.read_text(encoding="utf-8"):
+        if 'register_once("bsdf"' in path.read_text(encoding="utf-8"):
             found.add(importlib.import_module(f"mitsim.transport.{path.stem}").PLUGIN)
     assert found == set(CASES)
 

@@ -12,8 +12,7 @@ from mitsim.optics.beams import beam_frames
 from mitsim.optics.samplers import geometric_terms
 from mitsim.transport.beams import has_specular, trace_beams
 from mitsim.transport.mirrors import MirrorTracer
-from mitsim.transport.pinhole import PinholeRays
-from mitsim.transport.source import Projector
+from mitsim.transport.source import PinholeRays, Projector
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE = 8, 111000.0
@@ -119,7 +118,7 @@ def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
     scene = scene_with(sheet=plane(0, 400, {"type": "diffuse"}))
     beams = trace_beams(scene, scene.sensors()[0], projector(scene))
     assert len(beams) == 0 and beams.unresolved == 0
-    with pytest.raises(MitsimError, match="max_depth of mirror light is 0"):
+    with pytest.raises(MitsimError, match="max_depth of glints is 0"):
         trace_beams(scene, scene.sensors()[0], projector(scene), max_depth=0)
 
 

@@ -1,5 +1,6 @@
 """The sensor plugin, one ray at a time, against the mask's own transmission (whole frames: tests/physics)."""
 
+import re
 import subprocess
 import sys
 
@@ -112,3 +113,17 @@ def test_registering_needs_a_variant() -> None:
     program = "from mitsim.transport import lensless; lensless.register()"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 1 and "MitsimError: no Mitsuba variant is selected" in done.stderr
+
+
+def test_the_manual_lists_the_parameters_of_the_geometry() -> None:
+    """The table of the module's docstring: every field but ``pixels`` (the film's), in order, with its default."""
+    from mitsim.rig.camera import CameraGeometry
+    from mitsim.transport import lensless
+
+    rows = re.findall(r"^``(\w+)`` +(\S+) +(\S+) ", lensless.__doc__, re.M)
+    fields = {name: field for name, field in CameraGeometry.model_fields.items() if name != "pixels"}
+    assert [name for name, _, _ in rows] == [*fields, "to_world"]
+    for name, unit, default in rows[:-1]:
+        stated = fields[name]
+        assert default == (stated.default if isinstance(stated.default, str) else f"{stated.default:g}"), name
+        assert f"[{unit}]" in stated.description or unit == "-", name

@@ -13,8 +13,9 @@ import pytest
 
 from mitsim.transport import aperture
 from mitsim.transport.aperture import aperture_scene_parts
+from mitsim.transport.connection import Connection, LensHit, ProjectorConnector
 from mitsim.transport.sampling import generator
-from mitsim.transport.source import Connection, Projector, Source
+from mitsim.transport.source import Projector
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -28,8 +29,8 @@ def emitter(turn: float = 0.0, canvas: np.ndarray | None = None, place: tuple[fl
     return stock_projector(N, SCALE, place, turn, canvas)
 
 
-def source(light: Any = None, n: int = N, first_column: int = N, **lens: float) -> Source:
-    return Source(Projector(light or emitter(), n, 0, first_column, (N, 2 * N), **{"focus": 400.0, **lens}))
+def connector(light: Any = None, n: int = N, first_column: int = N, **lens: float) -> ProjectorConnector:
+    return ProjectorConnector(Projector(light or emitter(), n, 0, first_column, (N, 2 * N), **{"focus": 400.0, **lens}))
 
 
 def at(points: np.ndarray) -> Any:
@@ -38,9 +39,13 @@ def at(points: np.ndarray) -> Any:
     return si
 
 
-def connected(made: Source, points: np.ndarray, seed: int = 3) -> Connection:
+def connected(connector: ProjectorConnector, points: np.ndarray, seed: int = 3) -> Connection:
     rng = generator(mi.UInt32(seed), dr.arange(mi.UInt32, len(points)))
-    return made.connect(at(points), rng, mi.Bool(True))
+    return connector.connect(at(points), rng, mi.Bool(True))
+
+
+def lens_hit(made: ProjectorConnector, ray: Any, reach: Any = np.inf) -> LensHit:
+    return made.hit(ray, mi.Float(reach), generator(mi.UInt32(1), mi.UInt32(0)), mi.Bool(True))
 
 
 def numbers(value: Any) -> np.ndarray:
@@ -63,7 +68,7 @@ def repeated(point: tuple[float, float, float]) -> np.ndarray:
 
 def test_a_pinhole_is_the_stock_projector() -> None:
     points = board(400.0)
-    found, (ds, weight) = connected(source(), points), emitter().sample_direction(at(points), mi.Point2f(0.5))
+    found, (ds, weight) = connected(connector(), points), emitter().sample_direction(at(points), mi.Point2f(0.5))
     assert np.array_equal(numbers(found.weight), numbers(weight)) and not numbers(found.pdf).any()
     assert np.allclose(numbers(found.direction), numbers(ds.d)) and 0.9 < numbers(found.valid).mean() <= 1
 
@@ -73,7 +78,7 @@ def test_pixels_are_the_windows_rows_and_columns() -> None:
     row, column = np.divmod(np.arange(N * N), N)
     step = STEP * 400
     points = np.stack([60 - (column + 0.5) * step, -5 + (N / 2 - row - 0.5) * step, np.full(N * N, 402.0)], axis=1)
-    found = connected(source(), points)
+    found = connected(connector(), points)
     assert np.array_equal(numbers(found.pixel), np.arange(N * N))
 
 
@@ -82,7 +87,7 @@ def test_pixels_are_the_windows_rows_and_columns() -> None:
 @pytest.mark.parametrize("z", [250.0, 400.0, 800.0])
 def test_a_small_lens_and_a_small_spot_are_the_pinhole(turn: float, lens: dict[str, float], z: float) -> None:
     light, points = emitter(turn), board(z)
-    sharp, found = connected(source(light), points), connected(source(light, **lens), points)
+    sharp, found = connected(connector(light), points), connected(connector(light, **lens), points)
     both = numbers(sharp.valid).astype(bool) & numbers(found.valid).astype(bool)
     assert (numbers(sharp.valid) != numbers(found.valid)).mean() < 2e-3, "but for the window's edge"
     assert both.mean() > 0.5
@@ -98,7 +103,7 @@ def test_a_small_lens_and_a_small_spot_are_the_pinhole(turn: float, lens: dict[s
 @pytest.mark.parametrize("z", [250.0, 400.0, 800.0])
 def test_irradiance_on_a_plane_does_not_depend_on_the_lens(z: float) -> None:
     """weight x cos is pi scale / z^2 for every path from every lens point: an even picture has no vignette."""
-    found = connected(source(aperture=8.0, focus=300.0), board(z))
+    found = connected(connector(aperture=8.0, focus=300.0), board(z))
     lit = numbers(found.valid).astype(bool)
     cosine = -np.array(found.direction, dtype=np.float64)[2]
     assert lit.mean() > 0.8
@@ -107,7 +112,7 @@ def test_irradiance_on_a_plane_does_not_depend_on_the_lens(z: float) -> None:
 
 
 def test_lens_points_fill_the_disk_evenly() -> None:
-    found = connected(source(aperture=8.0), repeated((20.0, 0.0, 400.0)))
+    found = connected(connector(aperture=8.0), repeated((20.0, 0.0, 400.0)))
     lens = np.array(found.target, dtype=np.float64) - np.array(PLACE)[:, None]
     radius = np.hypot(lens[0], lens[1])
     assert radius.max() <= 8.0 * (1 + 1e-5) and np.abs(lens[2]).max() < 1e-4
@@ -121,7 +126,7 @@ def test_lens_points_fill_the_disk_evenly() -> None:
 def test_defocus_spreads_a_point_over_the_geometric_circle(z: float, focus: float) -> None:
     """A point at depth z sees the focus plane through the lens: a disk of radius a |1 - focus/z| there."""
     depth = z - PLACE[2]
-    found = connected(source(aperture=9.0, focus=focus), repeated((25.0, 0.0, z)))
+    found = connected(connector(aperture=9.0, focus=focus), repeated((25.0, 0.0, z)))
     assert numbers(found.valid).all()
     radius = 9.0 * abs(1 - focus / depth) / (STEP * focus)
     assert radius > 3
@@ -130,53 +135,53 @@ def test_defocus_spreads_a_point_over_the_geometric_circle(z: float, focus: floa
         # Uniform disk: variance r^2/4 along an axis, and 1/12 from rounding to whole pixels.
         assert np.var(index) == pytest.approx(radius**2 / 4 + 1 / 12, rel=0.02)
         assert np.ptp(index) == pytest.approx(2 * radius, abs=1.6)
-    sharp = connected(source(), repeated((25.0, 0.0, z))[:1])
+    sharp = connected(connector(), repeated((25.0, 0.0, z))[:1])
     centre = np.divmod(numbers(sharp.pixel)[0], N)
     assert abs(row.mean() - centre[0]) < 0.51 and abs(column.mean() - centre[1]) < 0.51
 
 
 def test_the_focus_plane_is_sharp() -> None:
-    found = connected(source(aperture=9.0, focus=400.0), repeated((25.2, 0.3, 402.0)))
+    found = connected(connector(aperture=9.0, focus=400.0), repeated((25.2, 0.3, 402.0)))
     assert len(np.unique(numbers(found.pixel))) == 1
 
 
 def test_light_found_by_chance_is_that_of_a_connection() -> None:
     """A ray through a lens point, and the connection to that point: the same radiance, density and pixel."""
     values = np.random.default_rng(5).uniform(0.2, 1, (N, 2 * N))
-    made = source(emitter(4.0, values), aperture=6.0, focus=300.0)
+    made = connector(emitter(4.0, values), aperture=6.0, focus=300.0)
     points = board(350.0)
     found = connected(made, points)
     ray = mi.Ray3f(at(points).p, found.direction)
-    radiance, pdf, pixel, met = made.hit(ray, mi.Float(np.inf), generator(mi.UInt32(1), mi.UInt32(0)), mi.Bool(True))
-    inner = numbers(found.valid).astype(bool) & numbers(met).astype(bool)
+    hit = lens_hit(made, ray)
+    inner = numbers(found.valid).astype(bool) & numbers(hit.met).astype(bool)
     assert inner.mean() > 0.6 and (numbers(found.valid)[~inner] == 0).mean() > 0.99
-    assert numbers(pdf)[inner] == pytest.approx(numbers(found.pdf)[inner], rel=1e-3)
-    same = numbers(pixel)[inner] == numbers(found.pixel)[inner]
+    assert numbers(hit.pdf)[inner] == pytest.approx(numbers(found.pdf)[inner], rel=1e-3)
+    same = numbers(hit.pixel)[inner] == numbers(found.pixel)[inner]
     assert same.mean() > 0.98, "float32 at pixels' edges"
     expected = (numbers(found.weight) * numbers(found.pdf))[inner][same]
-    assert numbers(radiance)[inner][same] == pytest.approx(expected, rel=2e-3)
+    assert numbers(hit.radiance)[inner][same] == pytest.approx(expected, rel=2e-3)
 
 
 def test_the_radiance_is_that_of_the_reference_estimators_projector() -> None:
     """Plugin ``mitsim_projector``, whose disk a ray meets: radiance texel by texel (random texels tell them apart)."""
     aperture.register()
     light = emitter(4.0, np.random.default_rng(5).uniform(0.2, 1, (N, 2 * N)))
-    made = source(light, aperture=6.0, focus=300.0)
+    made = connector(light, aperture=6.0, focus=300.0)
     points = board(350.0)
     found = connected(made, points)
     scene = mi.load_dict({"type": "scene", **aperture_scene_parts(light, 6.0, 300.0)})
     ray = mi.Ray3f(at(points).p, found.direction)
     si = scene.ray_intersect(ray)
     expected = numbers(si.emitter(scene).eval(si))
-    radiance, _, _, met = made.hit(ray, mi.Float(np.inf), generator(mi.UInt32(1), mi.UInt32(0)), mi.Bool(True))
-    lit = numbers(met).astype(bool) & numbers(found.valid).astype(bool)
-    ratio = numbers(radiance)[lit] / expected[lit]
+    hit = lens_hit(made, ray)
+    lit = numbers(hit.met).astype(bool) & numbers(found.valid).astype(bool)
+    ratio = numbers(hit.radiance)[lit] / expected[lit]
     assert lit.mean() > 0.6
     assert np.quantile(np.abs(ratio - 1), 0.98) < 2e-3
 
 
 def test_rays_that_miss_the_lens() -> None:
-    made, rng = source(aperture=6.0), generator(mi.UInt32(1), mi.UInt32(0))
+    made = connector(aperture=6.0)
     origin = np.array([[40.0, 0.0, 400.0]] * 4)
     target = np.array(PLACE) + np.array([[0, 0, 0], [6.1, 0, 0], [0, 0, 0], [0, 0, 0]])
     direction = target - origin
@@ -186,10 +191,10 @@ def test_rays_that_miss_the_lens() -> None:
     reach[3] *= 0.9  # something is in between
     reach[:3] *= 1.1
     ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*direction.T))
-    met = numbers(made.hit(ray, mi.Float(reach), rng, mi.Bool(True))[3])
+    met = numbers(lens_hit(made, ray, reach).met)
     assert met.tolist() == [1, 0, 0, 0]
     behind = mi.Ray3f(mi.Point3f(60, -5, -300), mi.Vector3f(0, 0, 1))
-    assert not numbers(made.hit(behind, mi.Float(np.inf), rng, mi.Bool(True))[3]).any()
+    assert not numbers(lens_hit(made, behind).met).any()
 
 
 # ---- the spot
@@ -200,7 +205,7 @@ def test_rays_that_miss_the_lens() -> None:
 @pytest.mark.parametrize("turn", [0.0, 6.0])
 def test_a_blurred_pixel_has_the_stated_deviation(blur: float, z: float, turn: float) -> None:
     """A normal spot: standard deviation in projector pixels at any depth, on rows and columns alike."""
-    made = source(emitter(turn), blur=blur)
+    made = connector(emitter(turn), blur=blur)
     depth = z - PLACE[2]
     middle = np.tan(np.arctan(0.15) - np.radians(turn))  # of the window, whose axis is turned
     point = (60 - middle * depth, -5.0, z)
@@ -211,12 +216,12 @@ def test_a_blurred_pixel_has_the_stated_deviation(blur: float, z: float, turn: f
         assert abs(np.var(index) / variance - 1) < gate
         assert np.mean(np.abs(index - index.mean()) < blur) == pytest.approx(0.683, abs=0.16 / blur)
     assert abs(np.corrcoef(row, column)[0, 1]) < SIGMAS / np.sqrt(SAMPLES)
-    centre = np.divmod(numbers(connected(source(emitter(turn)), repeated(point)[:1]).pixel)[0], N)
+    centre = np.divmod(numbers(connected(connector(emitter(turn)), repeated(point)[:1]).pixel)[0], N)
     assert abs(row.mean() - centre[0]) < 0.55 and abs(column.mean() - centre[1]) < 0.55
 
 
 def test_blur_and_defocus_add_their_variances() -> None:
-    found = connected(source(blur=3.0, aperture=9.0, focus=300.0), repeated((25.0, 0.0, 602.0)))
+    found = connected(connector(blur=3.0, aperture=9.0, focus=300.0), repeated((25.0, 0.0, 602.0)))
     radius = 9.0 * 0.5 / (STEP * 300)
     row, column = np.divmod(numbers(found.pixel), N)
     for index in (row, column):
@@ -225,7 +230,7 @@ def test_blur_and_defocus_add_their_variances() -> None:
 
 def test_a_spot_at_the_windows_edge_loses_half_its_light() -> None:
     """The point sees the window's edge: half of the normal deviates fall on dark canvas."""
-    found = connected(source(blur=2.0), repeated((60.0, -5.0, 402.0)))
+    found = connected(connector(blur=2.0), repeated((60.0, -5.0, 402.0)))
     lit = numbers(found.weight) * numbers(found.valid) > 0
     assert lit.mean() == pytest.approx(0.5, abs=SIGMAS * 0.5 / np.sqrt(SAMPLES) + 0.002)
 

@@ -1,0 +1,59 @@
+"""One map from the projector's pixels to rays, areas and flux: its uses in the renderer's and in NumPy's numbers agree.
+
+Planted: rows and columns exchanged in ``pixel_at``, and an area of the canvas instead of a pixel, fail.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.transport.connection import ProjectorConnector
+from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
+from mitsim.transport.sampling import generator
+from mitsim.transport.source import PinholeRays, Projector, ProjectorRays
+from tests.unit.transport.closed_forms import stock_projector
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, PLACE = 16, (60.0, -5.0, 2.0)
+
+
+@pytest.fixture
+def projector(variant: str) -> Projector:
+    """A turned one, every texel of another brightness; the window lies off the canvas's centre."""
+    canvas = np.random.default_rng(2).uniform(0.2, 1, (N + 4, 2 * (N + 4)))
+    return Projector(stock_projector(N + 4, 111000.0, PLACE, 7.0, canvas), N, 3, 21, canvas.shape)
+
+
+def test_rays_areas_and_flux_are_of_one_map(projector: Projector) -> None:
+    pixel = np.arange(N * N)
+    lanes, rng = mi.UInt32(pixel), generator(mi.UInt32(1), mi.UInt32(0))
+    wavelengths = dr.zeros(mi.Ray3f).wavelengths
+    rays, pinhole = ProjectorRays(projector), PinholeRays(projector, [None])
+    ray = rays.sample(lanes, mi.Point2f(0.5), rng, wavelengths)
+    centres = np.stack(np.divmod(pixel, N), axis=1) + 0.5
+    direction = np.array(ray.d, dtype=np.float64).T
+    assert np.abs(direction - pinhole.directions(centres)).max() < 2e-7
+    flux = np.array(rays.flux(lanes, wavelengths), dtype=np.float64).ravel()
+    assert flux == pytest.approx(pinhole.power[:, 0] * pinhole.area, rel=2e-5)
+    assert len(np.unique(flux)) == N * N
+    width, height = projector.pixel_size()
+    assert width * height == pytest.approx(pinhole.area, rel=5e-4)
+    si = dr.zeros(mi.SurfaceInteraction3f, N * N)
+    si.p = mi.Point3f((pinhole.origin + 500 * direction).T.astype(np.float32))
+    connection = ProjectorConnector(projector).connect(si, rng, mi.Bool(True))
+    assert np.array_equal(np.array(connection.pixel), pixel)
+
+
+def test_rows_and_columns_there_and_back() -> None:
+    x, y = np.random.default_rng(0).normal(size=(2, 5))
+    assert [part.tolist() for part in x_y(*rows_columns(x, y))] == [x.tolist(), y.tolist()]
+    row, column = rows_columns(np.array([1.0]), np.array([2.0]))
+    assert row == -2 and column == -1, "row 0 at +y, column 0 at +x"
+
+
+def test_what_counts_as_rigid() -> None:
+    turned = mi.Transform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 33)
+    turn, origin = turn_and_origin(turned)
+    assert origin.tolist() == [1, 2, 3] and rigidity_error(turn) < 1e-6
+    assert rigidity_error(np.round(turn, 5)) < RIGID < rigidity_error(1.0001 * turn)
