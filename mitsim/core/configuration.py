@@ -23,11 +23,15 @@ Model = TypeVar("Model", bound=pydantic.BaseModel)
 
 
 def shipped(*parts: str) -> Path:
-    """A file or folder that comes with mitsim beside the package, for example `shipped("calibration",
-    "imx249.toml")`. Raises MitsimError when it is not there (mitsim installed without its source tree)."""
-    path = Path(__file__).resolve().parents[2].joinpath(*parts)
+    """A file or folder that comes with mitsim, for example ``shipped("calibration", "imx249.toml")`` of ``parts``.
+
+    A wheel carries them inside the package, a source tree beside it. MitsimError when it is in neither.
+    """
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "_shipped"
+    path = (inside if inside.is_dir() else package.parent).joinpath(*parts)
     if not path.exists():
-        raise MitsimError(f"{'/'.join(parts)}: not found at {path}; run mitsim from its source tree (`make setup`)")
+        raise MitsimError(f"{'/'.join(parts)}: not found at {path}; install mitsim again")
     return path
 
 
