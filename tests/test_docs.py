@@ -283,3 +283,17 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "html" / "docs" / "api.html").is_file()
+
+
+def test_the_page_of_figures_has_every_marked_test() -> None:
+    """By its name in words; `make robustness` writes the page anew, with figures."""
+    page, missing = text_of("docs/robustness.md"), []
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        source = path.read_text(encoding="utf-8")
+        if re.search(r"^pytestmark = .*mark\.robustness\(", source, flags=re.M):
+            names = re.findall(r"^def test_(\w+)\(", source, flags=re.M)
+        else:
+            names = re.findall(r"^@pytest\.mark\.robustness\(.*\n(?:@.*\n)*def test_(\w+)\(", source, flags=re.M)
+        link = os.path.relpath(path, ROOT)
+        missing += [name for name in names if f"[{name.replace('_', ' ')}](../{link})" not in page]
+    assert not missing, missing

@@ -16,6 +16,8 @@ import pytest
 from mitsim.scene.guard.check import check_file
 from tests.hard.fuzz import RICH, Fuzz, run
 
+pytestmark = pytest.mark.robustness("Input")
+
 ROOT = Path(__file__).parents[2]
 
 
