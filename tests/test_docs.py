@@ -24,6 +24,7 @@ import pytest
 
 import mitsim
 from mitsim.core.configuration import shipped
+from tests.robustness import Recorder, Row, page_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -283,6 +284,25 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "html" / "docs" / "api.html").is_file()
+
+
+@pytest.mark.parametrize(("value", "gates"), [(2, {"at_most": 1}), (0, {"at_least": 1}), (np.nan, {"at_most": 1})])
+def test_a_figure_beyond_its_gate_fails(value: float, gates: dict[str, float]) -> None:
+    with pytest.raises(AssertionError, match="what"):
+        Recorder()(value, **gates, what="what")
+
+
+def test_a_row_shows_the_figure_nearest_to_its_gate() -> None:
+    figures = Recorder()
+    for value in (1e-9, 3e-7, -2e-8):
+        figures(value, at_most=1e-6, what="error")
+    row = Row("Optics", "tests/t.py", 1, "test_a_b", "What | holds.", 2, figures.figures)
+    page = page_of("{Optics}\n", [row, Row("Optics", "tests/t.py", 2, "test_c", "", 1)])
+    assert page.splitlines()[2:] == [
+        "| [a b](../tests/t.py) (2 cases). What \\| holds. | error: 3e-7 | <= 1e-6 |",
+        "",
+        "Also held: [c](../tests/t.py).",
+    ]
 
 
 def test_the_page_of_figures_has_every_marked_test() -> None:
