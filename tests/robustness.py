@@ -56,8 +56,14 @@ class Row:
     line: int
     name: str
     text: str
-    cases: int = 0
+    cases: list[str] = field(default_factory=list)
     figures: dict[str, Figure] = field(default_factory=dict)
+
+    def add(self, other: Row) -> None:
+        """The cases and figures of another run of the same test, which replace older ones."""
+        self.line, self.text = other.line, other.text
+        self.cases = list(dict.fromkeys([*self.cases, *other.cases]))
+        self.figures |= other.figures
 
     @property
     def words(self) -> str:
@@ -103,7 +109,7 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     if marker is not None and isinstance(item, pytest.Function):
         text = " ".join((item.function.__doc__ or "").strip().split("\n\n")[0].split())
         identity = item.nodeid[item.nodeid.index("[") + 1 : -1] if "[" in item.nodeid else ""
-        row = Row(marker.args[0], item.location[0], item.location[1] or 0, item.originalname, text, 1)
+        row = Row(marker.args[0], item.location[0], item.location[1] or 0, item.originalname, text, [identity])
         for what, figure in RECORDER.figures.items():
             row.figures[", ".join(filter(None, (identity, what)))] = figure
         item.user_properties.append(("robustness", asdict(row)))
@@ -125,25 +131,22 @@ class Page:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.rows: dict[str, Row] = {}
+        earlier = json.loads(RECORDS.read_text(encoding="utf-8")) if RECORDS.exists() else {}
+        self.rows = {key: row_of(row) for key, row in earlier.items()}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         for name, value in report.user_properties:
             if name == "robustness" and report.when == "call" and report.passed:
-                new = row_of(value)  # type: ignore[arg-type]
-                row = self.rows.setdefault(f"{new.file}::{new.name}", new)
-                if row is not new:
-                    row.cases += 1
-                    row.figures |= new.figures
+                row = row_of(value)  # type: ignore[arg-type]
+                self.rows.setdefault(f"{row.file}::{row.name}", row).add(row)
 
     def pytest_sessionfinish(self, exitstatus: int) -> None:
-        rows = {key: asdict(row) for key, row in self.rows.items()}
-        earlier = json.loads(RECORDS.read_text(encoding="utf-8")) if RECORDS.exists() else {}
         RECORDS.parent.mkdir(parents=True, exist_ok=True)
-        RECORDS.write_text(json.dumps(earlier | rows, indent=1), encoding="utf-8")
+        rows = {key: asdict(row) for key, row in self.rows.items()}
+        RECORDS.write_text(json.dumps(rows, indent=1), encoding="utf-8")
         if exitstatus == 0:
-            everything = [row_of(row) for row in (earlier | rows).values()]
-            self.path.write_text(page_of(TEMPLATE.read_text(encoding="utf-8"), everything), encoding="utf-8")
+            page = page_of(TEMPLATE.read_text(encoding="utf-8"), list(self.rows.values()))
+            self.path.write_text(page, encoding="utf-8")
 
 
 def row_of(values: dict[str, Any]) -> Row:
@@ -173,7 +176,7 @@ def table_of(rows: list[Row]) -> str:
 
 
 def link(row: Row) -> str:
-    cases = f" ({row.cases} cases)" if row.cases > 1 else ""
+    cases = f" ({len(row.cases)} cases)" if len(row.cases) > 1 else ""
     return f"[{row.words}](../{row.file}){cases}"
 
 

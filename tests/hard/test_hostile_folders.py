@@ -24,6 +24,8 @@ from mitsim.core.framefile import read_frame, write_frame
 from mitsim.reconstruct.folders import check_fit, load, read_calibration, read_run
 from mitsim.rig.sensor import load_sensor
 
+pytestmark = pytest.mark.robustness("Input")
+
 LONGEST = 5.0
 ROOM = 3 << 30
 """Bytes of address space beyond what the process has when a case starts; the frames here need 1 kB."""
