@@ -1,13 +1,16 @@
-# make setup | demo | test | test-all | lint.  Everything lives in .venv; PYTHON=python3.12 picks another Python.
+# make setup | demo | test | test-all | lint | docs | robustness | wheel.  Everything lives in .venv; PYTHON=python3.12
+# picks another Python.
 VENV := .venv
 PYTHON ?= python3
 READY := $(VENV)/.ready
 LINT_READY := $(VENV)/.lint-ready
+DOCS_READY := $(VENV)/.docs-ready
+INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 # One test process a processor.
 PARALLEL := -n logical --maxprocesses 8 --dist worksteal
 
-.PHONY: setup demo test test-all lint
+.PHONY: setup demo test test-all lint docs robustness wheel
 
 setup: $(READY)
 
@@ -16,7 +19,11 @@ $(READY): pyproject.toml scripts/setup.sh
 	@touch $@
 
 $(LINT_READY): $(READY)
-	@$(VENV)/bin/python -m pip install --quiet --no-compile -e '.[lint]'
+	@$(INSTALL) -e '.[lint]'
+	@touch $@
+
+$(DOCS_READY): $(READY)
+	@$(INSTALL) -e '.[docs]'
 	@touch $@
 
 demo: setup
@@ -32,3 +39,18 @@ lint: $(LINT_READY)
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/mypy
+
+# Warnings are errors; nothing is fetched and no notebook is run.
+docs: $(DOCS_READY)
+	@$(VENV)/bin/python -m sphinx -q -W --keep-going -b html -c docs . docs/_build/html
+	@echo docs/_build/html/index.html
+
+# All figures of docs/robustness.md anew, by all tests that are marked with `robustness`.
+robustness: setup
+	@rm -f docs/_build/robustness.json
+	@$(VENV)/bin/python -m pytest -m robustness $(PARALLEL) --robustness docs/robustness.md
+
+wheel: setup
+	@rm -rf dist
+	@$(VENV)/bin/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w dist .
+	@ls dist/mitsim-*.whl

@@ -14,6 +14,8 @@ import pytest
 
 from mitsim.core.configuration import shipped
 
+pytest_plugins = ["tests.robustness"]
+
 
 def pytest_configure() -> None:
     """Give each of several test processes (pytest-xdist) processors of its own, and with them its threads' number.

@@ -31,11 +31,15 @@ NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST, allow_inf_nan=Fa
 
 
 def shipped(*parts: str) -> Path:
-    """The file or folder at ``parts``, which comes with mitsim beside the package, for example
-    ``shipped("calibration", "imx249.toml")``. MitsimError when it is not there."""
-    path = Path(__file__).resolve().parents[2].joinpath(*parts)
+    """A file or folder that comes with mitsim, for example ``shipped("calibration", "imx249.toml")`` of ``parts``.
+
+    A wheel carries them inside the package, a source tree beside it. MitsimError when it is in neither.
+    """
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "_shipped"
+    path = (inside if inside.is_dir() else package.parent).joinpath(*parts)
     if not path.exists():
-        raise MitsimError(f"{'/'.join(parts)}: not found at {path}; run mitsim from its source tree (`make setup`)")
+        raise MitsimError(f"{'/'.join(parts)}: not found at {path}; install mitsim again")
     return path
 
 

@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import hadamard as sylvester
 
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
@@ -141,7 +140,7 @@ def _random_binary(n: int, k: int, seed: int, side: str) -> PatternFactor:
 def hadamard_matrix(order: int) -> PatternFactor:
     """(``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones.
 
-    Built from Sylvester's doubling (SciPy) and Paley's two constructions over prime fields (R. Paley, 1933), and their
+    Built from Sylvester's doubling and Paley's two constructions over prime fields (R. Paley, 1933), and their
     Kronecker products; :func:`hadamard_orders` lists what that covers (every multiple of 4 up to 48, then gaps).
 
     Raises
@@ -166,7 +165,11 @@ def _construct(order: int) -> npt.NDArray[np.int64] | None:
     if order < 1 or (order > 2 and order % 4):
         return None
     if order & (order - 1) == 0:
-        return np.asarray(sylvester(order), dtype=np.int64)
+        # Not scipy.linalg.hadamard: importing it takes longer than all else that a refusal needs.
+        doubled = np.ones((1, 1), dtype=np.int64)
+        while len(doubled) < order:
+            doubled = np.kron([[1, 1], [1, -1]], doubled)
+        return doubled
     if _is_prime(order - 1) and (order - 1) % 4 == 3:
         skew = _conference(order - 1)
         return skew + np.eye(order, dtype=np.int64)

@@ -15,6 +15,9 @@ import pytest
 
 from mitsim.scene.guard.check import check_file
 from tests.hard.fuzz import RICH, Fuzz, run
+from tests.robustness import Recorder
+
+pytestmark = pytest.mark.robustness("Input")
 
 ROOT = Path(__file__).parents[2]
 
@@ -57,7 +60,8 @@ def test_a_hundred_and_fifty_frames() -> None:
 @pytest.mark.parametrize(
     ("kind", "seconds"), [("xml", 20), ("json", 10), ("exr", 15), ("load", 40), ("mesh", 15), ("image", 15)]
 )
-def test_many_changes(kind: str, seconds: float) -> None:
+def test_many_changes(measured: Recorder, kind: str, seconds: float) -> None:
     """As many of 20000 as the time allows; ``load``, ``mesh`` and ``image`` go through Mitsuba's own readers."""
     taken, refused = apart(kind, 1000, 20_000, seconds)
-    assert taken >= 3 and taken + refused >= 100
+    measured(taken + refused, at_least=100, what="inputs")
+    assert taken >= 3

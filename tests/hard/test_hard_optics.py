@@ -27,7 +27,9 @@ from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import Mask, mls_mask
 from mitsim.rig.projector import Spectrum
+from tests.robustness import Recorder
 
+pytestmark = pytest.mark.robustness("Optics")
 EPS = np.finfo(float).eps
 NM = 550.0
 LINE = Spectrum(np.array([NM]), np.array([1.0]))
@@ -104,7 +106,9 @@ power = lambda low, high: st.floats(low, high).map(lambda x: 10.0**x)  # noqa: E
 )
 @example(np.array([1, 0, 1]), 0.18111005, 0.0029468356, 6.136185125, 0.0010824002457, 0.0, 0.0)
 @example(np.array([1]), 0.0336731820, 0.0076961102, 115.6449334894, 0.0054989479, 0.0, 0.0)
-def test_shadows_equal_fractions_at_any_scale(bits, feature, pitch, distance, beyond, width, thickness) -> None:
+def test_shadows_equal_fractions_at_any_scale(
+    measured: Recorder, bits, feature, pitch, distance, beyond, width, thickness
+) -> None:
     """Features 1 um to 1 mm, pixels 1 nm to 10 mm, masks 1 pm to 400 mm from the sensor, scenes from 1 um behind them.
 
     Within the conditioning, which is 1e-8 for pixels of 1 nm under a mask of 24 mm and 1e-13 for those of 10 um.
@@ -121,7 +125,8 @@ def test_shadows_equal_fractions_at_any_scale(bits, feature, pitch, distance, be
     bound = conditioning(setting, at)
     for pixel in range(4):
         for cell in range(3):
-            assert abs(found[pixel, cell] - float(exact_shadow(setting, at, pixel, cell))) < bound
+            error = abs(found[pixel, cell] - float(exact_shadow(setting, at, pixel, cell)))
+            measured(error / bound, at_most=1, what="of the conditioning")
 
 
 EXTREMES = {
@@ -140,7 +145,7 @@ EXTREMES = {
 
 
 @pytest.mark.parametrize("name", EXTREMES)
-def test_the_papers_mask_at_extremes_equals_fractions(name: str, record_property) -> None:
+def test_the_papers_mask_at_extremes_equals_fractions(measured: Recorder, name: str) -> None:
     """511 features: 4 partly open entries and a corner against fractions, and all entries between 0 and 1.
 
     Gates are the conditioning, eps x 15 mm over the wider box: 7e-9 for a pixel of 1 nm, 6e-13 for the paper's.
@@ -154,8 +159,7 @@ def test_the_papers_mask_at_extremes_equals_fractions(name: str, record_property
     chosen = np.random.default_rng(7).choice(len(partial), 4)
     entries = [(0, 0), *partial[chosen].tolist()]
     worst = max(abs(found[i, j] - float(exact_shadow(setting, PAPER, i, j))) for i, j in entries)
-    record_property("largest error", float(worst))
-    assert worst < gate
+    measured(worst, at_most=gate)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -165,7 +169,7 @@ def test_the_papers_mask_at_extremes_equals_fractions(name: str, record_property
     a=power(-6, 1),
     b=power(-9, 1) | st.just(0.0),
 )
-def test_means_of_uneven_steps_equal_fractions(sizes, values, a, b) -> None:
+def test_means_of_uneven_steps_equal_fractions(measured: Recorder, sizes, values, a, b) -> None:
     """Steps from 1 nm to 10 mm side by side: differences of antiderivatives keep eps of their size over the box."""
     edges = np.concatenate(([0.0], np.cumsum(sizes))) - sum(sizes) / 2
     steps = Steps(edges, np.array(values[: len(sizes)]))
@@ -175,11 +179,12 @@ def test_means_of_uneven_steps_equal_fractions(sizes, values, a, b) -> None:
     extent = float(edges[-1] - edges[0]) + 4 * (a + b)
     for centre, mean in zip(centres, found, strict=True):
         exact = exact_mean(exact_edges, exact_values, Fraction(float(centre)), Fraction(a), Fraction(b))
-        assert abs(mean - float(exact)) < 20 * EPS * extent / max(a, b) * (1 + len(sizes)) + 1e-14
+        bound = 20 * EPS * extent / max(a, b) * (1 + len(sizes)) + 1e-14
+        measured(abs(mean - float(exact)) / bound, at_most=1, what="of the conditioning")
 
 
 @pytest.mark.parametrize(("a", "b"), [(5.8e-3, 2.3e-3), (5.8e-3, 6e-7), (5e-7, 2.3e-3), (5e-7, 1e-9), (5e-7, 0.0)])
-def test_means_of_a_fine_grid_equal_fractions(a: float, b: float) -> None:
+def test_means_of_a_fine_grid_equal_fractions(measured: Recorder, a: float, b: float) -> None:
     """What the wave-optical shadow is averaged with: 1000 cells of a quarter micrometre, boxes down to 1 pm."""
     values = np.random.default_rng(5).random((1, 1000))
     step = 2.0**-12
@@ -189,7 +194,7 @@ def test_means_of_a_fine_grid_equal_fractions(a: float, b: float) -> None:
     exact_values = [Fraction(float(v)) for v in values[0]]
     for centre, mean in zip(centres, found, strict=True):
         exact = exact_mean(edges, exact_values, Fraction(float(centre)), Fraction(a), Fraction(b))
-        assert abs(mean - float(exact)) < 16 * EPS / max(a, b) + 1e-12
+        measured(abs(mean - float(exact)), at_most=16 * EPS / max(a, b) + 1e-12)
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
@@ -199,7 +204,9 @@ def test_means_of_a_fine_grid_equal_fractions(a: float, b: float) -> None:
     width=power(-15, 3) | st.just(0.0),
     many=st.booleans(),
 )
-def test_samplers_of_mirrored_light_equal_fractions(count: int, place: float, width: float, many: bool) -> None:
+def test_samplers_of_mirrored_light_equal_fractions(
+    measured: Recorder, count: int, place: float, width: float, many: bool
+) -> None:
     """Means over any width, 0 included, of up to 30 000 values; a difference of two sums had 5e-3 left at width 0."""
     numerators = np.random.default_rng(count).integers(0, 2**20, count * (1000 if many else 1))
     feature = 2.0**-14 if many else 2.0**-4
@@ -225,13 +232,16 @@ def test_samplers_of_mirrored_light_equal_fractions(count: int, place: float, wi
         assert min(near) - 1e-9 <= found <= max(near) + 1e-9
         return
     exact = float((upto(middle + half) - upto(middle - half)) / (2 * half * 2**20))
-    assert abs(found - exact) <= float(slack / half) + 4 * EPS * len(numerators)
+    bound = float(slack / half) + 4 * EPS * len(numerators)
+    measured(abs(found - exact) / bound, at_most=1, what="of the conditioning")
     assert -1e-12 < found < 1 + 1e-12
 
 
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(bits=bits_of_masks, feature=power(-3, 0), distance=power(-6, 2), beyond=power(-2, 4), parts=st.integers(1, 40))
-def test_light_through_the_mask_is_neither_made_nor_lost(bits, feature, distance, beyond, parts) -> None:
+def test_light_through_the_mask_is_neither_made_nor_lost(
+    measured: Recorder, bits, feature, distance, beyond, parts
+) -> None:
     """Columns over pixels that see the whole mask sum to its open width, for pixels of a tenth of a feature to 40."""
     mask, at = Mask("separable", feature, bits), Directions([-0.2, 0.01, 0.3], 0.01)
     depth = distance + beyond
@@ -242,7 +252,8 @@ def test_light_through_the_mask_is_neither_made_nor_lost(bits, feature, distance
     ((factor, _),) = geometric_terms(ShadowGeometry(mask, pixels, span / count, distance, 0.0, depth), at, at)
     width = factor.sum(axis=0) * (span / count) * shrink
     # Neighbours share their ends but for eps of the span, which each of `count` pixels rounds on its own.
-    assert np.allclose(width, bits.sum() * feature, rtol=0, atol=8 * EPS * span * shrink * count + 1e-9 * span * shrink)
+    bound = 8 * EPS * span * shrink * count + 1e-9 * span * shrink
+    measured(np.abs(width - bits.sum() * feature).max() / bound, at_most=1, what="of the rounding")
 
 
 def test_cells_of_a_fine_grid_keep_their_values_in_a_mask_of_four_metres() -> None:
@@ -257,7 +268,7 @@ def test_cells_of_a_fine_grid_keep_their_values_in_a_mask_of_four_metres() -> No
 # ---- to the mask, and to the scene
 
 
-def test_a_mask_on_the_sensor_is_its_own_shadow() -> None:
+def test_a_mask_on_the_sensor_is_its_own_shadow(measured: Recorder) -> None:
     """d to 0: the shadow tends to the mask's mean over each pixel, exact in fractions, in proportion to d.
 
     A crossing moves by d |tau - u / z|, at most 0.16 d here, and a mean over a pixel by 2 x that over its half width.
@@ -273,11 +284,11 @@ def test_a_mask_on_the_sensor_is_its_own_shadow() -> None:
             float(exact_mean(edges, values, Fraction(float(u)), half, Fraction(0))) for u in setting.pixel_centres_mm
         ]
         ends[distance] = np.abs(found - np.array(exact)[:, None]).max()
-        assert ends[distance] < 2 * 0.16 * distance / (setting.active_mm / 2) + 1e-12
+        measured(ends[distance], at_most=2 * 0.16 * distance / (setting.active_mm / 2) + 1e-12, what=f"{distance:g} mm")
     assert ends[1e-9] < 1e-4 * ends[1e-3]
 
 
-def test_waves_of_a_mask_near_the_sensor_tend_to_its_shadow() -> None:
+def test_waves_of_a_mask_near_the_sensor_tend_to_its_shadow(measured: Recorder) -> None:
     """Relative difference over 16 pixels from 20 um down to 10 nm: it falls with the root of lambda d at least.
 
     Each edge sends light over sqrt(lambda d), 74 nm at 10 nm, of a pixel's 11.72 um. Below 4 nm at 512 pixels the grid
@@ -290,7 +301,8 @@ def test_waves_of_a_mask_near_the_sensor_tend_to_its_shadow() -> None:
         ((wave, _),), ((rays, _),) = (shadow_terms(geometry, at, at, 400.0, light) for light in (LINE, None))
         assert np.isfinite(wave).all() and wave.min() > -1e-9
         errors.append(float(np.linalg.norm(wave - rays) / np.linalg.norm(rays)))
-    assert errors[0] < 0.2 and errors[-1] < 1e-3
+    measured(errors[0], at_most=0.2, what="20 um")
+    measured(errors[-1], at_most=1e-3, what="10 nm")
     for (near, far), (small, large) in zip(pairwise(errors), pairwise((2e-2, 1e-3, 1e-4, 1e-5)), strict=True):
         assert far / near < 1.3 * math.sqrt(large / small)
     with pytest.raises(MitsimError, match=r"^diffraction over [^\n]*move the mask off the sensor[^\n]*$"):
@@ -331,12 +343,12 @@ def edge_wave(x: float, product: float) -> mpmath.mpc:
 
 
 @pytest.mark.parametrize("x", [10.0**k for k in range(-8, 7)])
-def test_fresnel_integrals_keep_their_digits_from_1e_8_to_1e6(x: float) -> None:
+def test_fresnel_integrals_keep_their_digits_from_1e_8_to_1e6(measured: Recorder, x: float) -> None:
     """What waves are made of, against mpmath: 2e-15; of the oscillation 1 / (pi x) at 1e6 nine digits are left."""
     sine, cosine = fresnel(x)
     with mpmath.workdps(30):
         assert abs(sine - mpmath.fresnels(x)) < 1e-16 + 2e-16 * abs(mpmath.fresnels(x))
-        assert abs(cosine - mpmath.fresnelc(x)) < 2.5e-15
+        measured(abs(cosine - mpmath.fresnelc(x)), at_most=2.5e-15)
 
 
 @pytest.mark.parametrize(
@@ -350,7 +362,9 @@ def test_fresnel_integrals_keep_their_digits_from_1e_8_to_1e6(x: float) -> None:
         ("at the scene", 0.09, 399.6 * (1 - 399.6 / 400)),
     ],
 )
-def test_a_slit_equals_thirty_digits_in_the_far_and_the_near_field(name: str, half: float, distance: float) -> None:
+def test_a_slit_equals_thirty_digits_in_the_far_and_the_near_field(
+    measured: Recorder, name: str, half: float, distance: float
+) -> None:
     """Fresnel numbers from 9e-7 to 900 against differences of Fresnel integrals, and the far field's sinc.
 
     1e-12 of an open mask is what the transform leaves; of the far field's 1e-3 that is nine digits. Where the other
@@ -368,7 +382,7 @@ def test_a_slit_equals_thirty_digits_in_the_far_and_the_near_field(name: str, ha
     left = (
         0.0 if 2 * half + 12 * step < 0.75 * product / (2 * step) else 1.1 * math.sqrt(product) / (2 * np.pi * 2 * half)
     )
-    assert np.abs(found - exact).max() < 1e-12 + left
+    measured(np.abs(found - exact).max(), at_most=1e-12 + left)
     if half**2 / product < 1e-5:
         # Fraunhofer: 2h / sqrt(i lambda D) exp(i pi s^2 / (lambda D)) sinc(2 h s / (lambda D)).
         far = 2 * half / np.sqrt(1j * product) * np.exp(1j * np.pi * middles**2 / product)
@@ -377,7 +391,7 @@ def test_a_slit_equals_thirty_digits_in_the_far_and_the_near_field(name: str, ha
         assert np.abs(found - far).max() < np.pi * half**2 / product * np.abs(far).max()
 
 
-def test_a_million_edges_equal_their_sum() -> None:
+def test_a_million_edges_equal_their_sum(measured: Recorder) -> None:
     """A mask of 1e6 edges in 1.25e6 cells against the plain sum of a million edge waves, by math.fsum.
 
     1e-9 of an open mask: 1e6 terms of order 1, and their mean square rounding of eps x 1e3 in either way. Memory stays
@@ -394,12 +408,14 @@ def test_a_million_edges_equal_their_sum() -> None:
     found = waves.field(Steps(edges, values), start)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 400 * cells
+    measured(peak / cells, at_most=400, what="memory a cell", unit="bytes")
     jumps = np.diff(values, prepend=0.0, append=0.0)
     for middle, field in zip(start + (np.arange(3) + 0.5) * step, found, strict=True):
         sine, cosine = fresnel((middle - edges) * math.sqrt(2 / (NM * 1e-6 * distance)))
         terms = jumps * (0.5 + (0.5 - 0.5j) * (cosine + 1j * sine))
-        assert abs(field - complex(math.fsum(terms.real), math.fsum(terms.imag))) < 1e-9
+        measured(
+            abs(field - complex(math.fsum(terms.real), math.fsum(terms.imag))), at_most=1e-9, what="of an open mask"
+        )
 
 
 # ---- feature size
@@ -424,7 +440,7 @@ def exact_waves(geometry: CameraGeometry, step: float) -> np.ndarray:
     ("feature", "left"),
     [(1e-3, 0.05), (2e-3, 0.03), (5e-3, 0.015), (2e-2, 0.01), (0.06, 0.01), (0.2, 0.01), (1.0, 0.01)],
 )
-def test_features_from_a_micrometre_to_a_millimetre(feature: float, left: float, record_property) -> None:
+def test_features_from_a_micrometre_to_a_millimetre(measured: Recorder, feature: float, left: float) -> None:
     """A mask 0.2 mm away, wave by wave against scalar theory without the paraxial approximation.
 
     Paraxial waves leave 4 % at 1 um, where light spreads over tangents of 0.5, and 1 % from 20 um on.
@@ -437,8 +453,7 @@ def test_features_from_a_micrometre_to_a_millimetre(feature: float, left: float,
     exact = exact_waves(geometry, 2.5e-4)
     assert np.isfinite(wave).all() and wave.min() > -1e-9
     error = float(np.linalg.norm(wave[:, 0] - exact) / np.linalg.norm(exact))
-    record_property("error", float(error))
-    assert error < left
+    measured(error, at_most=left)
 
 
 @pytest.mark.parametrize(("feature", "warned"), [(5e-4, True), (1e-3, False)])

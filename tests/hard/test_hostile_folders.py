@@ -26,6 +26,8 @@ from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.rig.sensor import load_sensor
 
+pytestmark = pytest.mark.robustness("Input")
+
 LONGEST = 5.0
 ROOM = 3 << 30
 """Bytes of address space beyond what the process has when a case starts; the frames here need 1 kB."""

@@ -14,6 +14,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file
 from tests.hard.hostile import CASES, GOOD, OBJ, Case, ball, beside, file, mesh, picture, png, put, skin, swap
 
+pytestmark = pytest.mark.robustness("Input")
+
 LONGEST = 5.0
 """Seconds that any file may take; the slowest takes 0.1 s here."""
 

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.robustness import Recorder
+
+pytestmark = pytest.mark.robustness("Faults")
 PROGRAM = """
 import sys
 from pathlib import Path
@@ -36,10 +39,10 @@ print(used() - before, cost.memory_bytes, written, cost.disk_bytes)
     [("photograph", "dots:7", 1e-3), ("photograph", "hadamard:8", 1e-3), ("cookie_bag", "dots:7", 5e-3)],
 )
 def test_the_estimate_is_an_upper_one_within_a_factor_of_three(
-    variant: str, tmp_path: Path, scene: str, patterns: str, accuracy: float
+    measured: Recorder, variant: str, tmp_path: Path, scene: str, patterns: str, accuracy: float
 ) -> None:
     arguments = [sys.executable, "-c", PROGRAM, scene, patterns, str(tmp_path / "run"), str(accuracy)]
     done = subprocess.run(arguments, capture_output=True, text=True, check=True)
     taken, estimated, written, on_disk = map(float, done.stdout.split())
-    assert estimated / 3 < taken <= estimated, f"took {taken / 2**20:.0f} of {estimated / 2**20:.0f} MiB"
+    measured(estimated / taken, at_least=1, at_most=3, what="estimated for what was taken")
     assert on_disk / 1.1 < written <= on_disk

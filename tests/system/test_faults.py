@@ -23,6 +23,8 @@ from mitsim.core.framefile import read_frame
 from mitsim.core.output import LOCK
 from tests.system.interrupted import PATTERNS, assert_equal_runs, cut_short, ended, running
 
+pytestmark = pytest.mark.robustness("Faults")
+
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 LAST = 505  # of 512 frames, which are written 16 at a time
 

@@ -15,6 +15,8 @@ import pytest
 from mitsim.core.framefile import read_frame
 from tests.system.interrupted import PATTERNS, assert_equal_runs, cut_short
 
+pytestmark = pytest.mark.robustness("Faults")
+
 
 @pytest.fixture(scope="module")
 def killed(lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -1,0 +1,112 @@
+"""The site that `make docs` builds: pages in Markdown, the API from docstrings, notebooks as they are stored.
+
+The repository's root is the source folder, so that links lead to the same places here as on disk. Nothing is fetched
+and no notebook is run: a test does that.
+"""
+
+import base64
+import inspect
+import json
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+import mitsim
+
+ROOT = Path(__file__).resolve().parents[1]
+PICTURES = "docs/_build/gallery"
+
+project = "mitsim"
+author = "the mitsim authors"
+copyright = f"2026, {author}"
+version = release = mitsim.__version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "sphinxcontrib.mermaid"]
+root_doc = "README"
+include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**"]
+exclude_patterns = [".*", "mitsim", "tests", "scenes", "docs/_build", "docs/conf.py", "docs/images", "**/.*"]
+
+nb_execution_mode = "off"
+myst_enable_extensions = ["substitution"]
+myst_heading_anchors = 3
+myst_fence_as_directive = ["mermaid"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+numpydoc_show_class_members = False
+
+html_theme = "furo"
+html_title = f"mitsim {version}"
+
+CONTENTS = """
+```{toctree}
+:hidden:
+:caption: Guide
+
+docs/notebooks/index
+docs/architecture
+docs/physics
+docs/formats
+docs/extending
+docs/robustness
+```
+
+```{toctree}
+:hidden:
+:caption: Reference
+
+docs/api
+docs/decisions/index
+CHANGELOG
+CONTRIBUTING
+```
+"""
+
+
+def face() -> str:
+    """Markdown that documents every name of `mitsim.__all__`: functions, and classes with their public members."""
+    blocks = []
+    for name in sorted(getattr(mitsim, "__all__", ()), key=lambda name: (name[0].isupper(), name)):
+        kind = "autoclass" if inspect.isclass(getattr(mitsim, name)) else "autofunction"
+        members = "   :members:\n" if kind == "autoclass" else ""
+        blocks.append(f"```{{eval-rst}}\n.. {kind}:: mitsim.{name}\n{members}```")
+    return "\n\n".join(blocks)
+
+
+def gallery() -> str:
+    """Markdown that shows every notebook by its title, its first words and the first picture stored in it."""
+    blocks = []
+    for path in sorted((ROOT / "docs/notebooks").glob("*.ipynb")):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        title, _, words = "".join(cells[0]["source"]).lstrip("# ").partition("\n")
+        blocks.append(f"## [{title}]({path.name})\n\n{words.strip()}")
+        outputs = [output.get("data", {}) for cell in cells for output in cell.get("outputs", ())]
+        pictures = [data["image/png"] for data in outputs if "image/png" in data]
+        if pictures:
+            picture = ROOT / PICTURES / f"{path.stem}.png"
+            picture.parent.mkdir(parents=True, exist_ok=True)
+            picture.write_bytes(base64.b64decode("".join(pictures[0])))
+            blocks.append(f"![{title}](/{PICTURES}/{picture.name})")
+    if blocks:
+        blocks.append("```{toctree}\n:hidden:\n:glob:\n\n*\n```")
+    return "\n\n".join(blocks)
+
+
+myst_substitutions = {"face": face(), "gallery": gallery()}
+
+
+def add_contents(_: Sphinx, page: str, source: list[str]) -> None:
+    """README opens the site; what lists the other pages belongs to the site alone."""
+    if page == root_doc:
+        source[0] += CONTENTS
+
+
+def open_with_readme(app: Sphinx, _: Exception | None) -> None:
+    """An index.html that leads to README, for browsers that are given the folder."""
+    page = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url=README.html">'
+    Path(app.outdir, "index.html").write_text(page, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("source-read", add_contents)
+    app.connect("build-finished", open_with_readme)

@@ -1,0 +1,319 @@
+"""README and docs: every example runs, every command line is one that the program takes, every link leads somewhere.
+
+An example is a line ``$ mitsim ...`` or a Python block. Those of a page run in their order in one empty folder; the
+lines of output under a command say how it ends. Quick tests hold each command line against the program's own options.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim
+from mitsim.core.configuration import shipped
+from tests.robustness import Recorder, Row, page_of
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted(
+    path.relative_to(ROOT).as_posix()
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/decisions/*.md")]
+)
+EXAMPLES = [page for page in PAGES if page not in ("CHANGELOG.md", "CONTRIBUTING.md")]
+FIRST_SCREEN = 40
+"""Lines of README that a browser shows before one scrolls; chosen."""
+
+ELSEWHERE = {"--check", "--strict"}
+"""Options in the docs that are not mitsim's: of scenes/generate.py and mypy."""
+
+NO_MODULES = {"mitsim.key"}
+"""Names in the docs that only look like modules: metadata of OpenEXR files."""
+
+MODULES_PENDING = {
+    "mitsim/capture/run.py",
+    "mitsim/optics/frames.py",
+    "mitsim/scene/guard/check.py",
+    "mitsim/study/compare.py",
+}
+"""Modules that still mention a design page."""
+
+ACCURACY = "0.02"
+"""For examples that name none: how the verbs fit together does not depend on it, and they take a tenth of the time."""
+
+
+def text_of(page: str) -> str:
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def prose_of(page: str) -> str:
+    """The page without its blocks of code."""
+    fenceless = re.sub(r"^```.*?^```", "", text_of(page), flags=re.M | re.S)
+    return re.sub(r"^    .*$", "", fenceless, flags=re.M)
+
+
+@dataclass(frozen=True)
+class Example:
+    """A command of a page: its arguments after `mitsim`, and the exit status that the output under it tells."""
+
+    arguments: list[str]
+    status: int
+
+
+def examples(page: str) -> list[Example]:
+    found = []
+    for match in re.finditer(r"^    \$ mitsim (.*)\n((?:    (?!\$ ).*\n)*)", text_of(page), flags=re.M):
+        output = match[2]
+        status = 1 if "mitsim: warning" in output else 2 if "mitsim: " in output else 0
+        found.append(Example(shlex.split(match[1], comments=True), status))
+    return found
+
+
+def command_lines() -> list[tuple[str, str]]:
+    """(page, arguments) of all lines and inline spans of code that begin with `mitsim` and a verb."""
+    found = []
+    for page in EXAMPLES:
+        lines = re.findall(r"^    (?:\$ )?mitsim ([a-z].*)$", text_of(page), flags=re.M)
+        spans = re.findall(r"`mitsim ([a-z][^`]*)`", prose_of(page))
+        found += [(page, " ".join(line.split())) for line in [*lines, *spans]]
+    return found
+
+
+def verbs() -> dict[str, Any]:
+    import typer
+
+    from mitsim.cli import app
+
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    return commands
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text_of(page), flags=re.M | re.S)
+
+
+# ---- the command line ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("page", "line"), command_lines())
+def test_a_command_line_is_one_that_the_program_takes(page: str, line: str) -> None:
+    verb, *arguments = shlex.split(line, comments=True)
+    try:
+        verbs()[verb].make_context(verb, arguments)
+    except Exception as error:
+        # A sentence may name a verb or its option alone; typer does not say where it keeps click.
+        if type(error).__name__ not in ("MissingParameter", "BadOptionUsage") or f"`mitsim {line}`" not in text_of(
+            page
+        ):
+            raise
+
+
+def test_every_option_in_the_docs_is_one_of_a_verb() -> None:
+    options = {option for verb in verbs().values() for parameter in verb.params for option in parameter.opts}
+    options |= {"--help", "--version", *ELSEWHERE}
+    stale = {
+        f"{page}: {option}"
+        for page in EXAMPLES
+        for span in re.findall(r"`([^`\n]+)`", prose_of(page))
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", span)
+        if option not in options
+    }
+    assert not stale, stale
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in EXAMPLES if examples(page)])
+def test_the_commands_of_a_page_run_in_their_order(page: str, tmp_path: Path) -> None:
+    prepare(tmp_path)
+    for example in examples(page):
+        command = verbs()[example.arguments[0]]
+        options = {option for parameter in command.params for option in parameter.opts}
+        coarse = ["--accuracy", ACCURACY] if "--accuracy" in options - set(example.arguments) else []
+        done = subprocess.run(
+            [sys.executable, "-c", "from mitsim.cli import main; main()", *example.arguments, *coarse],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == example.status, f"mitsim {shlex.join(example.arguments)}\n{done.stderr}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("status", "line", "sentence"),
+    re.findall(r'^\| (\d) \|.*\| `mitsim ([^`]+)`: "([^"]+)" \|$', text_of("README.md"), flags=re.M),
+)
+def test_the_exit_statuses_of_readme(status: str, line: str, sentence: str, tmp_path: Path) -> None:
+    program = [sys.executable, "-c", "from mitsim.cli import main; main()", *shlex.split(line)]
+    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == int(status)
+    assert sentence in " ".join(done.stderr.split())
+
+
+def prepare(folder: Path) -> None:
+    """What readers of docs/extending.md have written before they type its commands."""
+    shutil.copytree(shipped("calibration"), folder / "calibration")
+    shutil.copy(shipped("calibration", "mp_cl1.toml"), folder / "mine.toml")
+    shutil.copytree(shipped("scenes", "photograph"), folder / "path" / "to")
+
+
+# ---- Python ----------------------------------------------------------------------------------------------------------
+
+
+def measured_responses() -> dict[str, object]:
+    """What docs/formats.md calls measured: responses of a separable camera of 144 pixels to 128 stripes a side."""
+    from scipy.linalg import hadamard
+
+    rng = np.random.default_rng(0)
+    left, right, stripes = rng.random((144, 128)), rng.random((144, 128)), hadamard(128)
+    return {
+        "horizontal": [np.outer(left @ stripe, right.sum(axis=1)) for stripe in stripes.T],
+        "vertical": [np.outer(left.sum(axis=1), right @ stripe) for stripe in stripes.T],
+    }
+
+
+GIVEN: dict[str, Callable[[], dict[str, object]]] = {"docs/formats.md": measured_responses}
+SLOW = {"README.md"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else [])
+        for page in EXAMPLES
+        if blocks(page, "python")
+    ],
+)
+def test_the_python_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = GIVEN.get(page, dict)()
+    for block in blocks(page, "python"):
+        exec(compile(block, page, "exec"), names)
+
+
+@pytest.mark.parametrize("page", [page for page in EXAMPLES if blocks(page, "json")])
+def test_the_json_of_a_page_is_json(page: str) -> None:
+    for block in blocks(page, "json"):
+        json.loads(block)
+
+
+# ---- what the text says ----------------------------------------------------------------------------------------------
+
+
+def slugs(page: str) -> set[str]:
+    """Anchors of a page's headings, as GitHub and the site make them."""
+    titles = re.findall(r"^#+ (.+)$", re.sub(r"^```.*?^```", "", text_of(page), flags=re.M | re.S), flags=re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page: str) -> None:
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose_of(page)):
+        if target.startswith(("http://", "https://")):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (ROOT / page).parent / name if name else ROOT / page
+        found = path.exists() and (not anchor or anchor in slugs(os.path.relpath(path, ROOT)))
+        broken += [] if found else [target]
+    assert not broken, f"{page}: {broken}"
+
+
+@pytest.mark.parametrize("page", EXAMPLES)
+def test_files_tests_and_modules_that_a_page_names_exist(page: str) -> None:
+    missing = []
+    for span in re.findall(r"`([^`\n]+)`", prose_of(page)):
+        for name, test in re.findall(r"\b((?:mitsim|tests|benchmarks|scenes|docs)/[\w/]+\.\w+)(?:::(\w+))?", span):
+            path = ROOT / name
+            if "NAME" not in name and not (path.is_file() and (f"def {test}(" if test else "") in text_of(name)):
+                missing.append(span)
+        dotted = set(re.findall(r"^mitsim(?:\.\w+)+$", span)) - NO_MODULES
+        missing += [name for name in dotted if not resolves(name)]
+    assert not missing, f"{page}: {missing}"
+
+
+def resolves(dotted: str) -> bool:
+    """Whether a dotted name is a module, or something in one."""
+    parts = dotted.split(".")
+    for length in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[length:]:
+            found = getattr(found, part, None)
+        return found is not None
+    return False
+
+
+def test_nothing_refers_to_a_page_that_is_not_there() -> None:
+    modules = [path.relative_to(ROOT).as_posix() for path in (ROOT / "mitsim").rglob("*.py")]
+    offenders = {name for name in [*PAGES, *modules] if re.search(r"\bDESIGN\b|design page", text_of(name))}
+    assert offenders <= MODULES_PENDING, offenders - MODULES_PENDING
+
+
+def test_the_first_screen_says_what_shows_a_picture_and_two_commands() -> None:
+    screen = "\n".join(text_of("README.md").splitlines()[:FIRST_SCREEN])
+    opening = screen.split("\n## ")[0]
+    assert re.match(r"# mitsim\n\nmitsim \w+", opening)
+    assert "](docs/images/" in opening
+    commands = re.findall(r"^    (\S+ \S+)", opening, flags=re.M)
+    assert len(commands) == 2 and commands[1] == "mitsim demo"
+
+
+def test_the_citation_names_this_version() -> None:
+    assert f"\nversion: {mitsim.__version__}\n" in text_of("CITATION.cff")
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("myst_nb", reason="make docs installs it")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-c", "docs", ".", tmp_path / "html"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "html" / "docs" / "api.html").is_file()
+
+
+@pytest.mark.parametrize(("value", "gates"), [(2, {"at_most": 1}), (0, {"at_least": 1}), (np.nan, {"at_most": 1})])
+def test_a_figure_beyond_its_gate_fails(value: float, gates: dict[str, float]) -> None:
+    with pytest.raises(AssertionError, match="what"):
+        Recorder()(value, **gates, what="what")
+
+
+def test_a_row_shows_the_figure_nearest_to_its_gate() -> None:
+    figures = Recorder()
+    for value in (1e-9, 3e-7, -2e-8):
+        figures(value, at_most=1e-6, what="error")
+    row = Row("Optics", "tests/t.py", 1, "test_a_b", "What | holds.", ["x", "y"], figures.figures)
+    page = page_of("{Optics}\n", [row, Row("Optics", "tests/t.py", 2, "test_c", "")])
+    assert page.splitlines()[2:] == [
+        "| [a b](../tests/t.py) (2 cases). What \\| holds. | error: 3e-7 | <= 1e-6 |",
+        "",
+        "Also held: [c](../tests/t.py).",
+    ]
+
+
+def test_the_page_of_figures_has_every_marked_test() -> None:
+    """By its name in words; `make robustness` writes the page anew, with figures."""
+    page, missing = text_of("docs/robustness.md"), []
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        source = path.read_text(encoding="utf-8")
+        if re.search(r"^pytestmark = .*mark\.robustness\(", source, flags=re.M):
+            names = re.findall(r"^def test_(\w+)\(", source, flags=re.M)
+        else:
+            names = re.findall(r"^@pytest\.mark\.robustness\(.*\n(?:@.*\n)*def test_(\w+)\(", source, flags=re.M)
+        link = os.path.relpath(path, ROOT)
+        missing += [name for name in names if f"[{name.replace('_', ' ')}](../{link})" not in page]
+    assert not missing, missing
