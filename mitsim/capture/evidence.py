@@ -135,12 +135,12 @@ class Evidence:
     unresolved: float = 0.0
 
     def connecting(self, settings: Settings, anchors: int) -> float:
-        """Seconds of direct light, and of its differences between anchors, in the samples that are predicted."""
+        """Seconds of direct light in the samples of ``settings``, and of its differences between ``anchors`` a side."""
         differences = settings.anchored_samples * anchors**2 * self.anchored.cost if anchors > 1 else 0.0
         return GROUPS * (settings.direct_samples * self.direct.cost + differences)
 
     def following(self, settings: Settings) -> float:
-        """Seconds of all other light; none when no effect calls for it."""
+        """Seconds of all other light in the samples of ``settings``; none when no effect calls for it."""
         if not settings.effects & names(lambda effect: effect.followed):
             return 0.0
         indirect = settings.indirect_samples * self.indirect.cost

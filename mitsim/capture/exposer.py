@@ -47,39 +47,39 @@ class Exposer:
     speckle: float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
-        """Expected photoelectrons (pixels, pixels), without dark current."""
+        """Expected photoelectrons (pixels, pixels) of ``frame``, without dark current."""
         return electrons_from_irradiance(
             frame.irradiance, self.exposure_s, self.bench.sensor, self.bench.projector.effective_wavelength_nm
         )
 
     def lit(self, frame: Frame, *names: str | int) -> FloatArray:
-        """Expected photoelectrons of the frame ``names``, with its own speckle."""
+        """Expected photoelectrons of ``frame``, with the speckle of its own that ``names`` find."""
         return speckled(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
-        """Noisy digital numbers of the frame ``names``."""
+        """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""
         shot, read = (stream(self.seed, noise, *names) for noise in ("shot", "read"))
         return expose(electrons, self.exposure_s, self.bench.sensor, shot, read)
 
     def rate(self, digital: Digital) -> FloatArray:
-        """What a user of frames computes: photoelectrons a second, dark current taken off."""
+        """What a user of frames computes of ``digital`` numbers: photoelectrons a second, dark current taken off."""
         sensor = self.bench.sensor
         return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
 
     def rendering_noise(self, frame: Frame) -> float:
-        """Root mean square Monte Carlo error of a frame [electrons]."""
+        """Root mean square Monte Carlo error of ``frame`` [electrons]."""
         unit = electrons_from_irradiance(
             1.0, self.exposure_s, self.bench.sensor, self.bench.projector.effective_wavelength_nm
         )
         return float(np.sqrt(frame.variance) * unit)
 
     def sensor_noise(self, electrons: FloatArray) -> float:
-        """Root mean square noise of the sensor in a frame, from its closed form [electrons]."""
+        """Root mean square noise of the sensor on expected ``electrons``, from its closed form [electrons]."""
         _, variance = frame_moments(electrons, self.exposure_s, self.bench.sensor)
         return float(np.sqrt(variance.mean()) / self.bench.sensor.gain_dn_per_e)
 
     def saturated(self, digital: Digital, electrons: FloatArray) -> bool:
-        """Whether any pixel reached the full well or the ADC's end, from the frame and its expected photoelectrons.
+        """Whether any pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end.
 
         A reading at the full well counts where the light can have filled it: with a chance of 1e-3 in the whole frame.
         Elsewhere it is read noise.

@@ -18,14 +18,24 @@ _KEPT = 4
 
 
 class Glint:
-    """Frames made from beams; the last few are kept, because forming them takes as long as tracing does."""
+    """Frames made from ``beams``; the last few are kept, because forming them takes as long as tracing does."""
 
     def __init__(self, beams: Beams) -> None:
         self.beams = beams
         self._frames: dict[tuple[bytes, CameraGeometry, Spectrum | None], ClassFrames] = {}
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
-        """Frames by class for ``labels`` (n^2,); without a ``spectrum`` the mask's shadow is geometric."""
+        """Frames by class of projector pixels; None where no beam reaches the sensor.
+
+        Parameters
+        ----------
+        labels
+            (n^2,) class of each pixel.
+        geometry
+            the camera.
+        spectrum
+            light whose diffraction is simulated; None: the mask's shadow is geometric.
+        """
         if not len(self.beams):
             return None
         key = labels.tobytes(), geometry, spectrum

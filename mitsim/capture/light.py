@@ -295,6 +295,13 @@ def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArra
     """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
 
     Direct light, two cells a side of a projector pixel; 0 where the projector does not light the board.
+
+    Parameters
+    ----------
+    bench, seed
+        what is looked at, and the root of the random streams.
+    board_reflectance
+        of the board that counts as 1.
     """
     settings = Settings(depth=bench.geometry.scene_distance)
 

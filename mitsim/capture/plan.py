@@ -272,9 +272,18 @@ def _coarse(evidence: Evidence, settings: Settings, accuracy: float) -> _Coarse:
 
 
 def allocate_samples(evidence: Evidence, settings: Settings, target: float) -> Settings:
-    """``settings`` with the samples that ``evidence`` predicts for a relative Monte Carlo error ``target``.
+    """The samples that a Monte Carlo error is predicted to need, put into settings.
 
     The fewest paths for a sum of variances; not the least time, for settings must not depend on the pace.
+
+    Parameters
+    ----------
+    evidence
+        noise of each kind of light.
+    settings
+        what is simulated.
+    target
+        relative Monte Carlo error.
     """
     paths = evidence.anchored.paths * settings.anchors**2 * (settings.anchors > 1)
     efforts: dict[str, Effort] = {"direct": evidence.direct, "anchored": replace(evidence.anchored, paths=paths)}

@@ -54,7 +54,15 @@ def plan_request(bench: Bench, request: Request) -> Plan:
 
 
 def trace_request(bench: Bench, plan: Plan, job: Job | None = None) -> Light:
-    """Light of a ``bench`` by projector pixel, as a ``plan`` of it asks; MitsimError beyond the limits of ``job``."""
+    """Light by projector pixel, as a plan asks.
+
+    Parameters
+    ----------
+    bench, plan
+        what is traced, and a plan of it.
+    job
+        clock, progress and limits; MitsimError for work beyond them.
+    """
     job, request = job or Job(), _request(plan)
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)

@@ -89,12 +89,29 @@ class Tray:
         return FrameOptics(self._geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, self._spectrum)
 
     def file(self, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        """(classes + 1, places) ``deposits`` of so many ``samples``, by the class in ``labels`` of their pixel."""
+        """(classes + 1, places) light per sample.
+
+        Parameters
+        ----------
+        deposits
+            of a tracer.
+        labels
+            (n^2,) class of each projector pixel.
+        samples
+            that were traced.
+        """
         return self.bundle.file(deposits, labels, samples)
 
 
 class Simulation:
     """A bench with settings; its parts are prepared when they are first asked for.
+
+    Parameters
+    ----------
+    bench, settings
+        what is simulated, and how finely.
+    pixels
+        cells a side of the projector's window, instead of one a pixel.
 
     Attributes
     ----------
@@ -105,7 +122,6 @@ class Simulation:
     """
 
     def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None) -> None:
-        """``pixels``: cells a side of the projector's window, instead of one a pixel."""
         self.bench, self.settings = bench, settings
         self.physics = Physics.simulated(bench, settings.effects)
         pixels = pixels or bench.n
@@ -165,7 +181,7 @@ class Simulation:
         return CameraTracer(loaded.scene, loaded.camera, physics.projector, self.aim, paths, physics.geometry)
 
     def follow(self, seed: int, samples: int) -> Deposits:
-        """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each, for :meth:`file_followed`."""
+        """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``, to be filed."""
         tracers = [tracer for tracer in (self.indirect, self.from_camera) if tracer is not None]
         return Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers])
 
@@ -177,17 +193,35 @@ class Simulation:
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
 
     def file_direct(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
-        """Light of :attr:`direct`, per sample: ``deposits`` of ``samples``, by the class in ``labels``."""
+        """Light of :attr:`direct`, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
         return self._light(fine=self.fine.file(deposits, labels, samples))
 
     def file_anchored(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
-        """Light of :attr:`anchored` beyond its mean over the sensor: ``deposits``, ``labels``, ``samples`` as above."""
+        """Light of :attr:`anchored` beyond its mean over the sensor, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
         mean = self.smooth.file(deposits.averaged(self.mean_weights), labels, samples)
         coarse = self.coarse.file(deposits, labels, samples)
         return self._light(coarse=coarse - self.coarse.bundle.repeated(mean))
 
     def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
-        """Light of :attr:`indirect` or :attr:`from_camera`: ``deposits``, ``labels``, ``samples`` as above."""
+        """Light of :attr:`indirect` or :attr:`from_camera`, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
         indirect = deposits.order == INDIRECT
         fine = self.fine.file(deposits.where(~indirect), labels, samples)
         return self._light(fine=fine, smooth=self.smooth.file(deposits.where(indirect), labels, samples))

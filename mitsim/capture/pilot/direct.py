@@ -37,6 +37,19 @@ class FineLight:
     """Direct light in many samples a cell, filed in different ways."""
 
     def __init__(self, bench: Bench, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
+        """Trace direct light twice.
+
+        Parameters
+        ----------
+        bench, base
+            what is traced, and the settings that are varied.
+        sample
+            shots and samples.
+        accuracy
+            where the search for enough may stop.
+        seed
+            root of the random streams.
+        """
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         tracer = _tracer(Simulation(bench, base), sample)
         first, second = (integer(seed, "pilot", "fine", half) for half in range(2))
@@ -115,7 +128,15 @@ class AnchoredLight:
     """
 
     def __init__(self, bench: Bench, base: Settings, sample: Sample, light: float, seed: int) -> None:
-        """``light`` is the norm of frames of all light, of which direct light is ``part``."""
+        """The frames of one anchor.
+
+        Parameters
+        ----------
+        bench, base, sample, seed
+            as for :class:`FineLight`.
+        light
+            norm of frames of all light, of which direct light is ``part``.
+        """
         self.bench, self.base, self.sample, self.light = bench, base, sample, light
         self.seeds = [integer(seed, "pilot", "anchors", half) for half in range(2)]
         self.part = norm(self._frames(1)) / light if light else 0.0

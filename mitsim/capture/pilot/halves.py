@@ -71,7 +71,17 @@ class Sample:
     def frames(
         self, simulation: Simulation, direct: Deposits, samples: int, followed: Deposits | None = None
     ) -> FloatArray:
-        """(shots, pixels, pixels) frames of ``direct`` light in ``samples``, and of ``followed`` light."""
+        """(shots, pixels, pixels) frames.
+
+        Parameters
+        ----------
+        simulation
+            what forms them.
+        direct, samples
+            direct light, and its samples.
+        followed
+            light over more surfaces or from the camera.
+        """
         labels = self.lighting.labels
         light = simulation.file_direct(direct, labels, samples)
         if followed is not None:
@@ -110,7 +120,7 @@ def ladder(steps: Iterable[int], frames: Callable[[int], Halves], first: int, ac
 
 
 def difference(changed: Halves, judge: Halves) -> float:
-    """||changed - judge|| / ||judge||."""
+    """||``changed`` - ``judge``|| / ||``judge``||."""
     energy = float((judge[0] * judge[1]).sum())
     product = float(((changed[0] - judge[0]) * (changed[1] - judge[1])).sum())
     return math.sqrt(max(product, 0.0) / energy) if energy > 0 else 0.0

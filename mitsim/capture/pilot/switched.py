@@ -19,7 +19,17 @@ _KINDS = {"indirect": histogram.INDIRECT, "ambient": histogram.AMBIENT}
 
 
 class SwitchedEffects:
-    """A bench with ``everything`` on; direct and followed light are traced once and reused where they can be."""
+    """A bench with all effects; direct and followed light are traced once and reused where they can be.
+
+    Parameters
+    ----------
+    bench, everything
+        what is traced, and settings with all its effects on.
+    sample
+        shots and samples.
+    seed
+        root of the random streams.
+    """
 
     def __init__(self, bench: Bench, everything: Settings, sample: Sample, seed: int) -> None:
         self.bench, self.everything, self.sample = bench, everything, sample
@@ -46,7 +56,7 @@ class SwitchedEffects:
         return self.simulation.physics.speckle
 
     def effort(self, name: str) -> Effort:
-        """Monte Carlo error of one estimate of the light of a tracer, relative to all light, and what it takes."""
+        """Monte Carlo error of one estimate of the light of tracer ``name``, relative to all light, and what it takes."""
         stage = self.simulation.tracers().get(name)
         if stage is None:
             return Effort.none()
