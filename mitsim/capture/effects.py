@@ -260,7 +260,7 @@ def names(which: Callable[[Effect], bool]) -> frozenset[str]:
 
 
 def parse_switches(text: str) -> dict[str, bool]:
-    """A ``text`` such as ``+ambient,-diffraction`` as {name: on}; MitsimError for a name that is no effect, or a missing sign."""
+    """A ``text`` such as ``+ambient,-diffraction`` as {name: on}; MitsimError for no effect, or a missing sign."""
     switches: dict[str, bool] = {}
     for word in filter(None, (part.strip() for part in text.split(","))):
         if word[0] not in "+-" or word[1:] not in SWITCHES:

@@ -21,10 +21,8 @@ from mitsim.rig.patterns import Lighting
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import Deposits
 
-ANCHOR_LADDER = (1, 2, 3, 5, 8)
-LAYER_LADDER = (1, 2, 3, 4, 6, 8, 12)
-CELL_LADDER = (1, 2, 4, 8)
-"""Numbers a side that are tried, each step about half the error of the one before or less."""
+ANCHOR_LADDER, LAYER_LADDER, CELL_LADDER = (1, 2, 3, 5, 8), (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
+"""Numbers that are tried, each step about half the error of the one before or less."""
 _FIRST_JUDGE, _FEW_ANCHORS = 5, 3
 """Anchors that judge at first, and those whose noise is measured: fewer leave a plan's choice to them unseen."""
 _FLAT = 1e-4

@@ -56,7 +56,7 @@ class SwitchedEffects:
         return self.simulation.physics.speckle
 
     def effort(self, name: str) -> Effort:
-        """Monte Carlo error of one estimate of the light of tracer ``name``, relative to all light, and what it takes."""
+        """Monte Carlo error of one estimate by the tracer ``name``, relative to all light, and what it takes."""
         stage = self.simulation.tracers().get(name)
         if stage is None:
             return Effort.none()
