@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import read_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
 from mitsim.core.runs import Capture, RunFolder, RunMemory, claimed, frame_name, load_run
 from mitsim.rig.patterns import parse_patterns
@@ -60,6 +61,10 @@ def test_a_saved_capture_is_the_folder_that_was_streamed(tmp_path: Path) -> None
     expected = content(tmp_path / "streamed")
     assert len(expected) == 4 * 2 + 2
     assert content(tmp_path / "saved") == expected and content(tmp_path / "copied") == expected
+    channels, metadata = read_frame(tmp_path / "saved" / frame_name(3))
+    assert metadata["run"] == RunHead.of(CONFIGURATION).configuration_sha256 and metadata["index"] == 3
+    assert len(str(metadata["pixels_sha256"])) == 64 and metadata["exposure_s"] == 0.02
+    assert set(channels) == {"DN", "electrons"}
 
 
 def test_memory_and_disk_give_the_same_arrays(tmp_path: Path) -> None:
