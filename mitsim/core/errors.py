@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 _LONGEST = 1500
+"""Characters of a message: a screen of 80 x 20."""
 
 
 class MitsimError(Exception):

@@ -12,7 +12,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -32,7 +35,7 @@ def single_threaded_blas() -> Iterator[None]:
 
 
 @cache
-def _controller() -> Any:
+def _controller() -> ThreadpoolController:
     """The thread pools of this process; looking for them takes a millisecond, so once."""
     # Imported here: threadpoolctl sets an environment variable when it is imported, and importing mitsim sets none.
     from threadpoolctl import ThreadpoolController
@@ -41,6 +44,6 @@ def _controller() -> Any:
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """``function`` of each item, in order, over one thread a processor; it should spend its time in numpy."""
+    """``function`` of each of the ``items``, in order, one thread a processor; it should spend its time in numpy."""
     with single_threaded_blas(), ThreadPoolExecutor(workers()) as pool:
         return list(pool.map(function, items))

@@ -17,6 +17,7 @@ _CGROUPS = (
 """Where control groups of version 2 and 1 say what a container may take, what it takes, and how much of that is cache
 of files, which the kernel gives back when it is needed."""
 _USABLE = 0.9
+"""Part of the free memory that work may take: the rest is for what estimates and other programs add."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,9 @@ class Limits:
 
     def __post_init__(self) -> None:
         if not self.seconds > 0:
-            raise MitsimError(f"--max-seconds {self.seconds:g}: give a number above 0")
+            raise MitsimError(f"max_seconds {self.seconds:g}: give a number above 0")
         if self.memory_bytes is not None and not self.memory_bytes > 0:
-            raise MitsimError(f"--max-memory {self.memory_bytes / 2**30:g}: give a number of GiB above 0")
+            raise MitsimError(f"max_memory {self.memory_bytes / 2**30:g}: give a number of GiB above 0")
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,26 @@ class Cost:
     disk_bytes: float = 0.0
 
     def check(self, what: str, limits: Limits, output: Path | None = None) -> None:
-        """MitsimError when the work takes more than its limits, or than the disk of ``output`` has free."""
+        """Refuse work that takes too much.
+
+        Parameters
+        ----------
+        what
+            the work, for the message.
+        limits
+            on time and memory.
+        output
+            where it writes, if it does.
+
+        Raises
+        ------
+        MitsimError
+            when the work takes more than its limits, or than the disk of ``output`` has free.
+        """
         if not self.seconds <= limits.seconds:
             raise MitsimError(
                 f"{what}: would take about {self.seconds:.3g} s; allowed are {limits.seconds:.3g} s; "
-                "ask for less accuracy or fewer frames, or raise --max-seconds"
+                "ask for less accuracy or fewer frames, or raise max_seconds"
             )
         free = free_memory() * _USABLE
         allowed = free if limits.memory_bytes is None else min(limits.memory_bytes, free)
@@ -82,8 +98,8 @@ def free_memory() -> float:
 
 def free_disk(path: Path) -> float:
     """Bytes left on the disk where ``path`` is, or will be."""
-    there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
-    return float(shutil.disk_usage(there).free)
+    existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    return float(shutil.disk_usage(existing).free)
 
 
 def _size(count: float) -> str:

@@ -115,13 +115,20 @@ class Capture:
         """P_L (n, K) and P_R (n', K')."""
         return self.manifest.patterns.matrices
 
-    def measurements(self) -> Iterator[tuple[FloatArray, int, int]]:
+    def measurements(self, shape: tuple[int, int] | None = None) -> Iterator[tuple[FloatArray, int, int]]:
         """(frame (rows, columns) [electrons/s], i, j) of every pattern, read one at a time; the halves of a signed one
-        come as their difference. MitsimError for a frame that is missing, damaged or not finite."""
+        come as their difference. MitsimError for a frame that is missing, damaged, not finite or of another ``shape``
+        than is asked for."""
         waiting: dict[tuple[int, int], FloatArray] = {}
         for shot in self.manifest.patterns.captures:
             index = (shot.row, shot.column)
-            frame = self.manifest.digital.rate(self._channel(shot.file, "DN")) * (shot.sign or 1)
+            dn = self._channel(shot.file, "DN")
+            if dn.shape != (shape or dn.shape):
+                raise MitsimError(
+                    f"{(self.folder or Path()) / shot.file}: the frame is {_size(dn.shape)}, but the calibration's are "
+                    f"{_size(shape or ())}; calibrate this camera"
+                )
+            frame = self.manifest.digital.rate(dn) * (shot.sign or 1)
             if shot.sign and index not in waiting:
                 waiting[index] = frame
                 continue
@@ -353,6 +360,10 @@ class RunFolder:
 
 def _truth(reflectance: FloatArray, board: float) -> tuple[Channels, Metadata]:
     return {"reflectance": reflectance.astype(np.float32)}, {"board_reflectance": board}
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape))
 
 
 def _pixels(channels: Channels) -> str:

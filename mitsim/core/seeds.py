@@ -11,22 +11,24 @@ import numpy as np
 from mitsim.core.errors import MitsimError
 
 _LARGEST_ROOT = 2**64
+"""What a frame's metadata and other programs hold as an unsigned integer."""
 
 
 def stream(root: int, *names: str | int) -> np.random.Generator:
-    """A generator of its own for `names` under the seed `root` (0 <= root < 2^64), for example
-    `stream(seed, "shot", frame)`. Raises MitsimError for a root out of range."""
+    """A generator of its own for ``names`` under the seed ``root`` (0 <= root < 2^64), for example
+    ``stream(seed, "shot", frame)``. MitsimError for a root out of range."""
     return np.random.Generator(np.random.PCG64(_sequence(root, "stream", names)))
 
 
 def integer(root: int, *names: str | int) -> int:
-    """A child seed in [0, 2^32) for libraries that want an integer; unrelated to `stream` of that name."""
+    """A child seed in [0, 2^32) for ``names`` under the seed ``root``, for libraries that want an integer; unrelated to
+    :func:`stream` of that name. MitsimError for a root out of range."""
     return int(_sequence(root, "integer", names).generate_state(1, np.uint32)[0])
 
 
 def _sequence(root: int, purpose: str, names: tuple[str | int, ...]) -> np.random.SeedSequence:
     if not 0 <= root < _LARGEST_ROOT:
-        raise MitsimError(f"seed: got {root}; allowed are whole numbers from 0 to 2^64 - 1; pass another --seed")
+        raise MitsimError(f"seed: got {root}; allowed are whole numbers from 0 to 2^64 - 1")
     digest = hashlib.sha256()
     # Type and length go in as well, so that ("a", "b"), ("ab",), (1,) and ("1",) are four different names.
     for name in (purpose, *names):

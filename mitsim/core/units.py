@@ -12,7 +12,8 @@ LUMINOUS_EFFICACY = 683.0
 
 
 def photon_energy(wavelength_nm: float) -> float:
-    """Energy of one photon in joules, E = h c / lambda, for a vacuum wavelength in nanometres."""
+    """Energy of one photon [J], E = h c / lambda, at a vacuum wavelength ``wavelength_nm`` [nm]; ValueError unless that
+    is above 0."""
     if not wavelength_nm > 0:
         raise ValueError(f"photon_energy: wavelength_nm is {wavelength_nm}; it must be above 0")
     return PLANCK * LIGHT_SPEED / (wavelength_nm * 1e-9)

@@ -167,13 +167,7 @@ def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator
     Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{shots.name}: factorising its patterns", Limits())
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
     frames = prepared.accumulator()
-    expected = len(factors.left), len(factors.right)
-    for measurement, row, column in shots.measurements():
-        if measurement.shape != expected:
-            raise MitsimError(
-                f"{shots.name}: the frame of pattern ({row}, {column}) is {_size(measurement.shape)}, but the "
-                f"calibration's are {_size(expected)}; calibrate this camera"
-            )
+    for measurement, row, column in shots.measurements((len(factors.left), len(factors.right))):
         frames.add(measurement, row, column)
     return prepared, frames
 
@@ -228,7 +222,3 @@ def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:
         for what, warnings in (("capture", shots.warnings), ("calibration", factors.warnings))
         for warning in warnings
     )
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return "x".join(map(str, shape))

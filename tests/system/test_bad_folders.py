@@ -136,7 +136,7 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("change", "fragments"),
     [
-        (put("status", value="incomplete"), ["incomplete", "--resume"]),
+        (put("status", value="incomplete"), ["incomplete", "resume"]),
         (drop("patterns"), ["patterns: got nothing"]),
         (drop("digital"), ["digital: got nothing"]),
         (drop("camera"), ["camera: got nothing"]),

@@ -210,7 +210,7 @@ def test_resume_with_another_version_is_refused(
     for package in ("mitsim", "mitsuba", "numpy"):
         monkeypatch.setattr("mitsim.capture.run.versions", lambda name=package: {**versions(), name: "99.0"})
         line = refused("capture", *lab.rig, "-o", interrupted, "--patterns", PATTERNS, "--resume")
-        assert "--resume" in line and "another configuration (versions differ)" in line
+        assert "resume" in line and "another configuration (versions differ)" in line
 
 
 def test_resume_with_another_variant_is_refused(shell: Callable[..., Any], lab: Any, interrupted: Path) -> None:

@@ -43,9 +43,9 @@ def test_a_killed_run_has_whole_frames_only(killed: Path, whole: Path) -> None:
 
 def test_a_killed_run_is_no_run(refused: Callable[..., str], lab: Any, interrupted: Path) -> None:
     line = refused("reconstruct", "run", "--calibration", lab.calibration)
-    assert "run: the capture is incomplete" in line and "--resume" in line
+    assert "run: the capture is incomplete" in line and "resume" in line
     line = refused("capture", *lab.rig, "-o", "run", "--patterns", PATTERNS)
-    assert "run: the folder holds files already" in line
+    assert "run: the folder holds files already: an unfinished capture with" in line and "resume" in line
 
 
 def test_resume_finishes_it(call: Callable[..., Any], lab: Any, interrupted: Path, whole: Path) -> None:
@@ -87,7 +87,7 @@ def test_resume_replaces_a_frame_that_was_changed(call: Callable[..., Any], lab:
     data = bytearray((run / "frame_00005.exr").read_bytes())
     data[-2000] ^= 1
     (run / "frame_00005.exr").write_bytes(data)
-    assert "--resume" in call("reconstruct", run, "--calibration", lab.calibration).refusal
+    assert "resume" in call("reconstruct", run, "--calibration", lab.calibration).refusal
     assert call("capture", *lab.rig, "-o", run, "--patterns", "dots:4", "--resume").code == 0
     assert_equal_runs(run, lab.run)
 

@@ -115,3 +115,23 @@ def test_a_folder_made_for_nothing_goes_away(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), output_folder(tmp_path / "run"):
         raise KeyboardInterrupt
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_a_name_that_is_not_utf8_is_refused_before_work(tmp_path: Path, kind: str) -> None:
+    """OpenEXR cannot open it, nor a terminal print it: it ended in a traceback after all the work."""
+    path = Path(str(tmp_path) + "/\udcff.exr")  # the byte 0xff, as Python reads it from a command line
+    with pytest.raises(MitsimError, match="is not UTF-8 text") as caught:
+        output.prepare_output(path, kind=kind)
+    assert str(caught.value).isprintable() and not list(tmp_path.iterdir())
+
+
+def test_an_unfinished_calibration_is_not_to_be_emptied(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text('{"kind": "calibration", "status": "incomplete"}')
+    (tmp_path / "left.exr").touch()
+    with pytest.raises(MitsimError, match="an unfinished calibration with 1 finished frames; go on with resume=True"):
+        output.prepare_output(tmp_path)
+    for text in ("{", "[" * 100_000, "[1]", '{"status": "complete"}'):
+        (tmp_path / "manifest.json").write_text(text)
+        with pytest.raises(MitsimError, match="holds files already; choose a new one or empty it"):
+            output.prepare_output(tmp_path)

@@ -1,0 +1,80 @@
+"""Tables of docs/formats.md: the models that read and write each format in, Markdown out.
+
+    python docs/tables.py
+
+rewrites what stands between ``<!-- fields: NAME -->`` and ``<!-- end -->``. tests/unit/core/test_formats.py fails when
+the file differs from the models.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunManifest, ShotFile
+from mitsim.rig.projector import ProjectorModel
+from mitsim.rig.recipe import SessionRecipe
+from mitsim.rig.sensor import SensorModel
+
+FORMATS = Path(__file__).with_name("formats.md")
+MODELS = (SensorModel, ProjectorModel, SessionRecipe, RunManifest, Digital, Patterns, ShotFile, CalibrationManifest)
+_PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
+
+
+def table(model: type[BaseModel]) -> str:
+    """Markdown table of a ``model``: its fields, what is allowed, the default and the meaning."""
+    schema = model.model_json_schema()
+    lines = ["| field | allowed | default | meaning |", "|---|---|---|---|"]
+    for name, rules in schema["properties"].items():
+        default = "required" if name in schema.get("required", ()) else _default(model.model_fields[name].default)
+        lines.append(f"| `{name}` | {_allowed(rules)} | {default} | {rules['description']} |")
+    return "\n".join(lines)
+
+
+def _default(value: Any) -> str:
+    if value is None or value in ({}, (), ""):
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "infinite" if value == float("inf") else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _allowed(rules: dict[str, Any]) -> str:
+    """What a field takes, from its JSON schema."""
+    for choice in rules.get("anyOf", ()):
+        if choice.get("type") != "null":
+            return f"{_allowed(choice)}, null"
+    if "const" in rules or "enum" in rules:
+        return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
+    if "$ref" in rules or rules.get("type") == "object":
+        return "object"
+    if rules.get("type") == "array":
+        most = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
+        return f"list: {_allowed(rules['items'])}{most}"
+    if "pattern" in rules:
+        words = re.fullmatch(r"\^\(([\w|]+)\)\$", rules["pattern"])
+        return ", ".join(f"`{word}`" for word in words[1].split("|")) if words else "text without / and \\"
+    least, above = rules.get("minimum"), rules.get("exclusiveMinimum")
+    most, below = rules.get("maximum"), rules.get("exclusiveMaximum")
+    start = f"{least:g}" if least is not None else f"above {above:g}" if above is not None else ""
+    end = f"{most:g}" if most is not None else f"below {below:g}" if below is not None else ""
+    if start and end:
+        return start if start == end else f"{start} to {end}"
+    kind = _PLAIN.get(rules.get("type", ""), "anything")
+    return f"{kind}, at least {start}" if least is not None else f"{kind}, {start}" if start else kind
+
+
+def rewritten(text: str) -> str:
+    """``text`` with every table between its marks as the models have it."""
+    for model in MODELS:
+        start, end = f"<!-- fields: {model.__name__} -->\n", "\n<!-- end -->"
+        before, rest = text.split(start)
+        text = f"{before}{start}\n{table(model)}\n{end}{rest.split(end, 1)[1]}"
+    return text
+
+
+if __name__ == "__main__":
+    FORMATS.write_text(rewritten(FORMATS.read_text(encoding="utf-8")), encoding="utf-8")

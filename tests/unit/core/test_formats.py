@@ -1,0 +1,17 @@
+"""docs/formats.md says what the models of each format say."""
+
+import importlib.util
+from pathlib import Path
+
+TABLES = Path(__file__).parents[3] / "docs" / "tables.py"
+
+
+def test_the_tables_are_those_of_the_models() -> None:
+    spec = importlib.util.spec_from_file_location("tables", TABLES)
+    assert spec is not None and spec.loader is not None
+    tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    text = tables.FORMATS.read_text(encoding="utf-8")
+    assert tables.rewritten(text) == text, "run: python docs/tables.py"
+    for model in tables.MODELS:
+        assert all(field.description for field in model.model_fields.values()), model

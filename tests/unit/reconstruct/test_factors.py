@@ -1,0 +1,76 @@
+"""Factors: the whole model as a linear operator with its adjoint, and the CAL folder that they make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import hadamard
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import CalibrationManifest
+from mitsim.reconstruct.calibration import estimate_factors
+from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.status import Status, Verdict
+from mitsim.rig.patterns import parse_patterns
+
+N, ROWS, COLUMNS = 12, 20, 17
+FAMILIES = ("uniform", "dots:3", "dots:5", "hadamard:4", "random:3")
+
+
+def factors(centre: bool = False) -> Factors:
+    rng = np.random.default_rng(7)
+    manifest = CalibrationManifest(camera={"name": "bench"}, centre=centre, board_reflectance=0.99)
+    left, right = rng.random((ROWS, N)), rng.random((COLUMNS, N))
+    return Factors(left, right, manifest, Status(Verdict.CALIBRATED, "Calibrated"))
+
+
+@pytest.mark.parametrize("centre", [False, True], ids=["plain", "centred"])
+@pytest.mark.parametrize("patterns", FAMILIES)
+def test_the_adjoint_passes_the_dot_test(patterns: str, centre: bool) -> None:
+    """<A x, y> = <x, A^H y>. (Planted: rights not transposed in the adjoint's last product.)"""
+    operator = factors(centre).operator(patterns)
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=operator.shape[1]), rng.normal(size=operator.shape[0])
+    forward, backward = np.vdot(operator @ x, y), np.vdot(x, operator.H @ y)
+    assert abs(forward - backward) <= 1e-12 * np.linalg.norm(operator @ x) * np.linalg.norm(y)
+
+
+@pytest.mark.parametrize("centre", [False, True], ids=["plain", "centred"])
+@pytest.mark.parametrize("patterns", FAMILIES)
+def test_it_is_the_model_of_each_frame(patterns: str, centre: bool) -> None:
+    """Frame (i, j) is Phi_L (P_ij o X) Phi_R^T, written out pixel by pixel of the pattern; centred: C Y C."""
+    model, family = factors(centre), parse_patterns(patterns, N)
+    image = np.random.default_rng(5).normal(size=(N, N))
+    frames = (model.operator(family) @ image.ravel()).reshape(
+        family.left.shape[1], family.right.shape[1], ROWS, COLUMNS
+    )
+    for i in range(family.left.shape[1]):
+        for j in range(family.right.shape[1]):
+            frame = model.left @ (np.outer(family.left[:, i], family.right[:, j]) * image) @ model.right.T
+            if centre:
+                frame = frame - frame.mean(axis=0) - frame.mean(axis=1, keepdims=True) + frame.mean()
+            np.testing.assert_allclose(frames[i, j], frame, rtol=1e-11, atol=1e-11)
+
+
+def test_patterns_of_another_projector_are_refused() -> None:
+    with pytest.raises(MitsimError, match=r"patterns 'dots:3' are for 16 x 16 .* have 12 x 12"):
+        factors().operator(parse_patterns("dots:3", 16))
+
+
+def test_saved_and_loaded_they_are_the_same(tmp_path: Path) -> None:
+    signs = hadamard(4).astype(float)
+    rng = np.random.default_rng(1)
+    left, right = rng.random((9, 4)) + np.eye(9, 4), rng.random((8, 4)) + np.eye(8, 4)
+    horizontal = [np.outer(left @ column, right.sum(axis=1)) for column in signs.T]
+    vertical = [np.outer(left.sum(axis=1), right @ column) for column in signs.T]
+    memory = Factors.of(estimate_factors(horizontal, vertical, signs), CalibrationManifest(camera={"name": "bench"}))
+    memory.save(tmp_path / "cal")
+    disk = load_calibration(tmp_path / "cal")
+    assert np.array_equal(disk.left, memory.left) and np.array_equal(disk.right, memory.right)
+    assert disk.fingerprint == memory.fingerprint and disk.condition == memory.condition
+    assert disk.status.verdict is memory.status.verdict is Verdict.CALIBRATED and disk.ok
+    assert str(disk.status) == str(memory.status)
+    for shown in (memory, disk):
+        assert shown._repr_html_().count("data:image/png;base64,") == 2
