@@ -106,7 +106,7 @@ def measure(python: str, scenes: list[str]) -> dict[str, dict[str, str]]:
         with tempfile.TemporaryDirectory() as folder:
             for name, arguments, results in runs(scene, Path(folder)):
                 started = time.perf_counter()
-                command = [python, "-m", "mitsim.cli", *arguments, "--quiet", "--json"]
+                command = [python, "-c", "from mitsim.cli import run; run()", *arguments, "--quiet", "--json"]
                 done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
                 if done.returncode not in ACCEPTED:
                     raise SystemExit(f"{scene} {name}: exit status {done.returncode}\n{done.stderr}")
