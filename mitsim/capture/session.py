@@ -30,9 +30,7 @@ from mitsim.rig.recipe import SessionRecipe
 
 SIDES = ("horizontal", "vertical")
 _LINES = 4
-"""Rows, and columns, of pixels that the plan looks at: chosen so that the middle and the edges of the window show."""
-_HIGHEST_ORDER = 4
-"""Orders are tried up to so many times n: Hadamard matrices are known at 4, 8, 12 ... and every power of two."""
+"""Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class Session:
     def signs(self) -> FloatArray:
         """(n, N) first n rows of the smallest Hadamard matrix that has them; column 0 is all +1."""
         n = self.bench.n
-        for order in range(n, _HIGHEST_ORDER * (n + 1) + 1):
+        for order in range(n, 2 * n + 1):  # with a power of two among them
             try:
                 return hadamard_matrix(order)[:n].astype(np.float64)
             except MitsimError:

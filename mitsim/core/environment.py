@@ -2,7 +2,6 @@
 
 import os
 import platform
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -12,9 +11,6 @@ from types import ModuleType
 
 from mitsim.core import llvm
 from mitsim.core.errors import MitsimError
-from mitsim.core.llvm import candidates, find_llvm, probe, select_llvm
-
-__all__ = ["VARIANTS", "Check", "candidates", "doctor", "find_llvm", "load_variant", "probe", "select_llvm"]
 
 DEFAULT_VARIANT = "llvm_ad_mono"
 """One panchromatic reflectance, as the factored estimator has it; the others cost time and change nothing else."""
@@ -22,7 +18,9 @@ VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral")
 """Variants mitsim is tested with; `load_variant` takes any that the installed Mitsuba has."""
 
 _CHILD_SECONDS = 120
+"""Longest time for a check; chosen so: all of them take some ten, on a busy machine several times that."""
 _FEWEST_THREADS = 2
+"""With a pool of one thread, Mitsuba 3.9.1 waits for ever when it reads an OpenEXR file."""
 
 _RENDER = """
 from mitsim.core.environment import load_variant
@@ -47,7 +45,7 @@ figure.savefig(io.BytesIO(), format="png")
 
 @dataclass(frozen=True)
 class Check:
-    """One thing the doctor looked at: `ok` or not, what was seen, and the one command that mends it."""
+    """One thing the doctor looked at: ``ok`` or not, what was seen, and the one command that mends it."""
 
     name: str
     ok: bool
@@ -56,20 +54,20 @@ class Check:
 
 
 def load_variant(name: str) -> ModuleType:
-    """Mitsuba with the variant `name` set, after choosing an LLVM that works for the llvm_ variants.
+    """Mitsuba with the variant ``name`` set, after choosing an LLVM that works for the llvm_ variants.
 
     Setting a variant is Mitsuba's own process-wide state; nothing in mitsim does so except by this call.
     Raises MitsimError for an unknown variant, a Mitsuba that cannot be imported, or a missing LLVM.
     """
     if name.startswith("llvm_"):
-        select_llvm()
+        llvm.select_llvm()
     try:
         import mitsuba
     except ImportError as error:
         raise MitsimError(f"mitsuba: cannot be imported ({error}); run: {_reinstall('mitsuba')}") from error
-    known = mitsuba.variants()
-    if name not in known:
-        raise MitsimError(f"variant: got {name!r}; this Mitsuba has {', '.join(known)}; choose one of these")
+    variants = mitsuba.variants()
+    if name not in variants:
+        raise MitsimError(f"variant: got {name!r}; this Mitsuba has {', '.join(variants)}; choose one of these")
     try:
         mitsuba.set_variant(name)
     except ImportError as error:
@@ -77,7 +75,6 @@ def load_variant(name: str) -> ModuleType:
     if name.startswith("llvm_"):
         import drjit
 
-        # With a pool of one thread, Mitsuba waits for ever when it reads an OpenEXR file (Mitsuba 3.9.1).
         if drjit.thread_count() < _FEWEST_THREADS:
             drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
@@ -87,22 +84,22 @@ def load_variant(name: str) -> ModuleType:
 def doctor() -> list[Check]:
     """All checks in order. What can crash or hang runs in child processes; takes some ten seconds."""
     checks = [_python(), _llvm(), _child("mitsuba", "import mitsuba", "imports", _reinstall("mitsuba"))]
-    mend = _reinstall("mitsuba") if checks[1].ok else checks[1].remedy
-    checks += [_child(f"render {name}", _RENDER.format(name=name), "renders a test image", mend) for name in VARIANTS]
+    remedy = _reinstall("mitsuba") if checks[1].ok else checks[1].remedy
+    checks += [_child(f"render {name}", _RENDER.format(name=name), "renders a test image", remedy) for name in VARIANTS]
     checks += [_openexr(), _kernel_cache()]
     checks.append(_child("matplotlib", _FIGURE, "draws without a display", _reinstall("matplotlib")))
     return checks
 
 
 def _python() -> Check:
-    seen = f"Python {platform.python_version()} at {sys.executable}"
-    good = sys.version_info >= (3, 10)
-    return Check("python", good, seen, "" if good else "apt-get install -y python3.11")
+    detail = f"Python {platform.python_version()} at {sys.executable}"
+    new_enough = sys.version_info >= (3, 10)
+    return Check("python", new_enough, detail, "" if new_enough else "apt-get install -y python3.11")
 
 
 def _llvm() -> Check:
     def look() -> str:
-        path = find_llvm()
+        path = llvm.find_llvm()
         return f"LLVM {llvm.version(path) or 'of unknown version'} at {path} compiles and runs"
 
     remedy = f"unset {llvm.VARIABLE}" if os.environ.get(llvm.VARIABLE) else llvm.install_command()
@@ -146,21 +143,8 @@ def _attempt(name: str, look: Callable[[], str], remedy: str) -> Check:
 
 
 def _child(name: str, program: str, success: str, remedy: str) -> Check:
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=_CHILD_SECONDS,
-        )
-    except subprocess.TimeoutExpired:
-        return Check(name, False, f"gave no answer within {_CHILD_SECONDS} s", remedy)
-    if done.returncode == 0:
-        return Check(name, True, success)
-    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["no message"]
-    how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit status {done.returncode}"
-    return Check(name, False, f"{how}: {lines[-1]}", remedy)
+    result = llvm.run_child(program, _CHILD_SECONDS)
+    return Check(name, True, success) if result.ok else Check(name, False, result.detail, remedy)
 
 
 def _reinstall(package: str) -> str:

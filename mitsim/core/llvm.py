@@ -14,16 +14,20 @@ import site
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from mitsim.core.errors import MitsimError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
+"""Environment variable by which Dr.Jit finds the library."""
 OLDEST = 17
-_NEWEST = 30  # names up to this version are looked for; the probe decides whether one works
+"""First version that works: 14 is refused by Dr.Jit 1.5, 15 and 16 abort the process."""
+_NEWEST = 30
+"""Names up to this version are looked for, the probe decides; chosen with years of releases to spare."""
 _PROBE_SECONDS = 60
+"""Longest time for a probe; chosen so: it takes about one, on a busy machine several."""
 
 # minimum and maximum are the operations LLVM 15 and 16 cannot select.
 _PROBE_PROGRAM = """
@@ -37,7 +41,7 @@ assert abs(float(total[0]) - 165.0) < 1e-3, total
 
 @dataclass(frozen=True)
 class Probe:
-    """Whether a library compiled and ran a small program in a child process, and what was seen."""
+    """Whether a child process did what it should, and what was seen."""
 
     ok: bool
     detail: str
@@ -52,7 +56,7 @@ def install_command() -> str:
 
 
 def version(path: Path | str) -> int | None:
-    """LLVM's major version as the library's file name (links followed) tells it, None if it does not."""
+    """LLVM's major version as the library's file name at ``path`` (links followed) tells it, None if it does not."""
     for name in (Path(path).name, Path(os.path.realpath(path)).name):
         match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", name)
         if match:
@@ -62,36 +66,50 @@ def version(path: Path | str) -> int | None:
 
 def candidates() -> list[Path]:
     """Existing LLVM libraries of version 17 or newer (or unknown), newest first, each file once."""
-    found: dict[str, Path] = {}
+    by_file: dict[str, Path] = {}
     for path in _names():
         if path.exists() and (version(path) or OLDEST) >= OLDEST:
-            found.setdefault(os.path.realpath(path), path)
-    return list(found.values())
+            by_file.setdefault(os.path.realpath(path), path)
+    return list(by_file.values())
+
+
+def run_child(program: str, seconds: float, variables: Mapping[str, str] | None = None) -> Probe:
+    """Run a Python program in a child process, which may hang or die.
+
+    Parameters
+    ----------
+    program
+        source text.
+    seconds
+        longest time that it may take.
+    variables
+        environment variables beside this process's own.
+    """
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, **(variables or {})},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=seconds,
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(False, f"gives no answer within {seconds:g} s")
+    if done.returncode == 0:
+        return Probe(True, "compiles and runs")
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+    reason = next((line for line in lines if "LLVM ERROR" in line), lines[-1])
+    status = f"signal {-done.returncode}" if done.returncode < 0 else f"exit status {done.returncode}"
+    return Probe(False, f"fails with {status} ({reason})")
 
 
 def probe(path: Path | str) -> Probe:
-    """Compile and run a small program with the library in a child process, which may die."""
-    environment = {**os.environ, VARIABLE: str(path), "PYTHONUSERBASE": site.getuserbase()}
-    try:
-        # A home of its own: a kernel that a good LLVM left in ~/.drjit would make any other look good.
-        with tempfile.TemporaryDirectory() as home:
-            done = subprocess.run(
-                [sys.executable, "-c", _PROBE_PROGRAM],
-                env={**environment, "HOME": home},
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=_PROBE_SECONDS,
-            )
-    except subprocess.TimeoutExpired:
-        return Probe(False, f"gave no answer within {_PROBE_SECONDS} s")
-    if done.returncode == 0:
-        return Probe(True, "compiles and runs")
-    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
-    reason = next((line for line in lines if "LLVM ERROR" in line or "Error:" in line), "no message")
-    if done.returncode < 0:
-        return Probe(False, f"ends the process with signal {-done.returncode} ({reason})")
-    return Probe(False, f"fails ({reason})")
+    """Compile and run a small program with the library at ``path`` in a child process."""
+    # A home of its own: a kernel that a good LLVM left in ~/.drjit would make any other look good.
+    with tempfile.TemporaryDirectory() as home:
+        variables = {VARIABLE: str(path), "PYTHONUSERBASE": site.getuserbase(), "HOME": home}
+        return run_child(_PROBE_PROGRAM, _PROBE_SECONDS, variables)
 
 
 def find_llvm() -> Path:
@@ -108,8 +126,8 @@ def find_llvm() -> Path:
         if result.ok:
             return path
         tried.append(f"{path} {result.detail}")
-    seen = "; ".join(tried) if tried else "none found"
-    raise MitsimError(f"LLVM: no usable library of version {OLDEST} or newer ({seen}); run: {install_command()}")
+    failures = "; ".join(tried) or "none found"
+    raise MitsimError(f"LLVM: no usable library of version {OLDEST} or newer ({failures}); run: {install_command()}")
 
 
 def select_llvm() -> Path:
@@ -123,10 +141,10 @@ def select_llvm() -> Path:
 
 
 def _checked(path: Path) -> Path:
-    known = version(path)
-    if known is not None and known < OLDEST:
+    major = version(path)
+    if major is not None and major < OLDEST:
         raise MitsimError(
-            f"{VARIABLE}: {path} is LLVM {known}, but Dr.Jit needs {OLDEST} or newer; run: unset {VARIABLE}"
+            f"{VARIABLE}: {path} is LLVM {major}, but Dr.Jit needs {OLDEST} or newer; run: unset {VARIABLE}"
         )
     if not path.exists():
         raise MitsimError(f"{VARIABLE}: {path} does not exist; run: unset {VARIABLE}")
@@ -164,8 +182,8 @@ def _cached_probe(path: Path) -> Probe:
         return probe(path)
     key = f"{os.path.realpath(path)} {stat.st_mtime_ns} {stat.st_size} drjit {drjit}"
     try:
-        known = json.loads(store.read_text(encoding="utf-8"))
-        if isinstance(known, list) and key in known:
+        proven = json.loads(store.read_text(encoding="utf-8"))
+        if isinstance(proven, list) and key in proven:
             return Probe(True, "compiles and runs")
     except (OSError, ValueError):
         pass

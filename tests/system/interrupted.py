@@ -1,4 +1,4 @@
-"""Captures that are cut short, and what they must come to when they are resumed."""
+"""Captures and calibrations that are cut short, and what they must come to when they are resumed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,16 +16,21 @@ from mitsim.core.framefile import read_frame
 PATTERNS = "hadamard:16"  # 512 frames: long enough to be hit in the middle
 
 
-def running(least: int, *arguments: object, **options: Any) -> subprocess.Popen[str]:
-    """Start mitsim; back as soon as ``least`` frames are written, for 0 as soon as the run's folder is there."""
+RESUME = "; finished work is kept, go on with --resume\n"
+
+
+def running(least: int | str, *arguments: object) -> subprocess.Popen[str]:
+    """Start mitsim; back as soon as ``least`` frames, or the file of that name, are written; for 0 as soon as the
+    output folder is there."""
     folder = Path(str(arguments[arguments.index("-o") + 1]))
     command = [sys.executable, "-m", "mitsim", *map(str, arguments)]
     # A shell's background jobs ignore SIGINT, and so would what they start.
     before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     signal.signal(signal.SIGINT, before)
     limit = time.monotonic() + 120
-    while len(list(folder.glob("frame_*.exr"))) < least or not folder.exists():
+    wanted, count = (least, 1) if isinstance(least, str) else ("frame_*.exr", least)
+    while len(list(folder.glob(wanted))) < count or not folder.exists():
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < limit
         time.sleep(0.001)
@@ -39,8 +43,8 @@ def ended(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
-def cut_short(how: signal.Signals, least: int, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Start mitsim, send it a signal as soon as ``least`` frames are written."""
+def cut_short(how: signal.Signals, least: int | str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Start mitsim, send it a signal as soon as ``least`` is written, as :func:`running` takes it."""
     process = running(least, *arguments)
     process.send_signal(how)
     return ended(process)

@@ -1,4 +1,5 @@
-"""A capture that was cut short: `--resume` finishes it to the same frames, and nothing takes it for a finished run."""
+"""A capture or calibration that was cut short: `--resume` finishes it to the same frames or factors, and nothing takes
+it for a finished one."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.framefile import read_frame
-from tests.system.interrupted import PATTERNS, assert_equal_runs, cut_short
+from tests.system.interrupted import PATTERNS, RESUME, assert_equal_runs, cut_short
 
 pytestmark = pytest.mark.robustness("Faults")
 
@@ -138,4 +139,54 @@ def test_resume_refuses_a_foreign_folder(refused: Callable[..., str], lab: Any, 
 
 def test_control_c_is_one_line_and_status_130(lab: Any, tmp_path: Path) -> None:
     done = cut_short(signal.SIGINT, 50, "capture", *lab.rig, "-o", tmp_path / "run", "--patterns", PATTERNS, "--json")
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "mitsim: interrupted\n")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "mitsim: interrupted" + RESUME)
+
+
+# ---- calibrations ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wide(lab: Any) -> tuple[object, ...]:
+    """The laboratory's rig with a projector of 32 x 32 pixels, whose 128 shots take long enough to be hit."""
+    return lab.write_scene("wide", n=32), *lab.electronics[:-1], "0.02"
+
+
+@pytest.fixture(scope="module")
+def factors(call: Callable[..., Any], wide: tuple[object, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The calibration of that rig which nothing disturbed."""
+    calibration: Path = tmp_path_factory.mktemp("factors") / "cal"
+    assert call("calibrate", *wide, "-o", calibration).code in (0, 1)
+    return calibration
+
+
+@pytest.mark.parametrize(
+    ("how", "part"),
+    [
+        pytest.param(signal.SIGKILL, "manifest.json", marks=pytest.mark.slow),
+        (signal.SIGINT, "light.part.npz"),
+        (signal.SIGKILL, "noisy.part.npz"),
+        pytest.param(signal.SIGTERM, "noise_free.part.npz", marks=pytest.mark.slow),
+    ],
+)
+def test_a_calibration_that_is_stopped_loses_no_finished_part(
+    call: Callable[..., Any],
+    lab: Any,
+    wide: tuple[object, ...],
+    factors: Path,
+    tmp_path: Path,
+    how: signal.Signals,
+    part: str,
+) -> None:
+    """While light is traced, after it, and between stripes; `reconstruct` does not take it for a calibration."""
+    calibration = tmp_path / "cal"
+    done = cut_short(how, part, "calibrate", *wide, "-o", calibration)
+    said = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
+    assert (done.returncode, done.stderr) == (-how if how == signal.SIGKILL else 128 + how, said.get(how, ""))
+    assert (calibration / part).is_file()
+    assert "the calibration is incomplete" in call("reconstruct", lab.run, "--calibration", calibration).refusal
+    assert "(seed differ)" in call("calibrate", *wide, "-o", calibration, "--resume", "--seed", "1").refusal
+    outcome = call("calibrate", *wide, "-o", calibration, "--resume")
+    assert outcome.code in (0, 1), outcome.err
+    assert sorted(path.name for path in calibration.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
+    ours, theirs = (json.loads((folder / "manifest.json").read_text()) for folder in (calibration, factors))
+    assert ours["checksums"] == theirs["checksums"] and ours["configuration"] == theirs["configuration"]

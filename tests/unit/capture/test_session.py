@@ -4,6 +4,7 @@ Few electrons (1 % of full well) make the sensor's noise the only error that cou
 """
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,11 +12,13 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.calibrate import CalibrationResult, calibrate
+from mitsim.capture.calibrate import Calibrated, CalibrationResult, calibrate
+from mitsim.capture.checkpoint import Checkpoint
 from mitsim.capture.evidence import PHYSICAL
+from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
 from mitsim.capture.light import make_plan, uniform_light
 from mitsim.capture.plan import Plan
-from mitsim.capture.session import Session
+from mitsim.capture.session import SIDES, Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
 from mitsim.core.job import Job
@@ -161,3 +164,162 @@ def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[
     uniform = make_plan(board, *uniform_light(16), 2e-2, 0)
     assert "diffraction" not in uniform.settings.effects
     assert "diffraction" in Session(board, recipe("pair")).plan(2e-2, Job()).settings.effects
+
+
+# ---- interrupted and resumed -----------------------------------------------------------------------------------------
+
+PARTS = ["light.part.npz", "noise_free.part.npz", "noisy.part.npz"]
+
+
+class Killed(BaseException):
+    """The end of a process that no code of ours takes notice of."""
+
+
+@pytest.fixture
+def geometric_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mitsim.capture.session.make_plan", geometric_plan)
+
+
+@pytest.fixture
+def kill_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """The session ends right after so many checkpoints are written from now on."""
+    save = Checkpoint.save
+
+    def arm(count: int) -> None:
+        left = iter(range(count - 1, -1, -1))
+
+        def save_and_die(self: Checkpoint, *part: object) -> None:
+            save(self, *part)
+            if next(left) == 0:
+                raise Killed
+
+        monkeypatch.setattr(Checkpoint, "save", save_and_die)
+
+    return arm
+
+
+def assert_equal(ours: Calibrated, theirs: Calibrated) -> None:
+    """The same factors bit for bit, the same report but for seconds and place."""
+    for name in ("left", "right", "predicted_error", "unexplained", "noise", "status"):
+        assert np.array_equal(getattr(ours.factors, name), getattr(theirs.factors, name)), name
+    for name in vars(ours.result).keys() - {"seconds", "output"}:
+        assert getattr(ours.result, name) == getattr(theirs.result, name), name
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
+    shared_scene: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kill_after: Callable[[int], None],
+    mode: str,
+) -> None:
+    """Each of the nine processes but the last gets one checkpoint further; nothing that is kept is computed again."""
+    bench = open_bench(shared_scene("resumed16", n=16))
+    whole = calibrate(bench, recipe(mode), seed=3)
+    exposures: list[object] = []
+    digital = Exposer.digital
+
+    def counted(self: Exposer, *shot: object) -> object:
+        exposures.append(shot[1:])
+        return digital(self, *shot)
+
+    monkeypatch.setattr(Exposer, "digital", counted)
+    calibration = tmp_path / "cal"
+    for life in range(9):
+        kill_after(1)
+        with pytest.raises(Killed):
+            calibrate(bench, recipe(mode), seed=3, output=calibration, resume=True)
+        assert json.loads((calibration / "manifest.json").read_text())["status"] == "incomplete"
+        monkeypatch.setattr(Session, "trace", lambda *_: pytest.fail("light is traced again"))
+        assert [path.name for path in sorted(calibration.glob("*.npz"))] == [
+            name for name, since in zip(PARTS, (0, 5, 1), strict=True) if life >= since
+        ]
+    kill_after(0)  # nothing is left to be saved
+    resumed = calibrate(bench, recipe(mode), seed=3, output=calibration, resume=True)
+    assert_equal(resumed, whole)
+    assert sorted(path.name for path in calibration.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
+    # Shots that were exposed with those of a checkpoint are exposed again, at most one chunk of each side a life.
+    assert set(exposures) == {
+        ("calibration", side, index) for side in SIDES for index in range(whole.result.frames // 2)
+    }
+    assert len(exposures) < whole.result.frames + 5 * FRAMES_AT_ONCE
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+def test_damaged_and_foreign_parts_are_computed_again(
+    shared_scene: Callable[..., Path],
+    tmp_path: Path,
+    kill_after: Callable[[int], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Cut, emptied, flipped at the start, in the middle and at the end, or of a session with another seed."""
+    bench = open_bench(shared_scene("damaged16", n=16))
+    for name, seed in (("ours", 3), ("theirs", 4)):
+        kill_after(7)
+        with pytest.raises(Killed):
+            calibrate(bench, recipe("pair"), seed=seed, output=tmp_path / name)
+    monkeypatch.undo()
+    monkeypatch.setattr("mitsim.capture.session.make_plan", geometric_plan)
+    whole = calibrate(bench, recipe("pair"), seed=3)
+
+    def flipped(spot: float) -> Callable[[bytes], bytes]:
+        def flip(data: bytes) -> bytes:
+            index = int(spot * (len(data) - 1))
+            return data[:index] + bytes([data[index] ^ 4]) + data[index + 1 :]
+
+        return flip
+
+    damages = [lambda data: data[:-7], lambda data: b"", flipped(0.0), flipped(0.5), flipped(1.0), None]
+    for index, damage in enumerate(damages):
+        folder = shutil.copytree(tmp_path / "ours", tmp_path / f"cal{index}")
+        part = folder / PARTS[index % len(PARTS)]
+        source = part if damage else tmp_path / "theirs" / part.name
+        part.write_bytes((damage or bytes)(source.read_bytes()))
+        assert_equal(calibrate(bench, recipe("pair"), seed=3, output=folder, resume=True), whole)
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+def test_only_the_same_session_is_resumed(
+    shared_scene: Callable[..., Path], tmp_path: Path, kill_after: Callable[[int], None]
+) -> None:
+    bench = open_bench(shared_scene("other16", n=16))
+    kill_after(1)
+    with pytest.raises(Killed):
+        calibrate(bench, recipe("pair"), output=tmp_path / "cal")
+    for change, words in (
+        ({"seed": 5}, "seed differ"),
+        ({"accuracy": 1e-2, "recipe": recipe("uniform")}, "accuracy, recipe differ"),
+    ):
+        with pytest.raises(MitsimError, match=rf"resume: .*cal holds a session of another configuration \({words}\)"):
+            calibrate(bench, **{"recipe": recipe("pair"), "output": tmp_path / "cal", "resume": True, **change})
+    with pytest.raises(MitsimError, match="holds files already"):
+        calibrate(bench, recipe("pair"), output=tmp_path / "cal")
+    (tmp_path / "cal" / "manifest.json").write_text('{"kind": "capture"}')
+    with pytest.raises(MitsimError, match=r"resume: .* is not that of a calibration"):
+        calibrate(bench, recipe("pair"), output=tmp_path / "cal", resume=True)
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
+    bench = open_bench(shared_scene("memory16", n=16))
+    calibrate(bench, recipe("pair"), output=tmp_path / "streamed")
+    calibrate(bench, recipe("pair")).save(tmp_path / "saved")
+    manifests = []
+    for name in ("streamed", "saved"):
+        manifest = json.loads((tmp_path / name / "manifest.json").read_text())
+        del manifest["result"]["seconds"]
+        manifests.append(manifest)
+    assert manifests[0] == manifests[1]
+    with pytest.raises(MitsimError, match="holds files already"):
+        calibrate(bench, recipe("pair")).save(tmp_path / "saved")
+
+
+def test_describing_a_session_traces_nothing(
+    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("make_plan", "collect"):
+        monkeypatch.setattr(f"mitsim.capture.session.{name}", lambda *_: pytest.fail("work was done"))
+    session = Session(open_bench(shared_scene("separable16", n=16)), recipe("pair"))
+    assert session.shots == 64 and session.signs.shape == (16, 16)
