@@ -107,7 +107,7 @@ class Outline:
     def refusal(self, error: BaseException) -> MitsimError:
         """One line for an ``error`` of Mitsuba's, with the last place that it names."""
         message = one_line(error)
-        places = [*re.finditer(r"[Ww]hile loading (.+?) \(line (\d+), col (\d+)\): ", message)]
+        places = [*re.finditer(r"(?:[Ww]hile loading|At) (\S.*?) \(line (\d+), col (\d+)\): ", message)]
         if not places:
             return MitsimError(f"{self.path}: Mitsuba refuses the scene: {message}")
         file, line, column = places[-1].groups()
