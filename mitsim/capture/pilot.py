@@ -22,6 +22,7 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.scene.darkness import why_dark
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import AMBIENT, INDIRECT, Deposits
 from mitsim.transport.lobes import SharpLight, sharp_light
@@ -155,13 +156,11 @@ def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float,
         everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own)
         if total < _FAINT * float(everywhere.value.sum()):
             raise MitsimError(
-                "the sensor's centre sees no light of the projector, though other parts of the sensor do: what is lit "
-                "lies edge-on or just hidden; turn or move it a little"
+                "the sensor's centre sees no light of the projector, though other parts of the sensor do: "
+                + why_dark(bench.loaded)
             )
     if not total and not bench.loaded.mirrors:
-        raise MitsimError(
-            "no light of the projector reaches the camera; check the scene, the window and the field stop"
-        )
+        raise MitsimError(f"no light of the projector reaches the camera: {why_dark(bench.loaded)}")
     # Sums by numpy, here and below: those of BLAS depend on the number of its threads in the last bits.
     mean = float((found.inverse_depth * found.value).sum()) / total if total else 0.0
     # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.

@@ -1,6 +1,6 @@
 """An OpenEXR file's path in; size, channels and decoded bytes out, as far as the file can hold what its header claims.
 
-OpenEXR's own reader takes the header: it allocates nothing by what a header claims, and damaged ones raise. Three things
+OpenEXR's own reader takes the header: it allocates nothing by what that claims, and damaged ones raise. Three things
 are left to check here. It compares the names of channels with each other, which takes 18 s for a list of 100 000, so it
 is given the beginning of the file alone. It passes over an attribute that claims 2 GB, for which the older reader in
 Mitsuba allocates them. And reading the pixels allocates what a header claims, 4 GiB for a file of 300 bytes.
