@@ -21,11 +21,11 @@ MAGIC = b"\x76\x2f\x31\x01"
 _ATTRIBUTE = re.compile(rb"[^\0]{1,255}\0[^\0]{1,255}\0(.{4})", re.DOTALL)
 """Name, type and length of an attribute, after the document "OpenEXR File Layout" (openexr.com)."""
 _HEADER_BYTES = 1 << 18
-"""Fifty times the header of a frame; a list of channels that fits takes 0.4 s."""
+"""Far more than the header of a frame; a list of channels that fits takes 0.15 s."""
 _LARGEST_RATIO = 1100
 """Deflate cannot shrink more than 1032 times; a small file of any compression may claim ``_SMALL`` bytes."""
 _SMALL = 1 << 24
-"""16 MiB, so that an even image of 2048 x 2048 float32 pixels is read whatever compresses it."""
+"""16 MiB, so that an even image of 2048 x 2048 pixels is read whatever compresses it."""
 _LARGEST_SIDE = 16384
 """Pixels a side of the largest sensor and environment map that are simulated."""
 _MOST_BYTES = 4 << 30

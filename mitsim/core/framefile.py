@@ -33,11 +33,23 @@ _stdout_lock = threading.Lock()
 
 
 def write_frame(path: Path | str, channels: Mapping[str, Channel], metadata: Mapping[str, Value]) -> None:
-    """Write equally shaped 2-D `channels` (float32 or uint32) and `metadata` to `path`, all or nothing.
+    """Write a frame to disk, all or nothing: a temporary in the same folder, then a rename.
 
-    The file appears under its name only when complete (a temporary in the same folder, then a rename). Raises
-    TypeError or ValueError for channels that cannot be stored as they are (nothing is converted silently),
-    MitsimError when the file cannot be written.
+    Parameters
+    ----------
+    path
+        file to write.
+    channels
+        (rows, columns) float32 or uint32 by name, all of one shape.
+    metadata
+        texts and numbers by name.
+
+    Raises
+    ------
+    TypeError, ValueError
+        for channels that cannot be stored as they are (nothing is converted silently).
+    MitsimError
+        when the file cannot be written.
     """
     _check_channels(channels)
     # Noise does not compress: ZIP saves a tenth of the room for four times the time.
@@ -54,7 +66,7 @@ def write_frame(path: Path | str, channels: Mapping[str, Channel], metadata: Map
 
 
 def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
-    """Channels (2-D, float32 or uint32; half floats of foreign files become float32) and metadata of a frame.
+    """Channels (2-D, float32 or uint32; half floats become float32) and metadata of the frame ``path``.
 
     Files of other programs are read too; their metadata is then empty. Raises MitsimError for a file that is
     missing, is not OpenEXR, or is damaged.
@@ -77,7 +89,7 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
 
 
 def checksum(path: Path | str) -> str:
-    """SHA-256 of a file's bytes as 64 hexadecimal digits. Raises MitsimError when it cannot be read."""
+    """SHA-256 of the bytes of the file ``path`` as 64 hexadecimal digits. MitsimError when it cannot be read."""
     digest = hashlib.sha256()
     check_plain(path)
     try:
@@ -123,14 +135,14 @@ def _open(path: Path) -> Any:
 
 @contextlib.contextmanager
 def _stderr_nowhere() -> Iterator[None]:
-    kept = os.dup(2)
+    stderr = os.dup(2)
     try:
         with open(os.devnull, "wb") as nowhere:
             os.dup2(nowhere.fileno(), 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)
 
 
 def _one_line(error: BaseException) -> str:

@@ -243,7 +243,7 @@ def test_colours_of_vertices(tmp_path: Path, variant: str, bsdf: str, worst: str
 
 
 def test_a_referenced_bitmap_keeps_the_limit_of_its_use(tmp_path: Path, variant: str) -> None:
-    """Mitsuba calls it by its id, not by the parameter that it is given for."""
+    """Mitsuba calls it by a number, not by the parameter that it is given for."""
     from mitsim.core.framefile import write_frame
     from mitsim.scene.load import load_scene
 
@@ -255,7 +255,7 @@ def test_a_referenced_bitmap_keeps_the_limit_of_its_use(tmp_path: Path, variant:
     write_frame(tmp_path / "t.exr", {"Y": np.full((4, 4), 0.5, np.float32)}, {})
     load_scene(path)
     write_frame(tmp_path / "t.exr", {"Y": np.full((4, 4), 3, np.float32)}, {})
-    with pytest.raises(MitsimError, match="row 0, column 0 is 3 .* 0 to 1"):
+    with pytest.raises(MitsimError, match=r"row 0, column 0 is 3 .* 0 to 1"):
         load_scene(path)
 
 
