@@ -1,15 +1,16 @@
 """An OpenEXR file's path in; size, channels and decoded bytes out, as far as the file can hold what its header claims.
 
-OpenEXR's own reader takes the header: it allocates nothing by what a header claims, and damaged ones raise. Two things
+OpenEXR's own reader takes the header: it allocates nothing by what that claims, and damaged ones raise. Three things
 are left to check here. It compares the names of channels with each other, which takes 18 s for a list of 100 000, so it
-is given the beginning of the file alone. And reading the pixels allocates what a header claims, 4 GiB for a file of
-300 bytes.
+is given the beginning of the file alone. It passes over an attribute that claims 2 GB, for which the older reader in
+Mitsuba allocates them. And reading the pixels allocates what a header claims, 4 GiB for a file of 300 bytes.
 """
 
 from __future__ import annotations
 
 import io
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,12 +18,14 @@ import OpenEXR
 
 MAGIC = b"\x76\x2f\x31\x01"
 """First bytes of every OpenEXR file."""
+_ATTRIBUTE = re.compile(rb"[^\0]{1,255}\0[^\0]{1,255}\0(.{4})", re.DOTALL)
+"""Name, type and length of an attribute, after the document "OpenEXR File Layout" (openexr.com)."""
 _HEADER_BYTES = 1 << 18
-"""Fifty times the header of a frame; a list of channels that fits takes 0.4 s."""
+"""Far more than the header of a frame; a list of channels that fits takes 0.15 s."""
 _LARGEST_RATIO = 1100
 """Deflate cannot shrink more than 1032 times; a small file of any compression may claim ``_SMALL`` bytes."""
 _SMALL = 1 << 24
-"""16 MiB, so that an even image of 2048 x 2048 float32 pixels is read whatever compresses it."""
+"""16 MiB, so that an even image of 2048 x 2048 pixels is read whatever compresses it."""
 _LARGEST_SIDE = 16384
 """Pixels a side of the largest sensor and environment map that are simulated."""
 _MOST_BYTES = 4 << 30
@@ -56,11 +59,16 @@ def read_header(path: Path) -> ExrHeader:
         start = file.read(_HEADER_BYTES)
     if not start.startswith(MAGIC) or len(start) < 8:
         raise ValueError(f"not an OpenEXR file (first bytes {start[:4]!r})")
+    place = 8
+    while attribute := _ATTRIBUTE.match(start, place):
+        place = attribute.end() + int.from_bytes(attribute[1], "little")
+    if start[place : place + 1] != b"\0":
+        raise ValueError("its header is damaged, cut short, or over 256 KiB long")
     try:
         with OpenEXR.File(io.BytesIO(start), header_only=True) as image:
             parts = [dict(part.header) for part in image.parts]
     except (RuntimeError, TypeError, UnicodeDecodeError):
-        raise ValueError("its header is damaged, cut short, or over 256 KiB long") from None
+        raise ValueError("its header is damaged") from None
     (header,) = parts if len(parts) == 1 else ({},)
     if header.get("type", OpenEXR.scanlineimage) != OpenEXR.scanlineimage or "tiles" in header or not header:
         raise ValueError("the image is tiled, deep or of several parts; save it as one part of scan lines")

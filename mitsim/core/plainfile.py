@@ -10,8 +10,8 @@ from mitsim.core.errors import MitsimError
 
 
 def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
-    """The status of a plain file. MitsimError when it cannot be looked at, or is a folder, pipe or device, from which
-    reading may never end."""
+    """The status of the plain file ``path``, called ``what`` in errors. MitsimError when it cannot be looked at, or is
+    a folder, pipe or device, from which reading may never end."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -25,8 +25,8 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
 
 
 def read_text(path: Path | str, most: int) -> str:
-    """The UTF-8 text of a plain file. MitsimError as ``check_plain``, and for over ``most`` bytes; ValueError when it
-    is no UTF-8."""
+    """The UTF-8 text of the plain file ``path``. MitsimError as ``check_plain``, and for over ``most`` bytes;
+    ValueError when it is no UTF-8."""
     size = check_plain(path).st_size
     if size > most:
         raise MitsimError(f"file {path}: has {size} bytes; at most {most} are allowed")

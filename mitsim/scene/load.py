@@ -50,7 +50,16 @@ def load_scene(
 ) -> LoadedScene:
     """Load a scene XML into the current variant; the plugin ``mitsim_lensless`` must be registered.
 
-    Files outside the scene's folder are read only when ``outside`` is set.
+    Parameters
+    ----------
+    path
+        the scene's XML.
+    defines
+        values of its parameters by name.
+    needs_projector
+        refuse a scene without exactly one projector.
+    outside
+        allow files outside the scene's folder.
 
     Raises
     ------
@@ -62,7 +71,6 @@ def load_scene(
     with looking_beside(checked.outline):
         scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
-    files = checked.files
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
@@ -84,13 +92,13 @@ def load_scene(
             if needs_projector:
                 raise
     if grid is None:
-        return LoadedScene(path, files, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
+        return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
-    return LoadedScene(path, files, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
+    return LoadedScene(path, checked.files, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
 
 
 def _polished(scene: mi.Scene) -> tuple[bool, bool]:
     """Whether a surface of the scene has a delta component, and whether one has a glossy component."""
     flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
     delta, glossy = mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy
-    return any(mi.has_flag(one, delta) for one in flags), any(mi.has_flag(one, glossy) for one in flags)
+    return any(mi.has_flag(own, delta) for own in flags), any(mi.has_flag(own, glossy) for own in flags)

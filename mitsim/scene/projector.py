@@ -9,7 +9,6 @@ as real projectors have it, and casts no keystone. Rows and columns follow the p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +16,9 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+
+_NO_KEYSTONE = 1e-3
+"""Projector pixels: chosen so that what rounding makes of a shifted lens is none; it shows in no frame."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,17 @@ class ProjectorGrid:
     keystone: float
 
 
-def locate_projector(where: str, projector: Any, camera: Any) -> ProjectorGrid:
-    """Find the lit window of ``projector`` and its place in front of ``camera``.
+def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> ProjectorGrid:
+    """Find the lit window of a projector and its place in front of a camera.
+
+    Parameters
+    ----------
+    where
+        what an error begins with, the scene's path.
+    projector
+        a stock emitter whose bitmap shows the window.
+    camera
+        the sensor, which carries its geometry.
 
     Raises
     ------
@@ -84,14 +95,29 @@ def locate_projector(where: str, projector: Any, camera: Any) -> ProjectorGrid:
         canvas=(int(lit.shape[0]), int(lit.shape[1])),
         row_tan=(float(low[0]), float(high[0])),
         column_tan=(float(low[1]), float(high[1])),
-        keystone=keystone if keystone > 1e-3 else 0.0,
+        keystone=keystone if keystone > _NO_KEYSTONE else 0.0,
     )
 
 
 def window_at(
-    where: str, projector: Any, camera: Any, grid: ProjectorGrid, depth: float
+    where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Row and column tan-angles of the window on the plane at ``depth`` [mm] from the camera."""
+    """Row and column tan-angles (first edge, last edge) of the window on a plane in front of the camera.
+
+    Parameters
+    ----------
+    where, projector, camera
+        as in :func:`locate_projector`, whose result is ``grid``.
+    grid
+        the window on the projector's canvas.
+    depth
+        distance of the plane [mm].
+
+    Raises
+    ------
+    MitsimError
+        when the projector does not light the plane.
+    """
     first = grid.first_row, grid.first_column
     corners = _window_corners(where, projector, camera, grid.canvas, first, grid.n, depth)
     (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
@@ -99,13 +125,19 @@ def window_at(
 
 
 def _window_corners(
-    where: str, projector: Any, camera: Any, canvas: tuple[int, ...], first: tuple[int, int], n: int, z: float
+    where: str,
+    projector: mi.Emitter,
+    camera: mi.Sensor,
+    canvas: tuple[int, ...],
+    first: tuple[int, int],
+    n: int,
+    z: float,
 ) -> FloatArray:
     """(4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
 
     Between that plane and the projector's image lies a homography; four probes of the emitter determine it.
     """
-    half = 0.25 * z
+    half = 0.25 * z  # any four points do
     probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(probes))
     interaction.p = camera.world_transform() @ mi.Point3f(probes[:, 0], probes[:, 1], z)

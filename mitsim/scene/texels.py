@@ -46,21 +46,22 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
             values = np.array(parameters[key])
             if values.dtype.kind != "f":
                 continue  # Mitsuba may keep bitmaps of 8 bits as they are: those hold nothing impossible
-            limit = limits.get(name.rpartition(".")[2] if last == "data" else last, _ANY)
+            file = re.search(r'name = "([^"]*)"', str(parameters.properties[key][2])) if last == "data" else None
+            # Mitsuba calls a texture by its parameter, and one that is referenced by a number.
+            limit = limits.get(file[1] if file else last) or limits.get(name.rpartition(".")[2], _ANY)
             wrong = ~np.isfinite(values) | (values < limit.low) | (values > limit.high + _ROUNDING)
             if wrong.any():
-                place = _place(key, values, wrong, parameters.properties[key][2])
+                place = _place(key, values, wrong, file[1] if file else key)
                 words = f" of {limit.low:g} to {limit.high:g}{limit.hint}" if limit is not _ANY else ""
                 raise MitsimError(f"{path}: {place}; allowed are finite numbers{words}")
 
 
-def _place(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], owner: object) -> str:
+def _place(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
     """What holds the first wrong number, and where."""
     at = np.argwhere(wrong)[0]
     name, _, last = key.rpartition(".")
     if values.ndim != 3:
         return f"mesh {name}: number {at[0]} of its {last} is {values[tuple(at)]:g}"
-    file = re.search(r'name = "([^"]*)"', str(owner))
     texel = f"{name.rpartition('.')[2]} of the texel in row {at[0]}, column {at[1]}"
     count = int(wrong.any(axis=2).sum())
-    return f"bitmap {file[1] if file else key}: {texel} is {values[tuple(at)]:g} ({count} such texels)"
+    return f"bitmap {file}: {texel} is {values[tuple(at)]:g} ({count} such texels)"

@@ -738,6 +738,7 @@ def _contents() -> list[Case]:
         shown("HDR without a size", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n", "Radiance"),
         shown("PFM of no numbers", b"PF\nx 4\n-1.0\n", "PFM"),
         shown("cut EXR", b"\x76\x2f\x31\x01\x02\0\0\0chan", "cut short"),
+        shown("EXR with an attribute of 2 GB", b"\x76\x2f\x31\x01\x02\0\0\0a\0string\0\xff\xff\xff\x7f", "cut short"),
         Case(
             "pictures that are large together",
             picture("p.png").replace(

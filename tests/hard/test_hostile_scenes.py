@@ -8,6 +8,7 @@ import struct
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
@@ -211,3 +212,63 @@ def test_a_loaded_scene_knows_its_files(tmp_path: Path, variant: str) -> None:
     path = prepared(tmp_path / "scene", picture("../out.png"))
     loaded = load_scene(path, outside=True)
     assert [item.name for item in loaded.files] == ["scene.xml", "projector.png", "out.png"]
+
+
+COLOURED = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "property float r\nproperty float g\nproperty float b\nelement face 1\n"
+    "property list uchar int vertex_indices\nend_header\n0 0 500 {0} {0} {0}\n9 0 500 0 0 0\n0 9 500 1 1 1\n3 0 1 2\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "worst"),
+    [
+        ('<bsdf type="diffuse">{}</bsdf>', "5"),
+        ('<bsdf type="diffuse"><texture name="reflectance" type="checkerboard">{}</texture></bsdf>', "-1"),
+        ('<emitter type="area">{}</emitter>', "-1"),
+    ],
+    ids=["colour", "below a checkerboard", "light"],
+)
+def test_colours_of_vertices(tmp_path: Path, variant: str, bsdf: str, worst: str) -> None:
+    """A mesh brings reflectances too: 5 of the light would leave a surface where 1 arrives."""
+    from mitsim.scene.load import load_scene
+
+    name = "color0" if "checkerboard" in bsdf else "radiance" if "emitter" in bsdf else "reflectance"
+    colour = f'<texture name="{name}" type="mesh_attribute"><string name="name" value="vertex_color"/></texture>'
+    path = prepared(tmp_path, mesh("c.ply").replace("</shape>\n</scene>", bsdf.format(colour) + "</shape>\n</scene>"))
+    file("c.ply", COLOURED.format(0.5))(tmp_path)
+    load_scene(path)
+    file("c.ply", COLOURED.format(worst))(tmp_path)
+    with pytest.raises(MitsimError, match=rf"number 0 of its vertex_color is {worst}; allowed are finite numbers of 0"):
+        load_scene(path)
+
+
+def test_a_referenced_bitmap_keeps_the_limit_of_its_use(tmp_path: Path, variant: str) -> None:
+    """Mitsuba calls it by a number, not by the parameter that it is given for."""
+    from mitsim.core.framefile import write_frame
+    from mitsim.scene.load import load_scene
+
+    texture = '<texture id="t" type="bitmap"><string name="filename" value="t.exr"/></texture>'
+    path = prepared(
+        tmp_path,
+        put(texture + '<shape type="sphere"><bsdf type="diffuse"><ref name="reflectance" id="t"/></bsdf></shape>'),
+    )
+    write_frame(tmp_path / "t.exr", {"Y": np.full((4, 4), 0.5, np.float32)}, {})
+    load_scene(path)
+    write_frame(tmp_path / "t.exr", {"Y": np.full((4, 4), 3, np.float32)}, {})
+    with pytest.raises(MitsimError, match=r"row 0, column 0 is 3 .* 0 to 1"):
+        load_scene(path)
+
+
+def test_an_attribute_of_2_gb(tmp_path: Path) -> None:
+    """OpenEXR's own reader passes over it; the one in Mitsuba allocates it."""
+    from mitsim.core.framefile import write_frame
+
+    write_frame(tmp_path / "p.exr", {"Y": np.zeros((4, 4), np.float32)}, {"run": "x"})
+    picture_bytes = (tmp_path / "p.exr").read_bytes()
+    assert picture_bytes.count(b"run\0string\0\3\0\0\0") == 1
+    path = prepared(tmp_path, picture("p.exr"))
+    assert check_file(path, {})
+    (tmp_path / "p.exr").write_bytes(picture_bytes.replace(b"string\0\3\0\0\0", b"string\0\xff\xff\xff\x7f"))
+    assert "header is damaged" in refusal(path)

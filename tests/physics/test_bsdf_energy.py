@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import mitsim.transport
+from mitsim.scene.guard.limits import LIMITS
 
 pytestmark = pytest.mark.usefixtures("variant")
 STEP = 0.0025
@@ -103,6 +104,33 @@ def test_light_takes_the_same_way_back(name: str, settings: dict[str, Any]) -> N
     """f is equal to float32 precision: the division by a cosine down to 0.01 leaves a few units in the last place."""
     bsdf = load(name, settings)
     assert worst_asymmetry(lambda wi, wo: radiance_factor(bsdf, wi, wo)) < 1e-6
+
+
+WEIGHTS = ("sheen", "sheen_tint", "spec_tint", "flatness", "clearcoat", "clearcoat_gloss", "diff_trans")
+
+
+@pytest.mark.parametrize("base", [0.5, 1.0])
+def test_principled_weights_at_their_bounds(monkeypatch: pytest.MonkeyPatch, base: float) -> None:
+    """What the guard lets through adds at most an eighth of the light; sheen of 10, which it does not, doubles it.
+
+    The model itself (Burley 2012) has no bound at grazing incidence: 1.44 of the light at 85 degrees for a white base
+    of roughness 1 and no weights. A base of 0.5 stays below 1.
+    """
+    monkeypatch.setattr(f"{__name__}.STEP", 0.02)
+
+    def worst(name: str, **weights: float) -> float:
+        bsdf = load(name, {"base_color": base, "roughness": 1.0, **weights})
+        angles = [(0, 0), (60, 180), (75, 250), (85, 0)]
+        return max(
+            reflected_part(lambda wi, wo: radiance_factor(bsdf, wi, wo), directions(*np.radians(pair)))
+            for pair in angles
+        )
+
+    for name in ("principled", "principledthin"):
+        plain = worst(name)
+        for weight in WEIGHTS[:-1] if name == "principled" else (*WEIGHTS[:4], "diff_trans"):
+            assert worst(name, **{weight: LIMITS[weight].high}) < (plain + 0.125 if base == 1 else 1 + ROUNDING)
+        assert worst(name, sheen=10.0) > (2 if base == 1 else 1)
 
 
 def test_gain_and_one_way_light_would_be_seen() -> None:

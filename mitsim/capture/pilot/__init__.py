@@ -18,6 +18,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
+from mitsim.scene.darkness import why_dark
 from mitsim.transport.lobes import SharpLight, sharp_light
 
 _LOBE_RAYS = 2**20
@@ -97,13 +98,11 @@ def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float,
         everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own)
         if total < _FAINT * float(everywhere.value.sum()):
             raise MitsimError(
-                "the sensor's centre sees no light of the projector, though other parts of the sensor do: what is lit "
-                "lies edge-on or just hidden; turn or move it a little"
+                "the sensor's centre sees no light of the projector, though other parts of the sensor do: "
+                + why_dark(bench.loaded)
             )
     if not total and not bench.loaded.mirrors:
-        raise MitsimError(
-            "no light of the projector reaches the camera; check the scene, the window and the field stop"
-        )
+        raise MitsimError(f"no light of the projector reaches the camera: {why_dark(bench.loaded)}")
     # Sums by numpy, here and elsewhere: those of BLAS depend on the number of its threads in the last bits.
     mean = float((deposits.inverse_depth * deposits.value).sum()) / total if total else 0.0
     # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.

@@ -39,7 +39,7 @@ class CheckedScene:
     """A scene that Mitsuba may make objects of.
 
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
-    the name of the parameter, of the bitmap or of the attribute.
+    the name of the parameter, of the bitmap's file or of the attribute.
     """
 
     outline: Outline
@@ -146,10 +146,9 @@ class _Tree:
         plugin = node.props.plugin_name()
         if plugin in ("blackbody", "d65") and limit.high <= 1:
             raise self.outline.tag(node).refusal("type", repr(plugin), f"{name} is no light; give another texture")
-        for meant in (name, node.props.id(), node.props.get("name", "") if plugin == "mesh_attribute" else ""):
-            if meant:
-                known = self.limits.get(meant, limit)
-                self.limits[meant] = min(known, limit, key=lambda one: one.high)
+        own = {"mesh_attribute": "name", "bitmap": "filename"}.get(plugin, "")
+        for meant in filter(None, (name, Path(str(node.props.get(own, ""))).name)):
+            self.limits[meant] = min(self.limits.get(meant, limit), limit, key=lambda one: one.high)
         for key in limits.TABLES:
             if key in node.props and node.props.type(key) == _Type.ResolvedReference:
                 self._check_texture(self._child(node, key), key, limit)

@@ -18,7 +18,7 @@ MOST_TEXELS = 1 << 25
 FARTHEST = 1e7
 """Largest coordinate [mm], 10 km: single precision resolves 1 mm there."""
 _HEADER = 1 << 16
-"""Bytes in which a header must end; those of meshes and pictures have some 500."""
+"""Bytes in which a header must end; those of meshes and Radiance pictures have some 500."""
 _PLY_TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -38,7 +38,7 @@ _PLY_TYPES = {
     "float64": "f8",
 }
 _MOST_TEXT = 64 << 20
-"""A million vertices with their faces; twice as much is parsed in 5 s."""
+"""Chosen so that its words, some ten million Python objects, stay below 1 GiB."""
 
 
 def check_image(path: Path) -> int:
@@ -60,7 +60,10 @@ def check_image(path: Path) -> int:
 
 
 def check_ply(path: Path) -> None:
-    """A PLY mesh of triangles whose corners exist and lie within ``FARTHEST``; Mitsuba reads beyond its arrays else."""
+    """Refuse ``path`` unless it is a PLY mesh of triangles whose corners exist and lie within ``FARTHEST``.
+
+    Mitsuba would read beyond its arrays. Raises ValueError or OSError.
+    """
     with open(path, "rb") as file:
         start = file.read(_HEADER)
         found = re.match(rb"ply\r?\n.*?\nend_header\r?\n", start, re.DOTALL)
@@ -81,7 +84,7 @@ def check_ply(path: Path) -> None:
 
 
 def check_obj(path: Path) -> None:
-    """A Wavefront mesh whose vertices are finite numbers within ``FARTHEST``; Mitsuba itself checks the faces."""
+    """Refuse ``path`` unless it is a Wavefront mesh of vertices within ``FARTHEST``; Mitsuba checks the faces."""
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
     with open(path, "rb") as file:

@@ -15,7 +15,7 @@ from mitsim.scene.guard.outline import Tag
 _LARGEST = 1e20
 """Squared, still far from the end of single precision (3.4e38) in which Mitsuba calculates."""
 _RIGID = 1e-4
-"""Ten times the rounding of a rotation whose matrix has six digits."""
+"""Above the 2e-5 by which a matrix that is written with five digits departs from a rotation."""
 _SMALLEST_SIZE = 1e-9
 """Of what a transform stretches, in mm: far below any light's wavelength, and 1 / its cube is still finite."""
 _MOST_UNEVEN = 1e7

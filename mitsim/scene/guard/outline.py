@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 DEEPEST = 16
-"""Elements inside elements, references followed: shipped scenes have 5; Mitsuba's stack ends at some 10 000."""
+"""Elements inside elements, references followed: shipped scenes have 5; Mitsuba's stack ends below 10 000."""
 MOST_ELEMENTS = 10_000
-"""Forty times the largest shipped scene; they are read and checked in 0.5 s."""
+"""A hundred times the largest shipped scene; they are read and checked in 0.2 s."""
 _MOST_INCLUDES = 64
 """Files that one scene is spread over; each is opened and read anew."""
 _DEEPEST_INCLUDE = 8
@@ -107,7 +107,7 @@ class Outline:
     def refusal(self, error: BaseException) -> MitsimError:
         """One line for an ``error`` of Mitsuba's, with the last place that it names."""
         message = one_line(error)
-        places = [*re.finditer(r"[Ww]hile loading (.+?) \(line (\d+), col (\d+)\): ", message)]
+        places = [*re.finditer(r"(?:[Ww]hile loading|At) (\S.*?) \(line (\d+), col (\d+)\): ", message)]
         if not places:
             return MitsimError(f"{self.path}: Mitsuba refuses the scene: {message}")
         file, line, column = places[-1].groups()

@@ -1,0 +1,99 @@
+"""Why a scene is dark: a loaded scene in, the sentence out that says what keeps the projector's light from the camera.
+
+A few hundred rays go from the projector through its window, and from what they meet to the sensor's centre.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.scene.load import LoadedScene
+
+_RAYS = 24
+"""Rays a side: they meet anything larger than a 24th of the window."""
+_FAR = 3.0
+"""Beyond so many times the aligned plane's distance, a scene is called too far: the window is three times as wide."""
+_SMALL = 1e-2
+"""Part of the aligned plane's distance below which a whole scene is taken for one in metres; theirs is 1e-3."""
+
+
+def why_dark(loaded: LoadedScene) -> str:
+    """What is wrong with a scene of which the sensor sees nothing, and what to do.
+
+    Parameters
+    ----------
+    loaded
+        a scene with its projector.
+    """
+    geometry, grid = loaded.camera.geometry, loaded.pixels
+    to_world = loaded.camera.world_transform()
+    rows, columns = (
+        low + (high - low) * (np.arange(_RAYS) + 0.5) / _RAYS for low, high in (grid.row_tan, grid.column_tan)
+    )
+    y, x = (-geometry.scene_distance * part.ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
+    projector_to_world = mi.traverse(loaded.projector)["to_world"]
+    start = projector_to_world @ mi.Point3f(0)
+    plane = to_world @ mi.Point3f(x, y, geometry.scene_distance)
+    if not _any((projector_to_world.inverse() @ plane).z > 0):
+        return "the projector looks away from the scene, whose aligned plane lies behind it; turn the projector"
+    towards = plane - start
+    si = loaded.scene.ray_intersect(mi.Ray3f(start, dr.normalize(towards)))
+    met = np.array(si.is_valid()).ravel()
+    if not met.any():
+        return _missed(loaded, to_world)
+    back = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
+    centre = to_world @ mi.Point3f(0)
+    lit = si.is_valid() & (back | (si.wi.z > 0))
+    facing = lit & (back | (dr.dot(si.n, centre - si.p) * dr.sign(dr.dot(si.n, start - si.p)) > 0))
+    if not _any(lit) or not _any(facing):
+        which = "camera" if _any(lit) else "projector"
+        return (
+            f"{met.sum()} of {met.size} rays of the projector meet a surface, and it turns its back to the {which}: a "
+            "mesh wound the wrong way; flip its normals or put its material in <bsdf type='twosided'>"
+        )
+    seen = np.array(to_world.inverse() @ si.p).reshape(3, -1)[:, np.array(facing).ravel()]
+    slope = np.abs(seen[:2] / seen[2]).max(axis=0)
+    if seen[2].max() <= geometry.mask_distance:
+        return f"what is lit lies at z = {seen[2].max():.4g} mm, not in front of the mask; move the scene along +z"
+    if slope.min() > geometry.tan_half_fov:
+        return (
+            f"what is lit lies outside the field stop: {np.degrees(np.arctan(slope.min())):.3g} degrees off the axis "
+            f"or more, and the stop (fov) lets {geometry.fov / 2:g} degrees pass; turn the camera or widen fov"
+        )
+    if not _any(facing & ~loaded.scene.ray_test(si.spawn_ray_to(centre))):
+        return "something hides from the camera what is lit; move it out of the way"
+    return "what is lit lies edge-on, is hidden or reflects nothing; turn it, move it or check its material"
+
+
+def _missed(loaded: LoadedScene, to_world: mi.Transform4f) -> str:
+    """Where the scene lies, when no ray of the projector meets it."""
+    distance, box = loaded.camera.geometry.scene_distance, loaded.scene.bbox()
+    if not box.valid():
+        return "the scene has no surfaces; add a shape"
+    corners = np.array([list(box.corner(i)) for i in range(8)]).T
+    low, high = _extent(np.array(to_world.inverse() @ mi.Point3f(corners)).reshape(3, -1))
+    place = ", ".join(f"{axis} = {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
+    where = f"no ray of the projector's window meets the scene, which lies at {place} mm of the camera"
+    if np.abs([low, high]).max() < _SMALL * distance:
+        return f"{where}: this looks like metres, and 1 unit is 1 mm; scale it by 1000"
+    if low[2] > _FAR * distance:
+        return f"{where}: too far, for the rig is aligned to {distance:g} mm; move it nearer or set scene_distance"
+    if high[2] <= 0:
+        return f"{where}: behind the camera, which looks along +z; move the scene or turn the camera"
+    rows, columns = loaded.pixels.row_tan, loaded.pixels.column_tan
+    window = ", ".join(
+        f"{axis} = {-distance * edges[1]:.4g} to {-distance * edges[0]:.4g}"
+        for axis, edges in (("x", columns), ("y", rows))
+    )
+    return f"{where}: outside the window, {window} mm at {distance:g} mm; move the scene or turn the projector"
+
+
+def _extent(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return points.min(axis=1), points.max(axis=1)
+
+
+def _any(mask: mi.Bool) -> bool:
+    return bool(np.array(mask).any())
