@@ -55,7 +55,7 @@ class SensorModel(BaseModel):
     @classmethod
     def _a_known_well_or_none(cls, electrons: float) -> float:
         if 1e12 < electrons < math.inf:
-            raise ValueError("a full well is 0.1 to 1e+12 electrons, or inf for none")
+            raise ValueError(f"got {electrons:g}; a full well is 0.1 to 1e+12 electrons, or inf for none")
         return electrons
 
     @model_validator(mode="after")
