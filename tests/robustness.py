@@ -6,8 +6,9 @@
         '''What holds, in the words that the page prints.'''
         measured(error, at_most=1e-12, what="far field")    # holds the gate, and writes figure and gate down
 
-A row of the page is a test: its name in words, the first paragraph of its docstring, figures and gates. The rest of the
-page is tests/robustness.md, where a table's name in braces stands for it.
+A row of the page is a test that measured: its name in words, the first paragraph of its docstring, figures and gates.
+Other marked tests are named below their table. The rest of the page is tests/robustness.md, where a table's name in
+braces stands for it.
 """
 
 from __future__ import annotations
@@ -165,14 +166,16 @@ def page_of(template: str, rows: list[Row]) -> str:
 
 
 def table_of(rows: list[Row]) -> str:
-    """One row a test that explains itself or measures something; the others by name below."""
+    """One row a test that measured something; the others by name below."""
     lines = ["| case | measured | gate |", "|---|---|---|"]
     for row in rows:
-        if row.text or row.figures:
+        if row.figures:
             cells = f"{link(row)}. {row.text}".replace("|", "\\|"), *figures_of(row)
             lines.append(f"| {' | '.join(cells)} |")
-    silent = [link(row) for row in rows if not (row.text or row.figures)]
-    return "\n".join([*lines, *(["", f"Also held: {'; '.join(silent)}."] if silent else []), ""])
+    lines = lines if len(lines) > 2 else []
+    others = [link(row) for row in rows if not row.figures]
+    also = ["", f"{'Also held' if lines else 'Held'}: {'; '.join(others)}."] if others else []
+    return "\n".join([*lines, *(also if lines else also[1:]), ""])
 
 
 def link(row: Row) -> str:
@@ -184,8 +187,6 @@ def figures_of(row: Row) -> tuple[str, str]:
     """The cells of a row: its figures, or their range when they are many, and the gate or the range of gates."""
     figures = list(row.figures.items())
     units = {figure.unit for _, figure in figures}
-    if not figures:
-        return "", ""
     if len(figures) > MOST_FIGURES:
         values = [figure.value for _, figure in figures]
         shown = f"{len(values)} figures, {number(min(values))} to {number(max(values))} {units.pop()}".strip()
