@@ -11,31 +11,33 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.calibrate import CalibrationResult, calibrate
-from mitsim.capture.evidence import PHYSICAL
-from mitsim.capture.light import make_plan, uniform_light
+from mitsim.capture.effects import EFFECTS
+from mitsim.capture.light import make_plan
 from mitsim.capture.plan import Plan
 from mitsim.capture.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
 from mitsim.core.job import Job
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import Calibration
+from mitsim.reconstruct.calibration import Estimate
+from mitsim.reconstruct.factors import Factors
 from mitsim.rig.camera import centred_edges
-from mitsim.rig.recipe import load_recipe
+from mitsim.rig.patterns import Lighting
+from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
 CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16), ("separable", "pair", 13)]
-Done = tuple[Bench, CalibrationResult, Calibration]
+Done = tuple[Bench, Factors, Estimate, Path]
+"""The bench, its factors, the estimate that they were made of, and their folder."""
 
 
 def geometric_plan(*arguments: object) -> Plan:
     """Direct light through a geometric mask."""
-    return make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
+    return make_plan(*arguments, switches=dict.fromkeys(EFFECTS, False))
 
 
-def recipe(mode: str, fraction: float = 0.01) -> object:
+def recipe(mode: str, fraction: float = 0.01) -> SessionRecipe:
     return load_recipe().model_copy(update={"exposure_fraction": fraction, "signed_capture": mode})
 
 
@@ -52,8 +54,8 @@ def session(
             folder = tmp_path_factory.mktemp("calibration") / "cal"
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr("mitsim.capture.session.make_plan", geometric_plan)
-                calibrated = calibrate(bench, recipe(mode), seed=2, output=folder)
-            made[key] = bench, calibrated.result, calibrated.factors
+                factors = bench.calibrate(2, recipe=recipe(mode), output=folder)
+            made[key] = bench, factors, factors.estimate, folder
         return made[key]
 
     return run
@@ -76,7 +78,7 @@ def test_factors_are_the_geometric_shadow_within_their_noise(
 
     1008 numbers a side tell a noise to 2 %; the light's fall-off inside a projector pixel adds a per mille.
     """
-    bench, _, calibration = session(mask, mode, n)
+    bench, _, calibration, _ = session(mask, mode, n)
     truth = geometric(bench)
     for factor, predicted in zip((calibration.left, calibration.right), calibration.predicted_error, strict=True):
         scale = (factor * truth).sum(axis=0) / np.square(truth).sum(axis=0)
@@ -88,15 +90,16 @@ def test_factors_are_the_geometric_shadow_within_their_noise(
 
 @pytest.mark.parametrize(("mask", "mode", "n"), CASES)
 def test_the_reported_error_is_the_predicted_one(session: Callable[..., Done], mask: str, mode: str, n: int) -> None:
-    _, result, calibration = session(mask, mode, n)
-    assert result.phi_error == pytest.approx(np.hypot(*calibration.predicted_error), rel=0.3)
-    assert result.noise_free_residual < 2e-3 < result.separability_residual
-    assert result.condition == calibration.condition
+    _, factors, calibration, _ = session(mask, mode, n)
+    result = factors.manifest.result
+    assert result["phi_error"] == pytest.approx(np.hypot(*calibration.predicted_error), rel=0.3)
+    assert result["noise_free_residual"] < 2e-3 < result["separability_residual"]
+    assert result["condition"] == calibration.condition
 
 
 def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
     """left x right reproduces the rate of a uniform frame: E A t eta / (h c / lambda), from the board's radiance."""
-    bench, _, calibration = session("separable", "pair", 16)
+    bench, _, calibration, _ = session("separable", "pair", 16)
     rate = np.outer(calibration.left.sum(axis=1), calibration.right.sum(axis=1))
     radiance = 0.99 * 111000 / 400**2
     tau = (np.arange(N) - 7.5) * 0.3 / N
@@ -111,21 +114,20 @@ def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
 
 
 def test_number_of_frames(session: Callable[..., Done]) -> None:
-    assert session("separable", "pair", 16)[1].frames == 2 * 2 * 16
-    assert session("separable", "uniform", 16)[1].frames == 2 * (16 + 1)
+    assert session("separable", "pair", 16)[1].manifest.result["frames"] == 2 * 2 * 16
+    assert session("separable", "uniform", 16)[1].manifest.result["frames"] == 2 * (16 + 1)
     # 13 is no Hadamard order: the patterns are those of 16.
-    assert session("separable", "pair", 13)[1].frames == 2 * 2 * 16
+    assert session("separable", "pair", 13)[1].manifest.result["frames"] == 2 * 2 * 16
 
 
 def test_the_folder(session: Callable[..., Done]) -> None:
-    bench, result, calibration = session("separable", "pair", 16)
-    folder = Path(result.output)
+    bench, factors, calibration, folder = session("separable", "pair", 16)
     assert sorted(path.name for path in folder.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["kind"] == "calibration" and manifest["centre"] is False
     assert manifest["camera"] == json.loads(json.dumps(bench.identity()))
-    assert manifest["estimate"] == calibration.status and manifest["warnings"] == list(result.warnings)
-    assert not any("full well" in warning for warning in result.warnings)
+    assert manifest["estimate"] == str(calibration.status) and manifest["warnings"] == list(factors.warnings)
+    assert not any("full well" in warning for warning in factors.warnings)
     for name, factor in (("left", calibration.left), ("right", calibration.right)):
         channels, metadata = read_frame(folder / f"{name}.exr")
         assert np.array_equal(channels["factor"], factor.astype(np.float32))
@@ -134,30 +136,30 @@ def test_the_folder(session: Callable[..., Done]) -> None:
 
 
 def test_flatcam_is_centred(session: Callable[..., Done]) -> None:
-    _, result, calibration = session("flatcam", "pair", 16)
-    assert json.loads((Path(result.output) / "manifest.json").read_text())["centre"] is True
+    _, _, calibration, folder = session("flatcam", "pair", 16)
+    assert json.loads((folder / "manifest.json").read_text())["centre"] is True
     for factor in (calibration.left, calibration.right):
         assert np.abs(factor.sum(axis=0)).max() < 1e-9 * np.abs(factor).sum()
 
 
 def test_seeds(shared_scene: Callable[..., Path]) -> None:
     bench = open_bench(shared_scene("separable16", n=16))
-    one, again, other = (calibrate(bench, recipe("uniform"), 2e-2, seed).factors.left for seed in (1, 1, 2))
+    one, again, other = (bench.calibrate(seed, 2e-2, recipe("uniform")).left for seed in (1, 1, 2))
     assert np.array_equal(one, again) and not np.allclose(one, other, rtol=1e-6)
 
 
 def test_a_used_folder_is_refused_before_any_work(
     session: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench, result, _ = session("separable", "pair", 16)
+    bench, *_, folder = session("separable", "pair", 16)
     monkeypatch.setattr("mitsim.capture.session.make_plan", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match="holds files already"):
-        calibrate(bench, output=result.output)
+        bench.calibrate(output=folder)
 
 
 def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[..., Path]) -> None:
     """Diffraction hardly changes a uniform frame, but single lines, and so the +-1 responses, by a tenth."""
     board = open_bench(shared_scene("separable16", n=16)).with_board(0.99)
-    uniform = make_plan(board, *uniform_light(16), 2e-2, 0)
+    uniform = make_plan(board, Lighting.uniform(16), 2e-2, 0)
     assert "diffraction" not in uniform.settings.effects
     assert "diffraction" in Session(board, recipe("pair")).plan(2e-2, Job()).settings.effects
