@@ -349,7 +349,7 @@ def test_effects_are_switched_by_the_user(bench: Bench, captured: Capture, tmp_p
     assert manifest["configuration"]["effects"] == {"diffraction": False}
     row = next(effect for effect in manifest["plan"]["effects"] if effect["name"] == "diffraction")
     assert row["state"] == "off" and "by the user" in row["reason"]
-    assert any("no diffraction" in warning for warning in done.warnings)
+    assert any("largest: diffraction (off)" in warning for warning in done.warnings)
     first, second = (
         np.stack([read_frame(one.folder / name)[0]["electrons"] for name in FILES]) / one.exposure_s
         for one in (captured, done)
