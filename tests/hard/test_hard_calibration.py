@@ -345,12 +345,11 @@ def test_a_saturated_session_is_flagged(
     (That no frame is counted without cause: tests/unit/capture/test_session.py::test_the_folder.)
     """
     from mitsim.capture.bench import open_bench
-    from mitsim.capture.calibrate import calibrate
     from mitsim.capture.effects import EFFECTS
     from mitsim.capture.light import make_plan
 
     def simple_plan(*arguments: object) -> object:
-        return make_plan(*arguments, forced=dict.fromkeys(EFFECTS, False))
+        return make_plan(*arguments, switches=dict.fromkeys(EFFECTS, False))
 
     monkeypatch.setattr("mitsim.capture.session.make_plan", simple_plan)
     camera = tmp_path / "camera.toml"
@@ -359,9 +358,8 @@ def test_a_saturated_session_is_flagged(
         'quantum_efficiency = 0.75\ngain_dn_per_e = 0.125\nbits = 8\nsource = "made for a test"\n'
     )
     bench = open_bench(small_scene(n=8), variant, camera=camera)
-    calibrated = calibrate(bench, accuracy=2e-2, output=tmp_path / "cal")
-    result, found = calibrated.result, calibrated.factors
-    [told] = [warning for warning in result.warnings if "full well or the ADC's end" in warning]
+    found = bench.calibrate(accuracy=2e-2, output=tmp_path / "cal")
+    [told] = [warning for warning in found.warnings if "full well or the ADC's end" in warning]
     assert told.startswith("30 of 32 frames") and not found.ok
     manifest = json.loads((tmp_path / "cal" / "manifest.json").read_text())
-    assert tuple(manifest["warnings"]) == result.warnings and manifest["estimate"] == str(found.status)
+    assert tuple(manifest["warnings"]) == found.warnings and manifest["estimate"] == str(found.status)

@@ -22,7 +22,6 @@ from scipy import sparse
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.light import make_plan
-from mitsim.capture.run import capture
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
@@ -412,10 +411,10 @@ def frame_at(write: Callable[..., Path], scale: float) -> np.ndarray:
     """One frame of direct and indirect light, geometric shadow, with the paths of seed 1."""
     bench = open_bench(scaled_scene(write, scale), for_render=True)
     simulation = Simulation(bench, replace(SCALED, depth=Z * scale))
-    labels, weights = Lighting.uniform(N)
-    found = simulation.file_direct(simulation.direct.trace(1, 0, 64), labels, 64)
-    found = found + simulation.file_followed(simulation.follow(1, 64), labels, 64)
-    return next(iter(simulation.expected([found], np.arange(1), weights, 0))).irradiance
+    uniform = Lighting.uniform(N)
+    found = simulation.file_direct(simulation.direct.trace(1, 0, 64), uniform.labels, 64)
+    found = found + simulation.file_followed(simulation.follow(1, 64), uniform.labels, 64)
+    return next(iter(simulation.expected([found], np.arange(1), uniform, 0))).irradiance
 
 
 @pytest.mark.slow
@@ -488,8 +487,8 @@ def test_one_pixel_is_a_projector(small_scene: Callable[..., Path]) -> None:
 @pytest.mark.slow
 def test_one_pixel_is_captured(small_scene: Callable[..., Path], tmp_path: Path) -> None:
     bench = open_bench(small_scene(canvas=np.pad([[255.0]], ((1, 2), (5, 2)))))
-    result = capture(bench, "uniform", tmp_path / "run", 2e-2, seed=1, effects={"diffraction": False})
-    assert result.frames == 1 and 0 < result.mc_error < 2e-2 and np.isfinite(result.exposure_s)
+    result = bench.capture("uniform", tmp_path / "run", accuracy=2e-2, seed=1, effects={"diffraction": False})
+    assert len(result.dn) == 1 and 0 < result.manifest.mc_error < 2e-2 and np.isfinite(result.exposure_s)
 
 
 @settings(max_examples=8, deadline=None, derandomize=True)
@@ -576,7 +575,7 @@ def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path], tmp_
     path = small_scene()
     path.write_text(EMPTY[what](path))
     with pytest.raises(MitsimError, match="no light of the projector reaches the camera") as caught:
-        capture(open_bench(path), "uniform", tmp_path / "run", 1e-2)
+        open_bench(path).capture("uniform", tmp_path / "run", accuracy=1e-2)
     assert "\n" not in str(caught.value) and not list((tmp_path / "run").glob("*.exr"))
 
 
@@ -623,12 +622,13 @@ def test_a_capture_tells_of_fireflies(
     plan = replace(plan, settings=Settings(Z, direct_samples=16), sampling_target=1e9, warnings=())
     monkeypatch.setattr("mitsim.capture.run.make_plan", lambda *_: plan)
     for seed, fireflies in ((4, True), (2, False)):
-        result = capture(bench, "uniform", tmp_path / f"run{seed}", 2e-2, seed=seed)
+        result = bench.capture("uniform", tmp_path / f"run{seed}", accuracy=2e-2, seed=seed)
+        heaviest = result.manifest.heaviest_group
         gate = {"at_least": 0.8} if fireflies else {"at_most": 0.8}
-        measured(result.heaviest_group, **gate, what=f"share of the heaviest group, seed {seed}")
+        measured(heaviest, **gate, what=f"share of the heaviest group, seed {seed}")
         assert any("fireflies" in warning for warning in result.warnings) is fireflies
         manifest = json.loads((tmp_path / f"run{seed}" / "manifest.json").read_text())
-        assert manifest["heaviest_group"] == result.heaviest_group
+        assert manifest["heaviest_group"] == heaviest
         assert any("fireflies" in warning for warning in manifest["warnings"]) is fireflies
 
 
@@ -636,6 +636,6 @@ def test_a_capture_tells_of_fireflies(
 def test_ordinary_scenes_have_none(white: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
     """A sheet, and a plate of roughness 0.1 that adds noise of its own: no warning, shares of plain noise."""
     for name, bench in (("white", white), ("glossy", open_bench(small_scene(**glossy(0.1))))):
-        result = capture(bench, "uniform", tmp_path / name, 2e-2, seed=1, effects={"diffraction": False})
+        result = bench.capture("uniform", tmp_path / name, accuracy=2e-2, seed=1, effects={"diffraction": False})
         assert not any("fireflies" in warning or "sharp" in warning for warning in result.warnings)
-        assert result.heaviest_group < 0.8
+        assert result.manifest.heaviest_group < 0.8

@@ -12,7 +12,6 @@ pytestmark = pytest.mark.robustness("Faults")
 PROGRAM = """
 import sys
 from pathlib import Path
-from mitsim.capture import run
 from mitsim.capture.bench import open_bench
 from mitsim.capture.cost import frames_cost
 from mitsim.core.configuration import shipped
@@ -24,9 +23,9 @@ def used():
 
 bench = open_bench(shipped("scenes", sys.argv[1], "scene.xml"))
 before = used()
-result = run.capture(bench, sys.argv[2], Path(sys.argv[3]), float(sys.argv[4]))
-labels, weights = bench.family(sys.argv[2]).lighting
-cost = frames_cost(bench, result.plan.settings, weights.shape[1], len(weights))
+plan = bench.plan(sys.argv[2], accuracy=float(sys.argv[4]))
+bench.capture(plan, sys.argv[3])
+cost = frames_cost(bench, plan.settings, bench.family(sys.argv[2]).lighting)
 written = sum(path.stat().st_size for path in Path(sys.argv[3]).glob("*.exr"))
 print(used() - before, cost.memory_bytes, written, cost.disk_bytes)
 """

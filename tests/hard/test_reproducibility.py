@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from mitsim.capture import light, pilot
+from mitsim.capture import light
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.light import make_plan
-from mitsim.capture.run import capture
+from mitsim.capture.light import make_plan, trace_light
+from mitsim.capture.pilot import direct, halves
 from mitsim.core import parallel
 from mitsim.core.framefile import read_frame
 from mitsim.optics import frames
@@ -35,9 +35,9 @@ LAMP_AND_BOX = """
 CHILD = """
 import sys
 from mitsim.capture.bench import open_bench
-from mitsim.capture.run import capture
 effects = {"interreflection": True, "ambient": True}
-capture(open_bench(sys.argv[1], for_render=True), sys.argv[2], sys.argv[3], float(sys.argv[4]), 3, effects=effects)
+bench = open_bench(sys.argv[1], for_render=True)
+bench.capture(sys.argv[2], sys.argv[3], accuracy=float(sys.argv[4]), seed=3, effects=effects)
 """
 
 
@@ -72,7 +72,7 @@ def runs(bench: Bench, patterns: str, accuracy: float, where: Path, threads: Cal
     found = []
     for count in THREADS:
         with threads(count):
-            capture(bench, patterns, where / f"run{count}", accuracy, 3, effects=EFFECTS)
+            bench.capture(patterns, where / f"run{count}", accuracy=accuracy, seed=3, effects=EFFECTS)
         found.append(bits(where / f"run{count}"))
     return found
 
@@ -110,8 +110,8 @@ def test_sums_do_not_depend_on_threads_of_blas(measured: Recorder) -> None:
     for count in THREADS:
         with threadpool_limits(count):
             naive.add(float(np.vdot(a[0], a[1])))
-            norms.add(pilot._norm((a[0], a[1])))
-            differences.add(pilot._difference((a[0], a[1]), (b[0], b[1])))
+            norms.add(halves.norm((a[0], a[1])))
+            differences.add(halves.difference((a[0], a[1]), (b[0], b[1])))
     measured(len(naive), what="answers of BLAS")
     measured(max(len(norms), len(differences)), at_most=1, what="ours")
 
@@ -145,8 +145,8 @@ def test_the_plan_does_not_depend_on_the_clock(
     for seed in range(2):
         rng = np.random.default_rng(seed)
         times = iter(np.cumsum(rng.exponential(10.0 ** rng.uniform(-6, 3, 1000))))
-        monkeypatch.setattr(pilot.time, "perf_counter", lambda times=times: float(next(times)))
-        plans.append(make_plan(bench, *family, 5e-2, 3))
+        monkeypatch.setattr(direct.time, "perf_counter", lambda times=times: float(next(times)))
+        plans.append(make_plan(bench, family, 5e-2, 3))
     first, second = plans
     assert first.predicted_seconds != second.predicted_seconds
     assert (first.settings, first.sampling_target) == (second.settings, second.sampling_target)
@@ -158,12 +158,12 @@ def test_light_does_not_depend_on_how_many_paths_are_held_at_once(
 ) -> None:
     """The chunk is a constant, not the machine's; another one adds the same light in another order, to 1e-12."""
     bench = open_bench(small_scene("chunks"), for_render=True)
-    labels, weights = bench.family("dots:2").lighting
-    plan = make_plan(bench, labels, weights, 5e-2, 3, {"diffraction": False})
+    lighting = bench.family("dots:2").lighting
+    plan = make_plan(bench, lighting, 5e-2, 3, {"diffraction": False})
     found = []
     for lanes in (light._LANES_AT_ONCE, light._LANES_AT_ONCE, 300):
         monkeypatch.setattr(light, "_LANES_AT_ONCE", lanes)
-        one = light.collect(bench, plan, labels, weights, 3)
-        found.append(np.stack([frame.irradiance for frame in one.frames(labels, weights, 3)]))
+        one = trace_light(bench, plan, lighting, 3)
+        found.append(np.stack([frame.irradiance for frame in one.frames(lighting, 3)]))
     assert np.array_equal(found[0], found[1])
     measured(np.linalg.norm(found[2] - found[0]) / np.linalg.norm(found[0]), at_most=1e-6)

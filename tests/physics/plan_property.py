@@ -21,13 +21,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from mitsim.capture import effects
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
-from mitsim.capture.pilot import applicable
-from mitsim.capture.simulation import Estimate, Simulation
+from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import FrameOptics
+from mitsim.rig.patterns import Lighting
 from mitsim.transport.histogram import AMBIENT, Deposits
 
 GROUPS = 6
@@ -78,20 +79,19 @@ class Change:
 
 def measured(bench: Bench, patterns: str, captures: int, depth: float, seed: int, effort: Effort) -> dict[str, Change]:
     """Change of the frames by each effect that the scene has; ``depth`` [mm] is where one layer is put."""
-    labels, weights = bench.family(patterns).lighting
-    chosen = weights[np.linspace(0, len(weights) - 1, captures).round().astype(int)]
-    names = frozenset(applicable(bench)) - {"speckle"}
-    look = _Look(bench, labels, chosen, Settings(depth, effects=names), effort, seed)
+    lighting = bench.family(patterns).lighting
+    chosen = lighting.shots(np.linspace(0, len(lighting.weights) - 1, captures).round().astype(int))
+    names = frozenset(effects.present(bench)) - {"speckle"}
+    look = _Look(bench, chosen, Settings(depth, effects=names), effort, seed)
     return look.changes()
 
 
 class _Look:
-    def __init__(
-        self, bench: Bench, labels: np.ndarray, weights: np.ndarray, base: Settings, effort: Effort, seed: int
-    ) -> None:
-        self.bench, self.labels, self.weights, self.effort, self.seed = bench, labels, weights, effort, seed
+    def __init__(self, bench: Bench, lighting: Lighting, base: Settings, effort: Effort, seed: int) -> None:
+        self.bench, self.effort, self.seed = bench, effort, seed
+        self.labels, self.weights = lighting.labels, lighting.weights
         # Light that no capture shows is dropped before it is filed, which takes most of the time.
-        self.shown = np.append(weights.any(axis=0)[labels], True)
+        self.shown = np.append(self.weights.any(axis=0)[self.labels], True)
         self.full = replace(base, subdivision=2, coarse_cells=2, coarse_layers=True)
         self.full = replace(self.full, layers=self._layers())
 
@@ -121,7 +121,7 @@ class _Look:
             frames.append(captures)
             for name, simulation in without.items():
                 if name == "black-level":
-                    found[name].append(everything.black * (self._all_lit(everything, seed) - captures))
+                    found[name].append(everything.physics.black_level * (self._all_lit(everything, seed) - captures))
                 elif name == "interreflection":
                     found[name].append(self._of_classes(everything.smooth.optics, light.smooth))
                 else:
@@ -142,19 +142,19 @@ class _Look:
         other = simulation.follow(integer(seed, "other"), self.effort.other)
         return direct.where(self.shown[direct.source]), other.where(self.shown[other.source])
 
-    def _filed(self, simulation: Simulation, deposits: tuple[Deposits, Deposits]) -> Estimate:
+    def _filed(self, simulation: Simulation, deposits: tuple[Deposits, Deposits]) -> FiledLight:
         """What of the deposits a simulation has."""
         direct, other = deposits
-        if not simulation.lit_by_lamps:
+        if not simulation.physics.lamps:
             other = other.where(other.order != AMBIENT)
         light = simulation.file_direct(direct, self.labels, self.effort.direct)
         return light + simulation.file_followed(other, self.labels, self.effort.other)
 
-    def _formed(self, simulation: Simulation, light: Estimate) -> np.ndarray:
+    def _formed(self, simulation: Simulation, light: FiledLight) -> np.ndarray:
         """(captures, pixels, pixels) frames without the projector's black."""
-        frames = self._of_classes(simulation.optics, light.fine)
+        frames = self._of_classes(simulation.fine.optics, light.fine)
         frames += self._of_classes(simulation.smooth.optics, light.smooth)
-        if simulation.lit_by_lamps:
+        if simulation.physics.lamps:
             frames += _products_of(simulation.ambient.optics, light.fine[[-1]])
         mirrored = simulation.glint_frames(self.labels)
         if mirrored is not None:
@@ -176,7 +176,7 @@ class _Look:
         one = np.zeros_like(self.labels)
         light = simulation.file_direct(simulation.direct.trace(integer(seed, "direct"), 0, 2), one, 2)
         light += simulation.file_followed(simulation.follow(integer(seed, "other"), 8), one, 8)
-        frames = _products_of(simulation.optics, light.fine[[0]])
+        frames = _products_of(simulation.fine.optics, light.fine[[0]])
         frames += _products_of(simulation.smooth.optics, light.smooth[[0]])
         mirrored = simulation.glint_frames(one)
         return np.asarray(frames[0] if mirrored is None else frames[0] + mirrored.irradiance.sum(axis=0))

@@ -16,7 +16,7 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
-from mitsim.capture.light import collect, make_plan
+from mitsim.capture.light import Sampling, make_plan, trace_light
 from mitsim.capture.render import projected
 from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped
@@ -55,9 +55,10 @@ def ambient_frame(bench: Bench, samples: int = 8, anchors: int = 3, interreflect
     on = {"ambient"} | ({"interreflection"} if interreflection else set())
     settings = Settings(depth=400.0, anchors=anchors, effects=frozenset(on))
     simulation = Simulation(bench, settings)
-    labels, weights = Lighting.uniform(bench.n)
-    light = simulation.file_followed(simulation.other.trace(5, 0, samples), labels, samples)
-    return next(iter(simulation.expected([light], np.zeros(1, np.int64), 0 * weights, 0))).irradiance
+    uniform = Lighting.uniform(bench.n)
+    light = simulation.file_followed(simulation.from_camera.trace(5, 0, samples), uniform.labels, samples)
+    dark = Lighting(uniform.labels, 0 * uniform.weights)
+    return next(iter(simulation.expected([light], np.zeros(1, np.int64), dark, 0))).irradiance
 
 
 def by_lamp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -188,7 +189,7 @@ def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.n
 
 def lens_pair(bench: Bench, shown: np.ndarray, spp: int, accuracy: float = 3e-3) -> Pair:
     forced = {"diffraction": False, "black-level": False, "interreflection": False, "aperture": True}
-    plan = make_plan(bench, *classes_of(shown), accuracy, seed=21, forced=forced)
+    plan = make_plan(bench, classes_of(shown), accuracy, seed=21, switches=forced)
     frame, groups, light = frame_of(bench, plan, shown)
     return Pair(*reference_with_lens(bench, shown, spp), frame, groups, light, bench, plan, shown)
 
@@ -219,7 +220,7 @@ def test_a_small_lens_is_a_pinhole(shared_scene: SmallScene) -> None:
     shown = np.ones((bench.n, bench.n))
     off = {"diffraction": False, "black-level": False, "interreflection": False}
     frames = [
-        frame_of(one, make_plan(one, *classes_of(shown), 1e-3, 23, {**off, "aperture": one is not bench}), shown)[0]
+        frame_of(one, make_plan(one, classes_of(shown), 1e-3, 23, {**off, "aperture": one is not bench}), shown)[0]
         for one in (bench, with_lens(bench, 1e-3))
     ]
     assert np.linalg.norm(frames[1] - frames[0]) < 3e-3 * np.linalg.norm(frames[0])
@@ -232,14 +233,14 @@ def test_black_pixels_shine_by_one_over_the_contrast(shipped_bench: Callable[...
     """Contrast 100: every frame is 1 % of the uniform one and 99 % of its own, glints included."""
     sharp = shipped_bench("mirror")
     bench = replace(sharp, projector=sharp.projector.model_copy(update={"contrast_ratio": 100.0}))
-    labels, weights = bench.family("dots:3").lighting
-    weights = np.concatenate([weights, np.ones((1, 9)), np.zeros((1, 9))])
+    dots = bench.family("dots:3").lighting
+    lighting = Lighting(dots.labels, np.concatenate([dots.weights, np.ones((1, 9)), np.zeros((1, 9))]))
     frames = {}
     for on in (True, False):
         forced = {"black-level": on, "diffraction": False, "mirrors": True, "interreflection": False}
-        plan = make_plan(bench, labels, weights, 3e-2, 31, forced)
-        light = collect(bench, plan, labels, weights, 31, by_pixel=False)
-        frames[on] = np.stack([frame.irradiance for frame in light.merged().frames(labels, weights, 0)])
+        plan = make_plan(bench, lighting, 3e-2, 31, forced)
+        light = trace_light(bench, plan, lighting, 31, Sampling(by_pixel=False))
+        frames[on] = np.stack([frame.irradiance for frame in light.merged().frames(lighting, 0)])
     uniform = frames[False][9]
     expected = 0.01 * uniform + 0.99 * frames[False]
     assert np.linalg.norm(frames[True] - expected) < 1e-9 * np.linalg.norm(expected)

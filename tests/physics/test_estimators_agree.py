@@ -32,9 +32,10 @@ import pytest
 from scipy import stats
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.light import Light, collect, make_plan
+from mitsim.capture.light import Light, Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan
 from mitsim.capture.render import projected
+from mitsim.rig.patterns import Lighting
 
 PASSES = 8
 FAMILY_ALPHA, CASES = 1e-3, 26
@@ -66,7 +67,7 @@ class Pair:
         simulation = self.light.simulation
         groups = self.light.groups
         kinds = (
-            (simulation.optics, [group.fine for group in groups]),
+            (simulation.fine.optics, [group.fine for group in groups]),
             (simulation.coarse.optics, [group.coarse for group in groups]),
             (simulation.smooth.optics, [group.smooth for group in groups]),
         )
@@ -103,21 +104,20 @@ def reference_of(bench: Bench, spp: int, shown: np.ndarray) -> tuple[np.ndarray,
     return mean, (square / PASSES - np.square(mean)) / (PASSES - 1)
 
 
-def classes_of(shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def classes_of(shown: np.ndarray) -> Lighting:
     """Labels and weights of one capture: pixels that are dark (when there are any), and pixels that are lit."""
     dark = int(shown.min() == 0)
-    return shown.astype(np.int64).ravel() * dark, np.arange(1 + dark, dtype=float).reshape(1, -1) + 1 - dark
+    weights = np.arange(1 + dark, dtype=float).reshape(1, -1) + 1 - dark
+    return Lighting(shown.astype(np.int64).ravel() * dark, weights)
 
 
 def frame_of(bench: Bench, plan: Plan, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray, Light]:
     """The factored frame (mean, and of each group), and the light that arrives."""
-    labels, weights = classes_of(shown)
-    light = collect(bench, plan, labels, weights, seed=11, by_pixel=False)
+    lighting = classes_of(shown)
+    light = trace_light(bench, plan, lighting, 11, Sampling(by_pixel=False))
     assert light.reached
-    groups = [
-        next(iter(replace(light, groups=(group,)).frames(labels, weights, 0))).irradiance for group in light.groups
-    ]
-    return next(iter(light.frames(labels, weights, 0))).irradiance, np.stack(groups), light
+    groups = [next(iter(replace(light, groups=(group,)).frames(lighting, 0))).irradiance for group in light.groups]
+    return next(iter(light.frames(lighting, 0))).irradiance, np.stack(groups), light
 
 
 def pair_of(bench: Bench, patterns: str, index: int, accuracy: float, spp: int, on: tuple[str, ...] = ()) -> Pair:
@@ -125,7 +125,7 @@ def pair_of(bench: Bench, patterns: str, index: int, accuracy: float, spp: int, 
     family = bench.family(patterns)
     shown = family.light(family.captures[index])
     forced = {"diffraction": False, "black-level": False, **dict.fromkeys(on, True)}
-    plan = make_plan(bench, *classes_of(shown), accuracy, seed=11, forced=forced)
+    plan = make_plan(bench, classes_of(shown), accuracy, seed=11, switches=forced)
     frame, groups, light = frame_of(bench, plan, shown)
     return Pair(*reference_of(bench, spp, shown), frame, groups, light, bench, plan, shown)
 

@@ -86,7 +86,7 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
 
     bench = open_bench(scene, for_render=True)
     family = bench.family(f"dots:{K}", 0)
-    labels, weights = family.lighting
+    lighting = family.lighting
     settings = Settings(depth=400.0, anchors=3, effects=frozenset({"interreflection"}))
     # Cells as narrow as a real projector's: the wide ones of 15 pixels would hide light lost at the field stop's rim.
     simulation = Simulation(bench, settings, pixels=8 * N)
@@ -96,14 +96,14 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
         own = 1000 * seed + group
         one, more = (
             [
-                stage.file(stage.tracer.trace(own, 0, count), labels, count)
+                stage.file(stage.tracer.trace(own, 0, count), lighting.labels, count)
                 for name, stage in simulation.tracers().items()
                 if name in names
             ]
             for names, count in ((("direct", "anchored"), samples), (("indirect",), 64 * samples))
         )
         for light in (sum(one[1:], one[0]), more[0]):
-            frames = [frame.irradiance for frame in simulation.expected([light], np.arange(K**2), weights, 0)]
+            frames = [frame.irradiance for frame in simulation.expected([light], np.arange(K**2), lighting, 0)]
             quadrants.append(np.reshape(frames, (K**2, 2, PIXELS // 2, 2, PIXELS // 2)).mean(axis=(2, 4)))
     values = np.reshape(quadrants, (GROUPS, 2, K**2, 2, 2))
     mean, error = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(GROUPS)

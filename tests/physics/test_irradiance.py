@@ -17,6 +17,7 @@ import pytest
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.patterns import Lighting
 
 pytestmark = pytest.mark.usefixtures("variant")
 SCALE, Z, ALBEDO = 111000.0, 400.0, 0.5
@@ -187,7 +188,8 @@ def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)
     groups = [simulation.file_direct(simulation.direct.trace(seed, 0, 16), labels, 16) for seed in range(4)]
-    return next(iter(simulation.expected(groups, labels, light.reshape(1, -1), 0))).irradiance
+    lighting = Lighting(labels, light.reshape(1, -1))
+    return next(iter(simulation.expected(groups, labels, lighting, 0))).irradiance
 
 
 PIXELS = [(0, 0), (0, 15), (3, 11)]

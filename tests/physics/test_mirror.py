@@ -8,15 +8,17 @@ mask dims it at s = X + (P - X) d / P_z. There is nothing random: tolerances are
 by 0.6 % relatively), or stated.
 """
 
+import copy
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.signal import max_len_seq
 
-from mitsim.capture.light import collect, make_plan
+from mitsim.capture.light import Sampling, make_plan, trace_light
 from mitsim.optics.beams import SpecularFrames, beam_frames
 from mitsim.optics.samplers import geometric_terms
-from mitsim.rig.patterns import parse_patterns
+from mitsim.rig.patterns import Lighting, parse_patterns
 from mitsim.transport.aperture import aperture_scene_parts, register
 from mitsim.transport.beams import trace_beams
 from mitsim.transport.mirrors import MirrorTracer
@@ -134,6 +136,7 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 UNIFORM = np.zeros(N * N, dtype=np.int64)
+LIT = Lighting(UNIFORM, np.ones((1, 1)))
 BACK = np.array([0.0, 0.0, -1.0])
 
 
@@ -166,7 +169,7 @@ def test_a_plane_mirror_shows_a_second_projector(turn: float, normal: np.ndarray
 
 def test_dots_by_a_mirror(variant: str) -> None:
     """Every class of dots:7 that reaches the sensor; pixels of the projector have edges inside sensor pixels."""
-    labels, _ = parse_patterns("dots:7", N).classes()
+    labels = parse_patterns("dots:7", N).lighting.labels
     rig, place = Rig((60, 0, 0)), (30.0, 0.0, 400.0)
     found = rig.frames(rig.scene(mirror=mirror(place, BACK)), labels)
     image = rig.mirrored((place, BACK))
@@ -193,7 +196,7 @@ def test_dots_by_a_mirror(variant: str) -> None:
 def test_dots_by_a_mirror_that_casts_a_keystone(variant: str) -> None:
     """Projector pixels lie askew on the sensor pixels. Coarse sensor pixels, each the mean of 64 x 64 parts."""
     pixels, pitch, fine = 48, 0.125, 64
-    labels, _ = parse_patterns("dots:7", N).classes()
+    labels = parse_patterns("dots:7", N).lighting.labels
     normal = tilted(2.0, -1.5)
     rig, place = Rig((60, 0, 0), 10.0), (30.0, 0.0, 400.0)
     found = rig.frames(rig.scene(pixels=pixels, pitch=pitch, mirror=mirror(place, normal)), labels)
@@ -339,14 +342,16 @@ def shipped_image() -> "Rig":
 def pipeline_light(bench, diffraction: bool):
     """The plan with mirrors and the light it collects, under uniform light."""
     forced = {"diffraction": diffraction, "black-level": False, "mirrors": True}
-    plan = make_plan(bench, UNIFORM, np.ones((1, 1)), 2e-3, seed=3, forced=forced)
-    return plan, collect(bench, plan, UNIFORM, np.ones((1, 1)), seed=3, by_pixel=False)
+    plan = make_plan(bench, LIT, 2e-3, seed=3, switches=forced)
+    return plan, trace_light(bench, plan, LIT, 3, Sampling(by_pixel=False))
 
 
 def mirror_part(light) -> np.ndarray:
     """What the frame holds beyond the light that camera paths found."""
-    whole = next(iter(light.frames(UNIFORM, np.ones((1, 1)), 0))).irradiance
-    traced = light.simulation.expected(light.groups, np.zeros(1, np.int64), np.ones((1, 1)), 0)
+    whole = next(iter(light.frames(LIT, 0))).irradiance
+    without = copy.copy(light.simulation)
+    without.glint_frames = lambda labels: None
+    traced = without.expected(light.groups, np.zeros(1, np.int64), LIT, 0)
     return whole - next(iter(traced)).irradiance
 
 
@@ -362,7 +367,7 @@ def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) ->
     glint = SHIPPED * irradiance * np.outer(*masks)
     assert relative(mirror_part(light), glint) < 2e-3
 
-    whole = next(iter(light.frames(UNIFORM, np.ones((1, 1)), 0))).irradiance
+    whole = next(iter(light.frames(LIT, 0))).irradiance
     board = np.zeros_like(whole)
     squares = np.zeros_like(whole)
     passes = 8

@@ -15,12 +15,13 @@ from mitsim.capture import run
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.light import collect, make_plan
+from mitsim.capture.light import make_plan, trace_light
 from mitsim.capture.request import Exposure
-from mitsim.capture.run import CaptureResult, capture
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
+from mitsim.core.job import Job
 from mitsim.core.resources import Limits
+from mitsim.core.runs import Capture
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.moments import frame_moments
@@ -42,8 +43,8 @@ def bench(shared_scene: Callable[..., Path], variant: str, printed: np.ndarray) 
 
 
 @pytest.fixture(scope="module")
-def captured(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> CaptureResult:
-    return capture(bench, "dots:3", tmp_path_factory.mktemp("capture") / "run", ACCURACY, seed=5)
+def captured(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return bench.capture("dots:3", tmp_path_factory.mktemp("capture") / "run", accuracy=ACCURACY, seed=5)
 
 
 def pixels(folder: Path) -> dict[str, str]:
@@ -58,17 +59,19 @@ def pixels(folder: Path) -> dict[str, str]:
     return found
 
 
-def test_the_folder_holds_every_frame_and_nothing_else(captured: CaptureResult) -> None:
-    folder = Path(captured.output)
+def test_the_folder_holds_every_frame_and_nothing_else(captured: Capture) -> None:
+    folder = captured.folder
     assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "manifest.json", "truth.exr"])
-    assert captured.frames == 9 and captured.shape == (64, 64) and captured.seed == 5
-    assert set(captured.seconds) >= {"transport", "optics", "sensor", "write", "total"}
-    assert captured.seconds["total"] >= max(captured.seconds.values())
-    assert captured.variant == "llvm_ad_mono"
+    summary = captured.summary()
+    assert summary["frames"] == 9 and summary["shape"] == (64, 64) and summary["seed"] == 5
+    seconds = summary["seconds"]
+    assert set(seconds) >= {"transport", "optics", "sensor", "write", "total"}
+    assert seconds["total"] >= max(seconds.values())
+    assert summary["variant"] == "llvm_ad_mono"
 
 
-def test_the_manifest_says_what_was_done(captured: CaptureResult, bench: Bench) -> None:
-    folder = Path(captured.output)
+def test_the_manifest_says_what_was_done(captured: Capture, bench: Bench) -> None:
+    folder = captured.folder
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["kind"] == "capture" and manifest["status"] == "complete"
     configuration = manifest["configuration"]
@@ -77,58 +80,60 @@ def test_the_manifest_says_what_was_done(captured: CaptureResult, bench: Bench) 
     assert configuration["scene_sha256"] == checksum(bench.loaded.path)
     assert manifest["camera"]["geometry"]["mask_distance"] == 2.0 and manifest["camera"]["projector"]["n"] == N
     assert manifest["digital"]["exposure_s"] == captured.exposure_s
-    assert manifest["mc_error"] == captured.mc_error
+    assert manifest["mc_error"] == captured.manifest.mc_error
     assert {"mitsim", "mitsuba", "drjit", "numpy", "python"} <= set(manifest["versions"])
     assert {"effects", "accuracy", "predicted_seconds", "settings"} <= set(manifest["plan"])
     assert {"anchors", "layers", "subdivision", "effects"} <= set(manifest["plan"]["settings"])
 
 
-def test_the_manifests_patterns_are_the_family(captured: CaptureResult) -> None:
-    block = json.loads((Path(captured.output) / "manifest.json").read_text())["patterns"]
+def test_the_manifests_patterns_are_the_family(captured: Capture) -> None:
+    block = json.loads((captured.folder / "manifest.json").read_text())["patterns"]
     family = parse_patterns("dots:3", N)
     assert block["family"] == "dots:3" and block["n"] == N
     assert np.array_equal(block["P_L"], family.left) and np.array_equal(block["P_R"], family.right)
     assert [entry["file"] for entry in block["captures"]] == FILES
     for entry, shown in zip(block["captures"], family.captures, strict=True):
         assert (entry["row"], entry["column"], entry["sign"]) == (shown.row, shown.column, 0)
-        _, metadata = read_frame(Path(captured.output) / entry["file"])
+        _, metadata = read_frame(captured.folder / entry["file"])
         assert (metadata["row"], metadata["column"], metadata["sign"]) == (shown.row, shown.column, 0)
         assert metadata["exposure_s"] == captured.exposure_s and metadata["seed"] == 5
 
 
-def test_checksums_are_those_of_the_files(captured: CaptureResult) -> None:
-    folder = Path(captured.output)
+def test_checksums_are_those_of_the_files(captured: Capture) -> None:
+    folder = captured.folder
     checksums = json.loads((folder / "manifest.json").read_text())["checksums"]
     assert set(checksums) == {*FILES, "truth.exr"}
     for name, value in checksums.items():
         assert value == hashlib.sha256((folder / name).read_bytes()).hexdigest()
 
 
-def test_the_monte_carlo_error_is_within_the_accuracy(captured: CaptureResult, bench: Bench) -> None:
+def test_the_monte_carlo_error_is_within_the_accuracy(captured: Capture, bench: Bench) -> None:
     """Stated, and true: against light of another seed at a third of the error."""
-    assert 0 < captured.mc_error <= ACCURACY and not captured.warnings
-    labels, weights = parse_patterns("dots:3", N).lighting
-    light = collect(bench, replace(captured.plan, sampling_target=captured.mc_error / 3), labels, weights, seed=99)
+    assert 0 < captured.manifest.mc_error <= ACCURACY and not captured.warnings
+    lighting = parse_patterns("dots:3", N).lighting
+    plan = make_plan(bench, lighting, ACCURACY, 5)
+    assert json.loads(json.dumps(plan.block()["settings"])) == json.loads(json.dumps(captured.plan["settings"]))
+    light = trace_light(bench, replace(plan, sampling_target=captured.manifest.mc_error / 3), lighting, seed=99)
     exposer = Exposer(bench, captured.exposure_s, 0)
-    judge = np.stack([exposer.electrons(frame) for frame in light.frames(labels, weights, 0)])
-    found = np.stack([read_frame(Path(captured.output) / name)[0]["electrons"] for name in FILES])
+    judge = np.stack([exposer.electrons(frame) for frame in light.frames(lighting, 0)])
+    found = np.stack([read_frame(captured.folder / name)[0]["electrons"] for name in FILES])
     error = np.linalg.norm(found - judge) / np.linalg.norm(judge)
     # The error has few degrees of freedom (how bright each dot pattern is as a whole), and so has its estimate.
-    assert error < 2 * captured.mc_error * np.hypot(1, 1 / 3)
-    assert error > captured.mc_error / 3
+    assert error < 2 * captured.manifest.mc_error * np.hypot(1, 1 / 3)
+    assert error > captured.manifest.mc_error / 3
 
 
-def test_the_brightest_pixel_has_its_part_of_the_full_well(captured: CaptureResult, bench: Bench) -> None:
-    peak = max(read_frame(Path(captured.output) / name)[0]["electrons"].max() for name in FILES)
+def test_the_brightest_pixel_has_its_part_of_the_full_well(captured: Capture, bench: Bench) -> None:
+    peak = max(read_frame(captured.folder / name)[0]["electrons"].max() for name in FILES)
     dark = bench.sensor.superpixel_dark_current_e_per_s * captured.exposure_s
     assert peak + dark == pytest.approx(0.8 * bench.sensor.superpixel_full_well_e, rel=1e-5)
 
 
-def test_digital_numbers_follow_the_expected_electrons(captured: CaptureResult, bench: Bench) -> None:
+def test_digital_numbers_follow_the_expected_electrons(captured: Capture, bench: Bench) -> None:
     """Mean residual of 9 x 4096 pixels in units of its closed-form deviation is normal: five of it."""
     scores = []
     for name in FILES:
-        channels, _ = read_frame(Path(captured.output) / name)
+        channels, _ = read_frame(captured.folder / name)
         assert channels["DN"].dtype == np.uint32
         mean, variance = frame_moments(channels["electrons"], captured.exposure_s, bench.sensor)
         scores.append((channels["DN"] - mean) / np.sqrt(variance))
@@ -141,8 +146,8 @@ def test_digital_numbers_follow_the_expected_electrons(captured: CaptureResult, 
     assert np.abs(correlation).max() < 6 / np.sqrt(4096)
 
 
-def test_truth_is_the_prints_reflectance_over_the_boards(captured: CaptureResult, printed: np.ndarray) -> None:
-    truth = read_frame(Path(captured.output) / "truth.exr")[0]["reflectance"]
+def test_truth_is_the_prints_reflectance_over_the_boards(captured: Capture, printed: np.ndarray) -> None:
+    truth = read_frame(captured.folder / "truth.exr")[0]["reflectance"]
     fine = np.kron(printed / 255, np.ones((8, 8)))  # 0.5 mm
     expected = fine[8:-8, 8:-8].reshape(N, 15, N, 15).mean(axis=(1, 3)) / load_recipe().board_reflectance
     # A projector pixel's light comes from hundreds of paths, jittered in cells; texels are as large as half a pixel.
@@ -151,21 +156,19 @@ def test_truth_is_the_prints_reflectance_over_the_boards(captured: CaptureResult
     assert np.linalg.norm(truth - expected.T) > 0.1 * np.linalg.norm(expected)
 
 
-def test_the_same_seed_is_bit_equal_and_another_differs(bench: Bench, tmp_path: Path, captured: CaptureResult) -> None:
-    again = capture(bench, "dots:3", tmp_path / "again", ACCURACY, seed=5)
-    other = capture(bench, "dots:3", tmp_path / "other", ACCURACY, seed=6)
-    same, different = pixels(Path(again.output)), pixels(Path(other.output))
-    assert same == pixels(Path(captured.output))
+def test_the_same_seed_is_bit_equal_and_another_differs(bench: Bench, tmp_path: Path, captured: Capture) -> None:
+    again = bench.capture("dots:3", tmp_path / "again", accuracy=ACCURACY, seed=5)
+    other = bench.capture("dots:3", tmp_path / "other", accuracy=ACCURACY, seed=6)
+    same, different = pixels(again.folder), pixels(other.folder)
+    assert same == pixels(captured.folder)
     assert all(different[name] != same[name] for name in same)
 
 
-def copied(captured: CaptureResult, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(captured.output, tmp_path / "run"))
+def copied(captured: Capture, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(captured.folder, tmp_path / "run"))
 
 
-def test_resume_makes_the_missing_frames_and_keeps_the_rest(
-    bench: Bench, captured: CaptureResult, tmp_path: Path
-) -> None:
+def test_resume_makes_the_missing_frames_and_keeps_the_rest(bench: Bench, captured: Capture, tmp_path: Path) -> None:
     folder = copied(captured, tmp_path)
     whole = pixels(folder)
     for name in FILES[2:7]:
@@ -175,19 +178,19 @@ def test_resume_makes_the_missing_frames_and_keeps_the_rest(
     keys = ("kind", "configuration", "configuration_sha256")
     (folder / "manifest.json").write_text(json.dumps({**{k: manifest[k] for k in keys}, "status": "incomplete"}))
     kept = (folder / FILES[8]).stat().st_mtime_ns
-    resumed = capture(bench, "dots:3", folder, ACCURACY, seed=5, resume=True)
+    resumed = bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True)
     assert pixels(folder) == whole
     assert (folder / FILES[8]).stat().st_mtime_ns == kept
-    assert resumed.mc_error == captured.mc_error and resumed.exposure_s == captured.exposure_s
+    assert resumed.manifest.mc_error == captured.manifest.mc_error and resumed.exposure_s == captured.exposure_s
     checksums = json.loads((folder / "manifest.json").read_text())["checksums"]
     assert all(checksum(folder / name) == value for name, value in checksums.items())
 
 
-def test_frames_of_another_run_are_not_kept(bench: Bench, captured: CaptureResult, tmp_path: Path) -> None:
+def test_frames_of_another_run_are_not_kept(bench: Bench, captured: Capture, tmp_path: Path) -> None:
     folder = copied(captured, tmp_path)
     whole = pixels(folder)
     shutil.copyfile(folder / FILES[1], folder / FILES[2])
-    capture(bench, "dots:3", folder, ACCURACY, seed=5, resume=True)
+    bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True)
     assert pixels(folder) == whole
 
 
@@ -197,65 +200,65 @@ def test_frames_of_another_run_are_not_kept(bench: Bench, captured: CaptureResul
         ({"seed": 6}, "seed"),
         ({"patterns": "dots:4"}, "patterns"),
         ({"accuracy": 2e-2}, "accuracy"),
-        ({"exposure": Exposure(seconds=0.01)}, "exposure"),
+        ({"exposure": 0.01}, "exposure"),
     ],
 )
 def test_resume_with_other_options_is_refused(
-    bench: Bench, captured: CaptureResult, tmp_path: Path, changed: dict[str, object], word: str
+    bench: Bench, captured: Capture, tmp_path: Path, changed: dict[str, object], word: str
 ) -> None:
     folder = copied(captured, tmp_path)
     before = pixels(folder)
     options = {"patterns": "dots:3", "accuracy": ACCURACY, "seed": 5, **changed}
     with pytest.raises(MitsimError, match=word) as caught:
-        capture(bench, output=folder, resume=True, **options)
+        bench.capture(options.pop("patterns"), folder, resume=True, **options)
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
     assert pixels(folder) == before
 
 
 def test_resume_of_a_changed_scene_is_refused(small_scene: Callable[..., Path], tmp_path: Path) -> None:
     path = small_scene()
-    capture(open_bench(path), "uniform", tmp_path / "run", 2e-2)
+    open_bench(path).capture("uniform", tmp_path / "run", accuracy=2e-2)
     with pytest.raises(MitsimError, match="defines"):
-        capture(open_bench(path, albedo="0.4"), "uniform", tmp_path / "run", 2e-2, resume=True)
+        open_bench(path, albedo="0.4").capture("uniform", tmp_path / "run", accuracy=2e-2, resume=True)
     path.write_text(path.read_text() + "<!-- edited -->")
     with pytest.raises(MitsimError, match="scene_sha256"):
-        capture(open_bench(path), "uniform", tmp_path / "run", 2e-2, resume=True)
+        open_bench(path).capture("uniform", tmp_path / "run", accuracy=2e-2, resume=True)
 
 
-def test_a_folder_in_use_is_refused(bench: Bench, captured: CaptureResult, tmp_path: Path) -> None:
+def test_a_folder_in_use_is_refused(bench: Bench, captured: Capture, tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match="holds files already"):
-        capture(bench, "dots:3", captured.output, ACCURACY, seed=5)
+        bench.capture("dots:3", captured.folder, accuracy=ACCURACY, seed=5)
     (tmp_path / "note.txt").write_text("mine")
     for resume in (False, True):
         with pytest.raises(MitsimError, match="holds files already"):
-            capture(bench, "dots:3", tmp_path, ACCURACY, resume=resume)
+            bench.capture("dots:3", tmp_path, accuracy=ACCURACY, resume=resume)
     assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(MitsimError, match="does not exist"):
-        capture(bench, "dots:3", tmp_path / "no" / "run", ACCURACY)
+        bench.capture("dots:3", tmp_path / "no" / "run", accuracy=ACCURACY)
 
 
 def test_a_folder_in_use_is_refused_before_any_work(
-    bench: Bench, captured: CaptureResult, monkeypatch: pytest.MonkeyPatch
+    bench: Bench, captured: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def work(*_: object) -> None:
         raise AssertionError("work was done first")
 
     monkeypatch.setattr(run, "make_plan", work)
     with pytest.raises(MitsimError, match="holds files already"):
-        capture(bench, "dots:3", captured.output, ACCURACY, seed=5)
+        bench.capture("dots:3", captured.folder, accuracy=ACCURACY, seed=5)
 
 
 @pytest.mark.parametrize("changed", [{"patterns": "dots:17"}, {"accuracy": 0.0}, {"seed": -1}])
 def test_what_is_refused_leaves_nothing_behind(bench: Bench, tmp_path: Path, changed: dict[str, object]) -> None:
     options = {"patterns": "dots:3", "accuracy": ACCURACY, "seed": 0, **changed}
     with pytest.raises(MitsimError):
-        capture(bench, output=tmp_path / "run", **options)
+        bench.capture(options.pop("patterns"), tmp_path / "run", **options)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_signed_family_is_captured_in_halves(bench: Bench, tmp_path: Path) -> None:
-    done = capture(bench, "hadamard:2", tmp_path / "run", 2e-2, seed=1, exposure=Exposure(seconds=0.02))
-    assert done.frames == 8 and done.exposure_s == 0.02
+    done = bench.capture("hadamard:2", tmp_path / "run", accuracy=2e-2, seed=1, exposure=0.02)
+    assert len(done.manifest.patterns.captures) == 8 and done.exposure_s == 0.02
     block = json.loads((tmp_path / "run" / "manifest.json").read_text())["patterns"]["captures"]
     assert [entry["sign"] for entry in block] == [1, -1] * 4
     halves = {
@@ -272,9 +275,8 @@ def test_a_signed_family_is_captured_in_halves(bench: Bench, tmp_path: Path) -> 
 def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> None:
     """Difference of halves in electrons a second; its mean is the expected response within its noise."""
     family = parse_patterns("hadamard:2", N)
-    labels, weights = family.lighting
-    plan = make_plan(bench, labels, weights, 2e-2, 0)
-    expected = collect(bench, plan, labels, weights, 0).frames(labels, weights, 0)
+    plan = make_plan(bench, family.lighting, 2e-2, 0)
+    expected = trace_light(bench, plan, family.lighting, 0).frames(family.lighting, 0)
     exposer = Exposer(bench, 0.01, seed=3)
     measured = {(i, j): y for y, i, j in exposer.measurements(family, expected)}
     assert set(measured) == {(0, 0), (0, 1), (1, 0), (1, 1)}
@@ -302,7 +304,7 @@ def test_ambient_light_is_simulated(small_scene: Callable[..., Path], tmp_path: 
     bench, found = open_bench(small_scene(extra=light)), {}
     for effects in ({}, {"ambient": False}):
         folder = tmp_path / str(len(found))
-        capture(bench, "hadamard:2", folder, 2e-2, exposure=Exposure(seconds=0.01), effects=effects)
+        bench.capture("hadamard:2", folder, accuracy=2e-2, exposure=0.01, effects=effects)
         frames = [read_frame(folder / f"frame_{index:05d}.exr")[0]["electrons"] for index in range(2)]
         found[len(found)] = sum(frames[0].ravel()), sum(frames[1].ravel())
     (bright, dark), (alone, black) = found[0], found[1]
@@ -311,7 +313,7 @@ def test_ambient_light_is_simulated(small_scene: Callable[..., Path], tmp_path: 
 
 
 def test_saturation_is_flagged(bench: Bench, tmp_path: Path) -> None:
-    done = capture(bench, "uniform", tmp_path / "run", 2e-2, exposure=Exposure(seconds=10.0))
+    done = bench.capture("uniform", tmp_path / "run", accuracy=2e-2, exposure=10.0)
     assert any("full well" in warning for warning in done.warnings)
 
 
@@ -322,10 +324,10 @@ def test_exposures_that_make_no_sense(settings: dict[str, float]) -> None:
 
 
 def test_sampling_stops_at_its_target(bench: Bench) -> None:
-    labels, weights = parse_patterns("dots:3", N).lighting
-    plan = make_plan(bench, labels, weights, 1e-2, 0)
+    lighting = parse_patterns("dots:3", N).lighting
+    plan = make_plan(bench, lighting, 1e-2, 0)
     targets = (1e-2, 1.5e-3)
-    loose, tight = (collect(bench, replace(plan, sampling_target=t), labels, weights, 0) for t in targets)
+    loose, tight = (trace_light(bench, replace(plan, sampling_target=t), lighting, 0) for t in targets)
     for light, target in zip((loose, tight), targets, strict=True):
         assert light.reached and len(light.groups) == GROUPS
         assert target / 4 < light.sampling_error <= target
@@ -338,17 +340,18 @@ def test_sampling_stops_at_its_target(bench: Bench) -> None:
 # ---- the user's own choices
 
 
-def test_effects_are_switched_by_the_user(bench: Bench, captured: CaptureResult, tmp_path: Path) -> None:
+def test_effects_are_switched_by_the_user(bench: Bench, captured: Capture, tmp_path: Path) -> None:
     """Without diffraction the frames are the geometric ones: 20 % and more away; the plan and the manifest say so."""
-    done = capture(bench, "dots:3", tmp_path / "run", ACCURACY, seed=5, effects={"diffraction": False})
-    assert "diffraction" in captured.plan.settings.effects and "diffraction" not in done.plan.settings.effects
+    done = bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, seed=5, effects={"diffraction": False})
+    assert "diffraction" in captured.plan["settings"]["effects"]
+    assert "diffraction" not in done.plan["settings"]["effects"]
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["configuration"]["effects"] == {"diffraction": False}
     row = next(effect for effect in manifest["plan"]["effects"] if effect["name"] == "diffraction")
-    assert row["state"] == "off" and "by --effects" in row["reason"]
-    assert any("no diffraction" in warning for warning in done.warnings)
+    assert row["state"] == "off" and "by the user" in row["reason"]
+    assert any("largest: diffraction (off)" in warning for warning in done.warnings)
     first, second = (
-        np.stack([read_frame(Path(one.output) / name)[0]["electrons"] for name in FILES]) / one.exposure_s
+        np.stack([read_frame(one.folder / name)[0]["electrons"] for name in FILES]) / one.exposure_s
         for one in (captured, done)
     )
     change = np.linalg.norm(first - second) / np.linalg.norm(first)
@@ -361,12 +364,12 @@ def test_effects_are_switched_by_the_user(bench: Bench, captured: CaptureResult,
     "changed", [{"effects": {"diffraction": False}}, {"effects": {"blur": True}}, {"noise_fraction": 0.5}]
 )
 def test_resume_with_other_effects_is_refused(
-    bench: Bench, captured: CaptureResult, tmp_path: Path, changed: dict[str, object]
+    bench: Bench, captured: Capture, tmp_path: Path, changed: dict[str, object]
 ) -> None:
     folder = copied(captured, tmp_path)
     before = pixels(folder)
     with pytest.raises(MitsimError, match=next(iter(changed))):
-        capture(bench, "dots:3", folder, ACCURACY, seed=5, resume=True, **changed)
+        bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True, **changed)
     assert pixels(folder) == before
 
 
@@ -375,9 +378,9 @@ def test_sampling_stops_at_a_part_of_the_sensors_noise(bench: Bench, tmp_path: P
     paths = {}
     for fraction in (1.0, 0.05):
         folder = tmp_path / str(fraction)
-        done = capture(bench, "dots:3", folder, ACCURACY, noise_fraction=fraction)
+        done = bench.capture("dots:3", folder, accuracy=ACCURACY, noise_fraction=fraction)
         # Stopped by eight of the nine frames, and by an estimate that is good to some percent.
-        assert 0 < done.mc_error < 1.1 * fraction * done.sensor_noise
+        assert 0 < done.manifest.mc_error < 1.1 * fraction * done.manifest.sensor_noise
         manifest = json.loads((folder / "manifest.json").read_text())
         assert manifest["configuration"]["noise_fraction"] == fraction
         paths[fraction] = manifest["paths"]
@@ -386,8 +389,8 @@ def test_sampling_stops_at_a_part_of_the_sensors_noise(bench: Bench, tmp_path: P
 
 @pytest.mark.parametrize("fraction", [0.0, -0.1, 1.5, np.nan])
 def test_noise_fractions_that_make_no_sense(bench: Bench, tmp_path: Path, fraction: float) -> None:
-    with pytest.raises(MitsimError, match="--noise-fraction"):
-        capture(bench, "dots:3", tmp_path / "run", ACCURACY, noise_fraction=fraction)
+    with pytest.raises(MitsimError, match="noise_fraction"):
+        bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, noise_fraction=fraction)
     assert not (tmp_path / "run").exists()
 
 
@@ -399,17 +402,17 @@ def test_what_frames_alone_take_is_looked_at_before_the_plan(
 ) -> None:
     monkeypatch.setattr(run, "make_plan", lambda *_: pytest.fail("work was begun"))
     with pytest.raises(MitsimError, match="dots:3: would take about"):
-        capture(bench, "dots:3", tmp_path / "run", ACCURACY, limits=limits)
+        bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, job=Job(limits=limits))
     assert not list(tmp_path.iterdir())
 
 
 def test_a_resumed_run_needs_room_for_its_missing_frames_only(
-    captured: CaptureResult, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    captured: Capture, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nine frames take 0.3 MB; with all of them there, 0.06 MB are enough."""
     monkeypatch.setattr("mitsim.core.resources.free_disk", lambda _: 6e4)
     with pytest.raises(MitsimError, match="would write about"):
-        capture(bench, "dots:3", tmp_path / "new", ACCURACY, seed=5)
-    folder = Path(shutil.copytree(captured.output, tmp_path / "run"))
-    capture(bench, "dots:3", folder, ACCURACY, seed=5, resume=True)
-    assert pixels(folder) == pixels(Path(captured.output))
+        bench.capture("dots:3", tmp_path / "new", accuracy=ACCURACY, seed=5)
+    folder = Path(shutil.copytree(captured.folder, tmp_path / "run"))
+    bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True)
+    assert pixels(folder) == pixels(captured.folder)

@@ -12,33 +12,36 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.calibrate import Calibrated, CalibrationResult, calibrate
+from mitsim.capture.calibrate import calibrate
 from mitsim.capture.checkpoint import Checkpoint
-from mitsim.capture.evidence import PHYSICAL
+from mitsim.capture.effects import EFFECTS
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
-from mitsim.capture.light import make_plan, uniform_light
+from mitsim.capture.light import make_plan
 from mitsim.capture.plan import Plan
 from mitsim.capture.session import SIDES, Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
 from mitsim.core.job import Job
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import Calibration
+from mitsim.reconstruct.calibration import Estimate
+from mitsim.reconstruct.factors import Factors
 from mitsim.rig.camera import centred_edges
-from mitsim.rig.recipe import load_recipe
+from mitsim.rig.patterns import Lighting
+from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
 CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16), ("separable", "pair", 13)]
-Done = tuple[Bench, CalibrationResult, Calibration]
+Done = tuple[Bench, Factors, Estimate, Path]
+"""The bench, its factors, the estimate that they were made of, and their folder."""
 
 
 def geometric_plan(*arguments: object) -> Plan:
     """Direct light through a geometric mask."""
-    return make_plan(*arguments, forced=dict.fromkeys(PHYSICAL, False))
+    return make_plan(*arguments, switches=dict.fromkeys(EFFECTS, False))
 
 
-def recipe(mode: str, fraction: float = 0.01) -> object:
+def recipe(mode: str, fraction: float = 0.01) -> SessionRecipe:
     return load_recipe().model_copy(update={"exposure_fraction": fraction, "signed_capture": mode})
 
 
@@ -55,8 +58,8 @@ def session(
             folder = tmp_path_factory.mktemp("calibration") / "cal"
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr("mitsim.capture.session.make_plan", geometric_plan)
-                calibrated = calibrate(bench, recipe(mode), seed=2, output=folder)
-            made[key] = bench, calibrated.result, calibrated.factors
+                factors = bench.calibrate(2, recipe=recipe(mode), output=folder)
+            made[key] = bench, factors, factors.estimate, folder
         return made[key]
 
     return run
@@ -79,7 +82,7 @@ def test_factors_are_the_geometric_shadow_within_their_noise(
 
     1008 numbers a side tell a noise to 2 %; the light's fall-off inside a projector pixel adds a per mille.
     """
-    bench, _, calibration = session(mask, mode, n)
+    bench, _, calibration, _ = session(mask, mode, n)
     truth = geometric(bench)
     for factor, predicted in zip((calibration.left, calibration.right), calibration.predicted_error, strict=True):
         scale = (factor * truth).sum(axis=0) / np.square(truth).sum(axis=0)
@@ -91,15 +94,16 @@ def test_factors_are_the_geometric_shadow_within_their_noise(
 
 @pytest.mark.parametrize(("mask", "mode", "n"), CASES)
 def test_the_reported_error_is_the_predicted_one(session: Callable[..., Done], mask: str, mode: str, n: int) -> None:
-    _, result, calibration = session(mask, mode, n)
-    assert result.phi_error == pytest.approx(np.hypot(*calibration.predicted_error), rel=0.3)
-    assert result.noise_free_residual < 2e-3 < result.separability_residual
-    assert result.condition == calibration.condition
+    _, factors, calibration, _ = session(mask, mode, n)
+    result = factors.manifest.result
+    assert result["phi_error"] == pytest.approx(np.hypot(*calibration.predicted_error), rel=0.3)
+    assert result["noise_free_residual"] < 2e-3 < result["separability_residual"]
+    assert result["condition"] == calibration.condition
 
 
 def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
     """left x right reproduces the rate of a uniform frame: E A t eta / (h c / lambda), from the board's radiance."""
-    bench, _, calibration = session("separable", "pair", 16)
+    bench, _, calibration, _ = session("separable", "pair", 16)
     rate = np.outer(calibration.left.sum(axis=1), calibration.right.sum(axis=1))
     radiance = 0.99 * 111000 / 400**2
     tau = (np.arange(N) - 7.5) * 0.3 / N
@@ -114,21 +118,20 @@ def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
 
 
 def test_number_of_frames(session: Callable[..., Done]) -> None:
-    assert session("separable", "pair", 16)[1].frames == 2 * 2 * 16
-    assert session("separable", "uniform", 16)[1].frames == 2 * (16 + 1)
+    assert session("separable", "pair", 16)[1].manifest.result["frames"] == 2 * 2 * 16
+    assert session("separable", "uniform", 16)[1].manifest.result["frames"] == 2 * (16 + 1)
     # 13 is no Hadamard order: the patterns are those of 16.
-    assert session("separable", "pair", 13)[1].frames == 2 * 2 * 16
+    assert session("separable", "pair", 13)[1].manifest.result["frames"] == 2 * 2 * 16
 
 
 def test_the_folder(session: Callable[..., Done]) -> None:
-    bench, result, calibration = session("separable", "pair", 16)
-    folder = Path(result.output)
+    bench, factors, calibration, folder = session("separable", "pair", 16)
     assert sorted(path.name for path in folder.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["kind"] == "calibration" and manifest["centre"] is False
     assert manifest["camera"] == json.loads(json.dumps(bench.identity()))
-    assert manifest["estimate"] == calibration.status and manifest["warnings"] == list(result.warnings)
-    assert not any("full well" in warning for warning in result.warnings)
+    assert manifest["estimate"] == str(calibration.status) and manifest["warnings"] == list(factors.warnings)
+    assert not any("full well" in warning for warning in factors.warnings)
     for name, factor in (("left", calibration.left), ("right", calibration.right)):
         channels, metadata = read_frame(folder / f"{name}.exr")
         assert np.array_equal(channels["factor"], factor.astype(np.float32))
@@ -137,31 +140,31 @@ def test_the_folder(session: Callable[..., Done]) -> None:
 
 
 def test_flatcam_is_centred(session: Callable[..., Done]) -> None:
-    _, result, calibration = session("flatcam", "pair", 16)
-    assert json.loads((Path(result.output) / "manifest.json").read_text())["centre"] is True
+    _, _, calibration, folder = session("flatcam", "pair", 16)
+    assert json.loads((folder / "manifest.json").read_text())["centre"] is True
     for factor in (calibration.left, calibration.right):
         assert np.abs(factor.sum(axis=0)).max() < 1e-9 * np.abs(factor).sum()
 
 
 def test_seeds(shared_scene: Callable[..., Path]) -> None:
     bench = open_bench(shared_scene("separable16", n=16))
-    one, again, other = (calibrate(bench, recipe("uniform"), 2e-2, seed).factors.left for seed in (1, 1, 2))
+    one, again, other = (bench.calibrate(seed, 2e-2, recipe("uniform")).left for seed in (1, 1, 2))
     assert np.array_equal(one, again) and not np.allclose(one, other, rtol=1e-6)
 
 
 def test_a_used_folder_is_refused_before_any_work(
     session: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench, result, _ = session("separable", "pair", 16)
+    bench, *_, folder = session("separable", "pair", 16)
     monkeypatch.setattr("mitsim.capture.session.make_plan", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match="holds files already"):
-        calibrate(bench, output=result.output)
+        bench.calibrate(output=folder)
 
 
 def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[..., Path]) -> None:
     """Diffraction hardly changes a uniform frame, but single lines, and so the +-1 responses, by a tenth."""
     board = open_bench(shared_scene("separable16", n=16)).with_board(0.99)
-    uniform = make_plan(board, *uniform_light(16), 2e-2, 0)
+    uniform = make_plan(board, Lighting.uniform(16), 2e-2, 0)
     assert "diffraction" not in uniform.settings.effects
     assert "diffraction" in Session(board, recipe("pair")).plan(2e-2, Job()).settings.effects
 
@@ -198,12 +201,14 @@ def kill_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return arm
 
 
-def assert_equal(ours: Calibrated, theirs: Calibrated) -> None:
-    """The same factors bit for bit, the same report but for seconds and place."""
-    for name in ("left", "right", "predicted_error", "unexplained", "noise", "status"):
-        assert np.array_equal(getattr(ours.factors, name), getattr(theirs.factors, name)), name
-    for name in vars(ours.result).keys() - {"seconds", "output"}:
-        assert getattr(ours.result, name) == getattr(theirs.result, name), name
+def assert_equal(ours: Factors, theirs: Factors) -> None:
+    """The same factors bit for bit, the same report but for seconds."""
+    for name in ("left", "right"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    for name in ("predicted_error", "unexplained", "noise", "status"):
+        assert getattr(ours.estimate, name) == getattr(theirs.estimate, name), name
+    for name in ours.manifest.result.keys() - {"seconds"}:
+        assert ours.manifest.result[name] == theirs.manifest.result[name], name
 
 
 @pytest.mark.usefixtures("geometric_sessions")
@@ -217,7 +222,7 @@ def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
 ) -> None:
     """Each of the nine processes but the last gets one checkpoint further; nothing that is kept is computed again."""
     bench = open_bench(shared_scene("resumed16", n=16))
-    whole = calibrate(bench, recipe(mode), seed=3)
+    whole = calibrate(bench, recipe=recipe(mode), seed=3)
     exposures: list[object] = []
     digital = Exposer.digital
 
@@ -230,21 +235,21 @@ def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
     for life in range(9):
         kill_after(1)
         with pytest.raises(Killed):
-            calibrate(bench, recipe(mode), seed=3, output=calibration, resume=True)
+            calibrate(bench, recipe=recipe(mode), seed=3, output=calibration, resume=True)
         assert json.loads((calibration / "manifest.json").read_text())["status"] == "incomplete"
         monkeypatch.setattr(Session, "trace", lambda *_: pytest.fail("light is traced again"))
         assert [path.name for path in sorted(calibration.glob("*.npz"))] == [
             name for name, since in zip(PARTS, (0, 5, 1), strict=True) if life >= since
         ]
     kill_after(0)  # nothing is left to be saved
-    resumed = calibrate(bench, recipe(mode), seed=3, output=calibration, resume=True)
+    resumed = calibrate(bench, recipe=recipe(mode), seed=3, output=calibration, resume=True)
     assert_equal(resumed, whole)
     assert sorted(path.name for path in calibration.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
     # Shots that were exposed with those of a checkpoint are exposed again, at most one chunk of each side a life.
     assert set(exposures) == {
-        ("calibration", side, index) for side in SIDES for index in range(whole.result.frames // 2)
+        ("calibration", side, index) for side in SIDES for index in range(whole.manifest.result["frames"] // 2)
     }
-    assert len(exposures) < whole.result.frames + 5 * FRAMES_AT_ONCE
+    assert len(exposures) < whole.manifest.result["frames"] + 5 * FRAMES_AT_ONCE
 
 
 @pytest.mark.usefixtures("geometric_sessions")
@@ -259,10 +264,10 @@ def test_damaged_and_foreign_parts_are_computed_again(
     for name, seed in (("ours", 3), ("theirs", 4)):
         kill_after(7)
         with pytest.raises(Killed):
-            calibrate(bench, recipe("pair"), seed=seed, output=tmp_path / name)
+            calibrate(bench, recipe=recipe("pair"), seed=seed, output=tmp_path / name)
     monkeypatch.undo()
     monkeypatch.setattr("mitsim.capture.session.make_plan", geometric_plan)
-    whole = calibrate(bench, recipe("pair"), seed=3)
+    whole = calibrate(bench, recipe=recipe("pair"), seed=3)
 
     def flipped(spot: float) -> Callable[[bytes], bytes]:
         def flip(data: bytes) -> bytes:
@@ -277,7 +282,7 @@ def test_damaged_and_foreign_parts_are_computed_again(
         part = folder / PARTS[index % len(PARTS)]
         source = part if damage else tmp_path / "theirs" / part.name
         part.write_bytes((damage or bytes)(source.read_bytes()))
-        assert_equal(calibrate(bench, recipe("pair"), seed=3, output=folder, resume=True), whole)
+        assert_equal(calibrate(bench, recipe=recipe("pair"), seed=3, output=folder, resume=True), whole)
 
 
 @pytest.mark.usefixtures("geometric_sessions")
@@ -287,7 +292,7 @@ def test_only_the_same_session_is_resumed(
     bench = open_bench(shared_scene("other16", n=16))
     kill_after(1)
     with pytest.raises(Killed):
-        calibrate(bench, recipe("pair"), output=tmp_path / "cal")
+        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal")
     for change, words in (
         ({"seed": 5}, "seed differ"),
         ({"accuracy": 1e-2, "recipe": recipe("uniform")}, "accuracy, recipe differ"),
@@ -295,17 +300,17 @@ def test_only_the_same_session_is_resumed(
         with pytest.raises(MitsimError, match=rf"resume: .*cal holds a session of another configuration \({words}\)"):
             calibrate(bench, **{"recipe": recipe("pair"), "output": tmp_path / "cal", "resume": True, **change})
     with pytest.raises(MitsimError, match="holds files already"):
-        calibrate(bench, recipe("pair"), output=tmp_path / "cal")
+        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal")
     (tmp_path / "cal" / "manifest.json").write_text('{"kind": "capture"}')
     with pytest.raises(MitsimError, match=r"resume: .* is not that of a calibration"):
-        calibrate(bench, recipe("pair"), output=tmp_path / "cal", resume=True)
+        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal", resume=True)
 
 
 @pytest.mark.usefixtures("geometric_sessions")
 def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
     bench = open_bench(shared_scene("memory16", n=16))
-    calibrate(bench, recipe("pair"), output=tmp_path / "streamed")
-    calibrate(bench, recipe("pair")).save(tmp_path / "saved")
+    calibrate(bench, recipe=recipe("pair"), output=tmp_path / "streamed")
+    calibrate(bench, recipe=recipe("pair")).save(tmp_path / "saved")
     manifests = []
     for name in ("streamed", "saved"):
         manifest = json.loads((tmp_path / name / "manifest.json").read_text())
@@ -313,13 +318,13 @@ def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path]
         manifests.append(manifest)
     assert manifests[0] == manifests[1]
     with pytest.raises(MitsimError, match="holds files already"):
-        calibrate(bench, recipe("pair")).save(tmp_path / "saved")
+        calibrate(bench, recipe=recipe("pair")).save(tmp_path / "saved")
 
 
 def test_describing_a_session_traces_nothing(
     shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("make_plan", "collect"):
+    for name in ("make_plan", "trace_light"):
         monkeypatch.setattr(f"mitsim.capture.session.{name}", lambda *_: pytest.fail("work was done"))
     session = Session(open_bench(shared_scene("separable16", n=16)), recipe("pair"))
     assert session.shots == 64 and session.signs.shape == (16, 16)
