@@ -9,7 +9,7 @@ _LONGEST = 1500
 class MitsimError(Exception):
     """A request that cannot be served; the command line prints it on one line and exits with status 2.
 
-    The message is one line: what is wrong, where, the value received, what is allowed, and what to do. Whatever a
+    The ``message`` is one line: what is wrong, where, the value received, what is allowed, and what to do. Whatever a
     hostile file brought into it, it is printable and not long.
     """
 
@@ -20,7 +20,7 @@ class MitsimError(Exception):
 class ArgumentError(MitsimError):
     """A value that one argument cannot have; ``argument`` names it.
 
-    The message begins with the argument, as Python spells it; the command line writes it as its option.
+    The ``message`` begins with the argument, as Python spells it; the command line writes it as its option.
     """
 
     def __init__(self, argument: str, message: str) -> None:
@@ -29,6 +29,6 @@ class ArgumentError(MitsimError):
 
 
 def cut(text: str, length: int = 60) -> str:
-    """One printable line of at most ``length`` characters."""
+    """One printable line of ``text``, of at most ``length`` characters."""
     shown = "".join(letter if letter.isprintable() else " " for letter in text[: length + 1])
     return shown if len(text) <= length else shown[: length - 3] + "..."

@@ -279,7 +279,15 @@ class RunMemory:
         return False
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Keep shot number ``index``: its ``channels`` (rows, columns) and ``metadata``."""
+        """Keep one shot.
+
+        Parameters
+        ----------
+        index
+            its number.
+        channels, metadata
+            of its file, (rows, columns) each.
+        """
         self._files[frame_name(index)] = channels, metadata
 
     def write_truth(self, reflectance: FloatArray, board: float) -> None:
@@ -299,7 +307,15 @@ class RunFolder:
     """
 
     def __init__(self, path: Path, head: RunHead, known: Mapping[str, str]) -> None:
-        """A run at ``path`` of the configuration in ``head``; ``known`` are checksums of an earlier, finished one."""
+        """A run in its folder.
+
+        Parameters
+        ----------
+        path, head
+            of the folder, and the configuration.
+        known
+            checksums of an earlier, finished run, by file name.
+        """
         self.path, self.head = path, head
         self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
 
@@ -323,7 +339,15 @@ class RunFolder:
         return same
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Write shot number ``index``, its ``channels`` (rows, columns) and ``metadata``, whole or not at all."""
+        """Write one shot, whole or not at all.
+
+        Parameters
+        ----------
+        index
+            its number.
+        channels, metadata
+            of its file, (rows, columns) each.
+        """
         self.write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
 
     def write_truth(self, reflectance: FloatArray, board: float) -> None:
@@ -331,7 +355,15 @@ class RunFolder:
         self.write(TRUTH, *_truth(reflectance, board))
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Write the file ``name`` of the run: its ``channels`` (rows, columns) and ``metadata``."""
+        """Write a file of the run.
+
+        Parameters
+        ----------
+        name
+            of the file.
+        channels, metadata
+            of it, (rows, columns) each.
+        """
         write_frame(self.path / name, channels, metadata)
         self._note(name, checksum(self.path / name))
 

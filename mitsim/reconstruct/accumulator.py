@@ -19,6 +19,13 @@ class Accumulator:
     """Sum over frames of what the solver needs: W, the frames' energy, and which frames came.
 
     Made by :meth:`mitsim.reconstruct.solver.Prepared.accumulator`; belongs to the factors that made it.
+
+    Parameters
+    ----------
+    left, right
+        the factorised model.
+    centre
+        whether row and column means are taken out of each frame.
     """
 
     def __init__(self, left: Side, right: Side, centre: bool) -> None:
@@ -45,16 +52,24 @@ class Accumulator:
         return [(int(i), int(j)) for i, j in np.argwhere(~self._seen)]
 
     def belongs_to(self, left: Side, right: Side) -> bool:
-        """Whether these are the factors the frames were projected on."""
+        """Whether ``left`` and ``right`` are the factors the frames were projected on."""
         return self._left is left and self._right is right
 
     def add(self, frame: npt.ArrayLike, row: int, column: int) -> None:
-        """Add the frame (m, m') taken under pattern P_L[:, row] P_R[:, column]^T.
+        """Add one frame; sums are float64.
 
-        Any real dtype is taken; sums are float64. For a signed pattern the frame is the difference of its
-        two captures. MitsimError for another shape, a value that is not finite, numbers whose squares leave
-        double precision, a pattern index out of range, or a pattern added twice (average repeated captures
-        first).
+        Parameters
+        ----------
+        frame
+            (m, m') of any real dtype; for a signed pattern the difference of its two shots.
+        row, column
+            of its pattern P_L[:, row] P_R[:, column]^T.
+
+        Raises
+        ------
+        MitsimError
+            for another shape, a value that is not finite, numbers whose squares leave double precision, a pattern
+            index out of range, or a pattern added twice (average repeated shots first).
         """
         self._check_index(row, column)
         values = self._checked(frame, row, column)
@@ -92,12 +107,12 @@ class Accumulator:
 
 
 def centred_columns(matrix: FloatArray) -> FloatArray:
-    """C matrix: the mean of each column taken out."""
+    """C ``matrix``: the mean of each column taken out."""
     return np.asarray(matrix - matrix.mean(axis=0, keepdims=True))
 
 
 def centred(frame: FloatArray) -> FloatArray:
-    """C Y C with C = I - 1 1^T / m: row and column means taken out, as FlatCam's constant term demands."""
+    """C Y C of a ``frame`` Y, C = I - 1 1^T / m: row and column means out, as FlatCam's constant term demands."""
     return centred_columns(frame - frame.mean(axis=1, keepdims=True))
 
 

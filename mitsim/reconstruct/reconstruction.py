@@ -173,9 +173,14 @@ def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator
 
 
 def inputs(shots: Capture, factors: Factors, lam: float | Literal["auto"], method: str) -> dict[str, str | float]:
-    """What decides an image: fingerprints of ``shots`` and ``factors``, ``lam`` and ``method`` as asked for.
+    """What decides an image.
 
-    MitsimError for an unknown method.
+    Parameters
+    ----------
+    shots, factors
+        told by their fingerprints.
+    lam, method
+        as asked for; MitsimError for an unknown method.
     """
     if method not in METHODS:
         raise MitsimError(f"method {method!r}: use {' or '.join(METHODS)}")

@@ -117,7 +117,7 @@ def pattern_blocks(patterns: FloatArray) -> tuple[IndexArray, ...]:
 
 
 def group_pixels(patterns: FloatArray, structure: Structure) -> tuple[Group, ...]:
-    """What of the factorisation depends on the patterns (n, K) alone; ``full`` makes one group of general rank."""
+    """What of the factorisation depends on ``patterns`` (n, K) alone; ``structure`` full makes one group."""
     if structure == "full":
         return (Group(np.arange(len(patterns)), patterns, None),)
     return tuple(Group(block, patterns[block], _rank_one(patterns[block])) for block in pattern_blocks(patterns))
@@ -131,7 +131,19 @@ def factorise(
     structure: Structure,
     centred: bool,
 ) -> Side:
-    """Factorise one side; ``phi`` (m, n) and ``patterns`` (n, K) are checked, ``groups`` are those of the patterns."""
+    """Factorise one side.
+
+    Parameters
+    ----------
+    phi, patterns
+        (m, n) and (n, K), checked.
+    groups
+        of the patterns.
+    method, structure
+        as for :func:`mitsim.reconstruct.solver.prepare`.
+    centred
+        whether frames lose row and column means.
+    """
     sensor, scene = phi.shape
     build = _projected if method == "svd" else _gram
     basis, singular, slabs = build(phi, patterns, groups, structure)
@@ -255,7 +267,7 @@ def _frozen(array: FloatArray) -> FloatArray:
 
 
 def check_choices(method: str, structure: str) -> None:
-    """MitsimError unless both names are known."""
+    """MitsimError unless ``method`` and ``structure`` are known."""
     if method not in get_args(Method):
         raise MitsimError(f"solver method is {method!r}; use one of {', '.join(get_args(Method))}")
     if structure not in get_args(Structure):

@@ -63,7 +63,19 @@ class CameraTracer(Tracer):
         paths: Paths,
         geometry: CameraGeometry | None = None,
     ) -> None:
-        """Paths start in the cells of ``grid``, one each; ``geometry`` stands in for the camera's own."""
+        """What is followed.
+
+        Parameters
+        ----------
+        scene, camera, projector
+            as loaded.
+        grid
+            cells that paths start in, one each.
+        paths
+            which of them are followed.
+        geometry
+            stands in for the camera's own.
+        """
         self.geometry: CameraGeometry = geometry or camera.geometry
         self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
         self.connector = ProjectorConnector(projector)

@@ -42,7 +42,7 @@ class LensHit:
 
 
 class ProjectorConnector:
-    """Connections to one projector; prepared once."""
+    """Connections to one ``projector``; prepared once."""
 
     def __init__(self, projector: Projector) -> None:
         self.projector, self.emitter = projector, projector.emitter

@@ -36,10 +36,20 @@ class DirectTracer(Tracer):
         spread: bool = False,
         pixels: IntArray | None = None,
     ) -> None:
-        """``anchors``: sensor points a side that light is connected to; ``geometry`` stands in for the camera's own.
+        """What is followed.
 
-        ``spread`` connects to random points of the sensor, all filed as one anchor: the mean over the sensor.
-        ``pixels`` (m,) are those of the projector that are traced, all of them without it.
+        Parameters
+        ----------
+        scene, camera, projector
+            as loaded.
+        anchors
+            sensor points a side that light is connected to.
+        geometry
+            stands in for the camera's own.
+        spread
+            connect to random points of the sensor instead, all filed as one anchor: the mean over the sensor.
+        pixels
+            (m,) of the projector that are traced; None: all.
         """
         self._pixels = np.arange(projector.n**2) if pixels is None else pixels
         self.scene, self.projector, self.anchors, self.spread = scene, projector, anchors, spread

@@ -109,7 +109,7 @@ class GratingModel(BaseModel):
 
     @classmethod
     def checked(cls, **values: object) -> GratingModel:
-        """Build from loose values; a bad one raises MitsimError with one line."""
+        """Build from loose ``values``; a bad one raises MitsimError with one line."""
         model = validated(cls, values, PLUGIN)
         total = sum(model.orders.values()) + model.diffuse
         if total > 1 + _ROUNDING:

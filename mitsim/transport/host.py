@@ -21,10 +21,10 @@ def per_lane(values: mi.Float, count: int) -> npt.NDArray[Any]:
 
 
 def vectors(values: mi.Vector3f, count: int) -> FloatArray:
-    """(count, 3) of a Dr.Jit vector ``values``."""
+    """(``count``, 3) of a Dr.Jit vector ``values``."""
     return np.stack([per_lane(part, count) for part in (values.x, values.y, values.z)], axis=1)
 
 
 def channels(spectrum: mi.UnpolarizedSpectrum, count: int) -> FloatArray:
-    """(count, channels) of a ``spectrum``."""
+    """(``count``, channels) of a ``spectrum``."""
     return np.stack([per_lane(spectrum[i], count) for i in range(len(spectrum))], axis=1)

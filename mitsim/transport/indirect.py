@@ -36,9 +36,16 @@ class IndirectTracer(Tracer):
         interreflection: bool,
         geometry: CameraGeometry | None = None,
     ) -> None:
-        """``mirrors``: paths over delta reflections and transmissions; ``interreflection``: over other surfaces.
+        """What is followed.
 
-        ``geometry`` stands in for the camera's own.
+        Parameters
+        ----------
+        scene, camera, projector
+            as loaded.
+        mirrors, interreflection
+            paths over delta reflections and transmissions, and over other surfaces.
+        geometry
+            stands in for the camera's own.
         """
         self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)

@@ -100,7 +100,15 @@ class MirrorTracer:
     """
 
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: Projector, max_depth: int) -> None:
-        """``max_depth``: surfaces that a ray may meet between ``projector`` and ``camera``."""
+        """What is followed.
+
+        Parameters
+        ----------
+        scene, camera, projector
+            as loaded.
+        max_depth
+            surfaces that a ray may meet between the two.
+        """
         self._scene, self._max_depth = scene, max_depth
         self._wavelengths = wavelength_sets()
         self.rays = PinholeRays(projector, self._wavelengths)

@@ -111,7 +111,15 @@ class Walk(ABC):
     rng: mi.PCG32
 
     def __init__(self, scene: mi.Scene, mirrors: bool, interreflection: bool) -> None:
-        """``mirrors``: paths over delta reflections and transmissions; ``interreflection``: over other surfaces."""
+        """Paths before their first surface.
+
+        Parameters
+        ----------
+        scene
+            as loaded.
+        mirrors, interreflection
+            paths over delta reflections and transmissions, and over other surfaces.
+        """
         self.scene, self.mirrors, self.interreflection = scene, mirrors, interreflection
         self.kept = {kind: Sightings.none() for kind in _KINDS}
 

@@ -42,7 +42,15 @@ class Reception:
 
 
 class Receiver:
-    """Prepared once for a scene and a camera; ``geometry`` stands in for the camera's own."""
+    """Prepared once for a scene and a camera.
+
+    Parameters
+    ----------
+    scene, camera
+        as loaded.
+    geometry
+        stands in for the camera's own.
+    """
 
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, geometry: CameraGeometry | None = None) -> None:
         self.scene, self.camera = scene, camera

@@ -128,7 +128,7 @@ class CanvasMap:
 
 
 class ProjectorRays:
-    """Rays of a projector, with its lens and its blur, a lane each.
+    """Rays of a ``projector``, with its lens and its blur, a lane each.
 
     Prepared once; numbers are opaque, so one compiled kernel serves all projectors of a kind.
     """
@@ -211,7 +211,7 @@ class PinholeRays:
     """
 
     def __init__(self, projector: Projector, wavelengths: Sequence[mi.Color0f | None]) -> None:
-        """``wavelengths``: sets at which spectra are taken, from :func:`wavelength_sets`."""
+        """Of a ``projector``; ``wavelengths`` are sets at which spectra are taken, from :func:`wavelength_sets`."""
         self._projector, n = projector, projector.n
         self._map = CanvasMap.of(projector.emitter)
         self.origin = self._map.origin
