@@ -73,9 +73,9 @@ def test_a_scene_with_a_bad_parameter(
     ("old", "new", "fragments"),
     [
         ('"fov" value="33.398488"', '"fov" value="nan"', ["fov: got nan", "finite"]),
-        ('<translate x="60"/>', '<translate x="inf"/>', ["translate: got inf", "finite"]),
-        ('<scale x="64" y="64"/>', '<scale x="nan" y="64"/>', ["scale: got nan"]),
-        ('value="1 0 0 0 0 1', 'value="1 0 0 nan 0 1', ["matrix", "got nan"]),
+        ('<translate x="60"/>', '<translate x="inf"/>', ["to_world: got nan", "finite"]),
+        ('<scale x="64" y="64"/>', '<scale x="nan" y="64"/>', ["to_world: got nan"]),
+        ('value="1 0 0 0 0 1', 'value="1 0 0 nan 0 1', ["to_world: got nan", "got nan"]),
         ('"scale" value="111000"', '"scale" value="-1"', ["scale: got -1", "at least 0"]),
         ('value="$albedo"', 'value="nan"', ["reflectance: got nan"]),
         ('value="$albedo"', 'value="400:0.5, 700:-0.5"', ["reflectance: got -0.5", "at least 0"]),

@@ -104,8 +104,10 @@ TABLES = ("value", "values", "color", "color0", "color1", "scale")
 def check_transform(tag: Tag, name: str, matrix: npt.NDArray[np.float64], rigid: bool) -> None:
     """MitsimError at ``tag`` when the (4, 4) ``matrix`` cannot be undone, or when ``rigid`` and it does more than turn
     and move."""
-    turn, finite = matrix[:3, :3], bool(np.isfinite(matrix).all())
-    sizes = np.linalg.svd(turn, compute_uv=False) if finite else np.full(3, np.nan)
+    if not np.isfinite(matrix).all():
+        raise tag.refusal(name, np.nan, "give finite numbers")
+    turn = matrix[:3, :3]
+    sizes = np.linalg.svd(turn, compute_uv=False)
     even = sizes[2] > _SMALLEST_SIZE and sizes[0] < FARTHEST and sizes[0] < _MOST_UNEVEN * sizes[2]
     if not (even and np.abs(matrix).max() <= FARTHEST):
         got = f"stretching by {sizes[2]:g} to {sizes[0]:g}, moving by {np.abs(matrix[:3, 3]).max():g}"
