@@ -252,7 +252,9 @@ def trace_light(
         if error <= target or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=error <= target)
         rate = _FOLLOWED_RATE if simulation.indirect or simulation.from_camera else _DIRECT_RATE
-        rounds *= min(max(1.05 * (error / target) ** rate, 1.1), _LARGEST_GROWTH)
+        # Capped before the power as well: a target that was set very low would overflow it.
+        growth = min(error / target, _LARGEST_GROWTH) ** rate
+        rounds *= min(max(1.05 * growth, 1.1), _LARGEST_GROWTH)
 
 
 class _Group:

@@ -12,6 +12,7 @@ from mitsim.capture.effects import check_switches, parse_switches
 from mitsim.capture.plan import check_accuracy
 from mitsim.core.configuration import validated
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 from mitsim.sensor.chain import exposure_for_peak
 
 if TYPE_CHECKING:
@@ -19,10 +20,6 @@ if TYPE_CHECKING:
 
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
-
-
-_LONGEST_S = 1e6
-"""Twelve days: no dark current allows more."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +30,13 @@ class Exposure:
     fraction: float = 0.8
 
     def __post_init__(self) -> None:
-        if self.seconds is not None and not 0 < self.seconds <= _LONGEST_S:
-            raise ArgumentError("exposure", f"{self.seconds:g}: give seconds above 0, up to {_LONGEST_S:g}, or auto")
-        if not 0 < self.fraction <= 1:
+        shortest, longest = EXPOSURE_S
+        if self.seconds is not None and not shortest <= self.seconds <= longest:
+            raise ArgumentError("exposure", f"{self.seconds:g}: give {shortest:g} to {longest:g} seconds, or auto")
+        least, most = EXPOSURE_FRACTION
+        if not least <= self.fraction <= most:
             raise ArgumentError(
-                "exposure_fraction", f"{self.fraction:g}: give a part of the full well above 0, up to 1"
+                "exposure_fraction", f"{self.fraction:g}: give a part of the full well, {least:g} to {most:g}"
             )
 
     def check(self, bench: Bench) -> None:

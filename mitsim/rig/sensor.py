@@ -8,10 +8,13 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from mitsim.core.configuration import load_model
 
-ExposureSeconds = Annotated[float, Field(strict=True, ge=1e-12, le=1e6, allow_inf_nan=False)]
-"""One exposure [s]. Gated avalanche diodes open for 1e-10 s; charge on a cooled CCD is collected for some 1e4 s."""
-ExposureFraction = Annotated[float, Field(strict=True, ge=1e-6, le=1, allow_inf_nan=False)]
-"""Mean of the brightest pixel as a part of the full well. A millionth is less than an electron of most wells."""
+EXPOSURE_S = 1e-12, 1e6
+"""Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""
+EXPOSURE_FRACTION = 1e-6, 1.0
+"""Mean of the brightest pixel as a part of the full well; a millionth is less than an electron of most wells."""
+ExposureFraction = Annotated[
+    float, Field(strict=True, ge=EXPOSURE_FRACTION[0], le=EXPOSURE_FRACTION[1], allow_inf_nan=False)
+]
 _LARGEST_CODE = 2**32 - 1
 """What a frame's uint32 holds."""
 
