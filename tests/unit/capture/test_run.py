@@ -317,7 +317,9 @@ def test_saturation_is_flagged(bench: Bench, tmp_path: Path) -> None:
     assert any("full well" in warning for warning in done.warnings)
 
 
-@pytest.mark.parametrize("settings", [{"seconds": 0.0}, {"seconds": np.inf}, {"fraction": 0.0}, {"fraction": 1.1}])
+@pytest.mark.parametrize(
+    "settings", [{"seconds": s} for s in (0.0, 1e-13, 1e7, np.inf)] + [{"fraction": f} for f in (0.0, 1e-7, 1.1)]
+)
 def test_exposures_that_make_no_sense(settings: dict[str, float]) -> None:
     with pytest.raises(MitsimError, match="exposure"):
         Exposure(**settings)

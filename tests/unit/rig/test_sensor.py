@@ -2,11 +2,11 @@ import math
 from pathlib import Path
 
 import pytest
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.rig.sensor import ExposureSeconds, SensorModel, load_sensor, paper_sensor
+from mitsim.rig.sensor import SensorModel, load_sensor, paper_sensor
 
 BASE = {
     "name": "test",
@@ -69,16 +69,6 @@ def test_a_value_out_of_range_is_refused(field: str, value: object) -> None:
 
 def test_whole_numbers_are_numbers() -> None:
     assert SensorModel(**{**BASE, "full_well_e": 1000, "read_noise_e": 3}) == SensorModel(**BASE)
-
-
-@pytest.mark.parametrize(("seconds", "allowed"), [(1e-9, True), (3600, True), (0, False), (1e7, False), (True, False)])
-def test_exposures_last_as_long_as_cameras_can(seconds: float, allowed: bool) -> None:
-    exposure = TypeAdapter(ExposureSeconds)
-    if allowed:
-        assert exposure.validate_python(seconds) == seconds
-        return
-    with pytest.raises(ValidationError):
-        exposure.validate_python(seconds)
 
 
 def test_a_black_level_at_the_ceiling_is_refused() -> None:
