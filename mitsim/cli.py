@@ -146,7 +146,7 @@ def demo(
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
     from mitsim.study.demo import demo as run_demo
 
-    request = _request(patterns=patterns, accuracy=accuracy, seed=seed)
+    request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
     with _job(quiet or as_json) as job:
         bench = _open(scene, variant, camera, projector, define, outside)
         result = run_demo(bench, output, request, job)
@@ -348,7 +348,7 @@ def study(
     from mitsim.study import find_study
 
     run_study = find_study(name)
-    request = _request(patterns=patterns, seed=seed)
+    request = mitsim.Request.of(patterns=patterns, seed=seed)
     with _job(quiet or as_json) as job:
         bench = _open(scene, variant, camera, projector, define, outside)
         result = run_study(bench, output, request, job)

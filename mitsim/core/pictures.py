@@ -15,18 +15,44 @@ _LARGEST_INLINE = 256
 
 
 def png(values: npt.ArrayLike, largest: int | None = None) -> bytes:
-    """A grey PNG of reflectances ``values`` (rows, columns): cut to 0..1, with the sRGB curve's approximate 1/2.2.
+    """A grey PNG of reflectances ``values`` (rows, columns), shown as :func:`lightness`; ``largest`` as for
+    :func:`grey_png`."""
+    return grey_png(lightness(values), largest)
 
-    ``largest`` is the number of pixels a side beyond which every second (third, ...) one is shown.
+
+def lightness(reflectance: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """``reflectance`` cut to 0..1 and encoded for a screen by the sRGB curve (IEC 61966-2-1)."""
+    linear = np.clip(np.asarray(reflectance, dtype=np.float64), 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
+    """A grey PNG of ``values`` as they are.
+
+    Parameters
+    ----------
+    values
+        (rows, columns), 0 black, 1 white.
+    largest
+        pixels a side beyond which every second (third, ...) value is shown.
+    smallest
+        pixels a side that there are at least: each value then takes a square of them.
     """
     # Imported here: matplotlib takes a third of a second, and most work shows nothing.
     from matplotlib import image
 
     shown = np.asarray(values, dtype=np.float64)
     step = -(-max(shown.shape) // largest) if largest else 1
+    shown = shown[::step, ::step]
+    copies = -(-smallest // max(shown.shape))
     buffer = io.BytesIO()
-    image.imsave(buffer, np.clip(shown[::step, ::step], 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1, format="png")
+    image.imsave(buffer, np.kron(shown, np.ones((copies, copies))), cmap="gray", vmin=0, vmax=1, format="png")
     return buffer.getvalue()
+
+
+def data_uri(picture: bytes) -> str:
+    """A PNG ``picture`` as the address that holds it, for a page that refers to nothing outside itself."""
+    return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
 
 
 def scaled(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -39,12 +65,12 @@ def scaled(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]) -> str:
     """HTML of an object in a notebook: its ``title``, reflectances or scaled ``pictures`` by caption, lines of
     ``facts``."""
-    encoded = {caption: base64.b64encode(png(values, _LARGEST_INLINE)).decode() for caption, values in pictures.items()}
+    sources = {caption: data_uri(png(values, _LARGEST_INLINE)) for caption, values in pictures.items()}
     figures = "".join(
         '<figure style="display:inline-block;margin:0 8px 4px 0">'
-        f'<img style="height:144px" src="data:image/png;base64,{data}">'
+        f'<img style="height:144px" src="{source}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-        for caption, data in encoded.items()
+        for caption, source in sources.items()
     )
     lines = "".join(f"<div>{html.escape(fact)}</div>" for fact in facts)
     return f"<div><b>{html.escape(title)}</b></div>{figures}{lines}"

@@ -4,10 +4,10 @@ Rows vary one knob at a time from the plan at QUOTED, and whole plans. Every row
 answer of its own seed with every effect of the scene, more anchors, layers, cells and samples than the finest plan. Its
 Monte Carlo error and the discretisation that it is predicted to leave are stated; below them no error means anything.
 
-The reference is measured on one frame of the family, and its time counted for all. It has a geometric mask and a
-perfect black, so its judge is the same light formed that way; it is unbiased, so its error falls with 1/sqrt(samples),
-by which it is extrapolated. Seconds are transport and optics for all frames, kernels compiled beforehand. Accuracies
-that the plan predicts to take longer than PATIENCE are left out and named.
+The reference is measured on one frame of the family, and its time counted for all. It lacks some effects, so its judge
+is light without them; it is unbiased, so its error falls with 1/sqrt(samples), by which it is extrapolated. Seconds are
+transport and optics for all frames, kernels compiled beforehand. Accuracies that the plan predicts to take longer than
+PATIENCE are left out and named.
 """
 
 from __future__ import annotations
@@ -15,52 +15,66 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.effects import EFFECTS, Physics, names, present
 from mitsim.capture.evidence import Evidence, Settings
-from mitsim.capture.light import Light, collect
+from mitsim.capture.exposer import NoiseTarget
+from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.plan import Plan, SceneFacts, decide
-from mitsim.capture.render import projected, reference
-from mitsim.capture.request import Exposure
-from mitsim.capture.run import NoiseTarget
-from mitsim.capture.simulation import Simulation
-from mitsim.core.arrays import FloatArray, Progress, silent
+from mitsim.capture.render import projected
+from mitsim.capture.request import Exposure, Request
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifest import write_json
-from mitsim.core.output import output_folder, whole_file
-from mitsim.core.versions import versions
+from mitsim.core.job import Job
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.rig.patterns import PatternFamily
+from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.study import plots
-from mitsim.study.knobs import Variant, at_once, sampled, variants, without
+from mitsim.study.knobs import Trial, at_once, reformed, sampled, trials, without
 from mitsim.study.metrics import relative_error
-from mitsim.study.solver_cost import SolverRow, solver_costs
+from mitsim.study.solver_cost import SolverRow, time_solver
 
 ACCURACIES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
-SAMPLES = (16, 64, 256)
+"""Two steps a decade, from a first look to below the sensor's noise."""
 QUOTED = 1e-3
+"""The default accuracy."""
 PATIENCE = 10.0
+"""Seconds of one row: the whole study then takes a minute or two."""
+_SAMPLES = (16, 64, 256)
+"""Samples a pixel of the reference, each half the error of the one before."""
 _JUDGE_MARGIN = 3.0
+"""The judge's noise is a third of the finest plan's, which then shows to a twentieth of its own."""
 _EFFECT_SAMPLES = 8
-_NOT_IN_REFERENCE = frozenset({"diffraction", "black-level", "mask-thickness"})
+"""The same paths with and without an effect: few tell their difference."""
 _SERIES = {
     "accuracy": "plan at an accuracy",
     "bounces": "bounces, wavelengths",
     "wavelengths": "bounces, wavelengths",
     "spp": "reference",
 }
+"""Knobs that share a colour in the figure, or are called otherwise there."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """One setting of one estimator: wall seconds for all frames, error against the judge, own Monte Carlo error.
+class Measured:
+    """One setting of one estimator.
 
-    ``on_front``: no other row is as good in less time.
+    Attributes
+    ----------
+    estimator, knob, setting
+        which of the two, what was turned, and to what.
+    seconds
+        wall time for all frames.
+    error, mc_error
+        relative, against the judge, and of its own Monte Carlo noise.
+    on_front
+        no other row is as good in less time.
     """
 
     estimator: str
@@ -73,7 +87,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class EffectRow:
+class EffectCost:
     """One effect switched off where all others are on: change of the frames (the same paths), and seconds it takes."""
 
     name: str
@@ -92,19 +106,30 @@ class JudgeFacts:
 
 
 @dataclass(frozen=True)
-class AccuracyStudy:
-    """All that was measured, and how much longer the reference would take for the factored error at QUOTED."""
+class AccuracyFindings:
+    """All that was measured.
 
-    scene: str
-    patterns: str
-    rows: tuple[Row, ...]
-    effects: tuple[EffectRow, ...]
+    Attributes
+    ----------
+    rows, effects, solver
+        of the estimators, of effects switched off, and of forms of the solution.
+    judge
+        how far it is to be trusted.
+    sensor_noise
+        relative noise of the sensor at equal peak; None for a camera without a full well.
+    speedup_at_equal_error
+        how much longer the reference would take for the factored error at QUOTED.
+    left_out
+        what was too slow.
+    """
+
+    rows: tuple[Measured, ...]
+    effects: tuple[EffectCost, ...]
     solver: tuple[SolverRow, ...]
     judge: JudgeFacts
     sensor_noise: float | None
     speedup_at_equal_error: float
     left_out: tuple[str, ...]
-    output: str
 
     def payload(self) -> dict[str, Any]:
         """The JSON of the command line."""
@@ -132,85 +157,96 @@ class AccuracyStudy:
             f"At the error of the factored estimator at {QUOTED:g} the reference would take "
             f"{self.speedup_at_equal_error:.1e} times as long (extrapolated by 1/sqrt(samples)).",
             *(f"Left out, too slow: {name}" for name in self.left_out),
-            f"Plots: accuracy.png, effects.png, solver.png in {self.output}",
         ]
 
+    def figures(self) -> dict[str, Figure]:
+        """Error against time, what each effect buys, and what the solver's precision costs."""
+        series: dict[str, list[plots.Point]] = {}
+        for row in self.rows:
+            series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
+        effects = [(effect.name, effect.error_if_off, effect.seconds) for effect in self.effects]
+        return {
+            "accuracy.png": plots.pareto(series, noise=self.sensor_noise, apart=(_SERIES["bounces"],)),
+            "effects.png": plots.effect_costs(effects, QUOTED),
+            "solver.png": plots.solver_costs(self.solver),
+        }
 
-def study_accuracy(bench: Bench, output: Path | str, patterns: str, seed: int, progress: Progress) -> AccuracyStudy:
-    """Measure error against time and write accuracy.json, accuracy.png, effects.png and solver.png to ``output``.
+
+def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
+    """Error against time for the patterns of a request.
+
+    Parameters
+    ----------
+    bench
+        what is studied.
+    request
+        patterns and seed; accuracies are the study's own.
+    job
+        told how far the work is.
 
     Raises
     ------
     MitsimError
-        for patterns that do not fit, an output that cannot be written, or a scene without light.
+        for patterns that do not fit, or a scene without light.
     """
-    # Only an earlier study is replaced.
-    with output_folder(output, overwrite=(Path(output) / "accuracy.json").is_file()) as folder:
-        study = _Study(bench, bench.family(patterns, seed), seed, progress)
-        found = replace(study.run(), patterns=patterns, output=str(folder))
-        series: dict[str, list[plots.Point]] = {}
-        for row in found.rows:
-            series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
-        figures = {
-            "accuracy.png": plots.pareto(series, noise=found.sensor_noise, apart=(_SERIES["bounces"],)),
-            "effects.png": plots.effect_costs([(e.name, e.error_if_off, e.seconds) for e in found.effects], QUOTED),
-            "solver.png": plots.solver_costs(found.solver),
-        }
-        for name, figure in figures.items():
-            with whole_file(folder / name) as part:
-                figure.savefig(part, dpi=150, format="png")
-        write_json(folder / "accuracy.json", {**found.payload(), "seed": seed, "versions": versions()})
-        return found
+    stand = _Stand(bench, bench.family(request.patterns, request.seed), request.seed, job)
+    plans = {accuracy: stand.plan(accuracy) for accuracy in ACCURACIES}
+    chosen = [a for a, plan in plans.items() if plan.predicted_seconds <= PATIENCE or a == QUOTED]
+    quoted = plans[QUOTED]
+    judge = _Judge.trace(stand, plans[min(chosen)])
+    tried = [Trial("accuracy", f"accuracy {a:g}", bench, plans[a]) for a in chosen]
+    tried += trials(bench, quoted, stand.evidence, PATIENCE)
+    rows = [judge.row(trial) for trial in tried]
+    plan_row = next(row for row in rows if row.setting == f"accuracy {QUOTED:g}")
+    rows += list(judge.reference())
+    finest = rows[-1]
+    front = plots.pareto_front([(row.seconds, row.error) for row in rows])
+    return AccuracyFindings(
+        rows=tuple(replace(row, on_front=(row.seconds, row.error) in front) for row in rows),
+        effects=tuple(_effects(stand, quoted)),
+        solver=time_solver(request.seed, job.progress),
+        judge=judge.facts,
+        sensor_noise=judge.sensor_noise,
+        speedup_at_equal_error=finest.seconds * (finest.error / plan_row.error) ** 2 / plan_row.seconds,
+        left_out=tuple(
+            f"accuracy {a:g} (predicted {plan.predicted_seconds:.0f} s)" for a, plan in plans.items() if a not in chosen
+        ),
+    )
 
 
-class _Study:
-    """One scene and family, with what the pilot found of them."""
+@dataclass(frozen=True, eq=False)
+class _Stand:
+    """What all rows share: scene, family and seed, and what the pilot found of them."""
 
-    def __init__(self, bench: Bench, family: PatternFamily, seed: int, progress: Progress) -> None:
-        self.bench, self.family, self.seed, self.progress = bench, family, seed, progress
-        self.labels, self.weights = family.lighting
-        self.evidence: Evidence = pilot.measure(bench, self.labels, self.weights, min(ACCURACIES), seed)
-        self.plans = {accuracy: self._plan(accuracy) for accuracy in ACCURACIES}
+    bench: Bench
+    family: PatternFamily
+    seed: int
+    job: Job
 
-    def run(self) -> AccuracyStudy:
-        """Every row; the caller names patterns and folder."""
-        chosen = [a for a, plan in self.plans.items() if plan.predicted_seconds <= PATIENCE or a == QUOTED]
-        slow = tuple(
-            f"accuracy {a:g} (predicted {plan.predicted_seconds:.0f} s)"
-            for a, plan in self.plans.items()
-            if a not in chosen
-        )
+    @cached_property
+    def evidence(self) -> Evidence:
+        return pilot.measure(self.bench, self.lighting, min(ACCURACIES), self.seed)
+
+    @property
+    def lighting(self) -> Lighting:
+        return self.family.lighting
+
+    def plan(self, accuracy: float) -> Plan:
+        return decide(accuracy, self.evidence, len(self.lighting.weights), SceneFacts.of(self.bench))
+
+    def trace(self, trial: Trial, seed: int) -> Light:
+        sampling = Sampling(by_pixel=False, target=trial.target)
+        return trace_light(trial.bench, trial.plan, self.lighting, seed, sampling, self.job.progress)
+
+    def timed(self, trial: Trial) -> tuple[float, FloatArray, float]:
+        """Seconds, frames and Monte Carlo error; one sample beforehand compiles the kernels."""
+        once = replace(trial.plan, settings=sampled(trial.plan.settings, 1))
+        self.trace(replace(trial, plan=once, target=at_once), self.seed)
         started = time.perf_counter()
-        finest = self._finest(self.plans[min(chosen)])
-        light = collect(self.bench, finest, self.labels, self.weights, self.seed + 1, self.progress)
-        expected = light.frames(self.labels, self.weights, self.seed + 1)
-        judge, judge_error = _stack(expected)
-        facts = JudgeFacts(judge_error, self._left(finest.settings), time.perf_counter() - started, self.seed + 1)
-        rows = [self._row(Variant("accuracy", f"accuracy {a:g}", self.bench, self.plans[a]), judge) for a in chosen]
-        rows += [
-            self._row(variant, judge) for variant in variants(self.bench, self.plans[QUOTED], self.evidence, PATIENCE)
-        ]
-        rows += list(self._reference(light))
-        front = plots.pareto_front([(row.seconds, row.error) for row in rows])
-        quoted = next(row for row in rows if row.setting == f"accuracy {QUOTED:g}")
-        best = rows[-1]
-        return AccuracyStudy(
-            scene=str(self.bench.loaded.path),
-            patterns="",
-            rows=tuple(replace(row, on_front=(row.seconds, row.error) in front) for row in rows),
-            effects=tuple(self._effects(finest.settings.effects)),
-            solver=solver_costs(self.seed, self.progress),
-            judge=facts,
-            sensor_noise=self._sensor_noise(expected),
-            speedup_at_equal_error=best.seconds * (best.error / quoted.error) ** 2 / quoted.seconds,
-            left_out=slow,
-            output="",
-        )
+        frames, mc_error = _stack(self.trace(trial, self.seed).frames(self.lighting, self.seed))
+        return time.perf_counter() - started, frames, mc_error
 
-    def _plan(self, accuracy: float) -> Plan:
-        return decide(accuracy, self.evidence, len(self.weights), SceneFacts.of(self.bench))
-
-    def _finest(self, plan: Plan) -> Plan:
+    def finest(self, plan: Plan) -> Plan:
         """Everything on, and one step finer than ``plan`` in each number."""
         evidence, now = self.evidence, plan.settings
         anchors = next((count for count in evidence.anchor_error if count > now.anchors), now.anchors)
@@ -221,13 +257,13 @@ class _Study:
             anchors=anchors,
             layers=evidence.layers[layers] if layers > 1 else (),
             subdivision=cells,
-            effects=frozenset(pilot.applicable(self.bench)),
+            effects=frozenset(present(self.bench)),
             coarse_cells=cells,
             coarse_layers=True,
         )
         return replace(plan, settings=settings, sampling_target=plan.accuracy / _JUDGE_MARGIN)
 
-    def _left(self, settings: Settings) -> float:
+    def left(self, settings: Settings) -> float:
         """What these settings are predicted to leave besides noise."""
         evidence = self.evidence
         parts = (
@@ -237,61 +273,80 @@ class _Study:
         )
         return float(np.linalg.norm(parts))
 
-    def _row(self, variant: Variant, judge: FloatArray) -> Row:
-        seconds, frames, mc_error = self._timed(variant)
-        error = relative_error(frames, judge)
-        return Row("factored", variant.knob, variant.setting, seconds, error, mc_error)
 
-    def _timed(self, variant: Variant) -> tuple[float, FloatArray, float]:
-        """Seconds, frames and Monte Carlo error; one sample beforehand compiles the kernels."""
-        bench, plan = variant.bench, variant.plan
-        once = replace(plan, settings=sampled(plan.settings, 1))
-        collect(bench, once, self.labels, self.weights, self.seed, by_pixel=False, target=at_once)
-        started = time.perf_counter()
-        light = collect(
-            bench, plan, self.labels, self.weights, self.seed, self.progress, by_pixel=False, target=variant.target
-        )
-        frames, mc_error = _stack(light.frames(self.labels, self.weights, self.seed))
-        return time.perf_counter() - started, frames, mc_error
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """The answer that rows are held against: its light, expected frames, and how far it is to be trusted."""
 
-    def _effects(self, names: frozenset[str]) -> Iterator[EffectRow]:
-        """Each effect that the scene has, switched off; as many samples with and without, so that noise cancels."""
-        plan = self.plans[QUOTED]
-        full = replace(plan, settings=replace(sampled(plan.settings, _EFFECT_SAMPLES), effects=names))
-        seconds, frames, _ = self._timed(Variant("effects", "all", self.bench, full, at_once))
-        for name, settings in without(full.settings, names):
-            changed = Variant("effects", f"no {name}", self.bench, replace(full, settings=settings), at_once)
-            less, other, _ = self._timed(changed)
-            yield EffectRow(name, relative_error(other, frames), seconds - less)
+    stand: _Stand
+    light: Light
+    expected: ExpectedFrames
+    frames: FloatArray
+    facts: JudgeFacts
 
-    def _reference(self, light: Light) -> Iterator[Row]:
-        """Against the judge's own light with the physics that the reference has."""
-        index = len(self.family.captures) // 2
-        settings = light.simulation.settings
-        plain = Simulation(self.bench, replace(settings, effects=settings.effects - _NOT_IN_REFERENCE))
-        shown = self.weights[[index]]
-        judge, _ = _stack(replace(light, simulation=plain).frames(self.labels, shown, self.seed + 1))
-        with projected(self.bench, self.family.light(self.family.captures[index])):
-            reference(self.bench.loaded, SAMPLES[0], self.seed, silent)
-            for spp in SAMPLES:
-                started = time.perf_counter()
-                found = reference(self.bench.loaded, spp, self.seed, self.progress)
-                seconds = (time.perf_counter() - started) * len(self.family.captures)
-                error = relative_error(found.mean.mean(axis=2), judge[0])
-                yield Row("reference", "spp", f"{spp} spp", seconds, error, found.mc_error)
+    @classmethod
+    def trace(cls, stand: _Stand, plan: Plan) -> _Judge:
+        """One step finer than ``plan``, with a seed of its own."""
+        started, seed = time.perf_counter(), stand.seed + 1
+        finest = stand.finest(plan)
+        light = stand.trace(Trial("judge", "", stand.bench, finest), seed)
+        expected = light.frames(stand.lighting, seed)
+        frames, mc_error = _stack(expected)
+        facts = JudgeFacts(mc_error, stand.left(finest.settings), time.perf_counter() - started, seed)
+        return cls(stand, light, expected, frames, facts)
 
-    def _sensor_noise(self, expected: ExpectedFrames) -> float | None:
+    def row(self, trial: Trial) -> Measured:
+        """One setting of the factored estimator."""
+        seconds, frames, mc_error = self.stand.timed(trial)
+        error = relative_error(frames, self.frames)
+        return Measured("factored", trial.knob, trial.setting, seconds, error, mc_error)
+
+    def reference(self) -> Iterator[Measured]:
+        """The reference, against light with the effects that it has."""
+        stand, shots = self.stand, self.stand.family.captures
+        index, bench = len(shots) // 2, stand.bench
+        lighting = stand.lighting.shots([index])
+        answer, _ = _stack(self.of_reference().frames(lighting, self.facts.seed))
+        with projected(bench, stand.family.light(shots[index])):
+            bench.render("reference", _SAMPLES[0], seed=stand.seed)  # compiles the kernels
+            for spp in _SAMPLES:
+                rendered = bench.render("reference", spp, seed=stand.seed, job=stand.job)
+                seconds = rendered.facts["seconds"] * len(shots)
+                error = relative_error(rendered.mean.mean(axis=2), answer[0])
+                yield Measured("reference", "spp", f"{spp} spp", seconds, error, rendered.mc_error)
+
+    def of_reference(self) -> Light:
+        """The same light without what the reference lacks; traced anew where that has shaped it."""
+        stand, plan, absent = self.stand, self.light.plan, names(lambda effect: not effect.in_reference)
+        if not any(EFFECTS[name].retraced(Physics.of(stand.bench)) for name in absent & plan.settings.effects):
+            return reformed(self.light, absent)
+        plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - absent))
+        return stand.trace(Trial("judge", "reference", stand.bench, plain), self.facts.seed)
+
+    @property
+    def sensor_noise(self) -> float | None:
         """Relative noise of the sensor at equal peak; None for a camera without a full well."""
-        if not np.isfinite(self.bench.sensor.full_well_e):
+        if not np.isfinite(self.stand.bench.sensor.full_well_e):
             return None
-        return NoiseTarget(self.bench, Exposure(), 1.0, self.seed)(expected)
+        return NoiseTarget(self.stand.bench, Exposure(), 1.0)(self.expected)
+
+
+def _effects(stand: _Stand, plan: Plan) -> Iterator[EffectCost]:
+    """Each effect that the scene has, switched off; as many samples with and without, so that noise cancels."""
+    everything = frozenset(present(stand.bench))
+    full = replace(plan, settings=replace(sampled(plan.settings, _EFFECT_SAMPLES), effects=everything))
+    seconds, frames, _ = stand.timed(Trial("effects", "all", stand.bench, full, at_once))
+    for name, settings in without(full.settings, everything):
+        trial = Trial("effects", f"no {name}", stand.bench, replace(full, settings=settings), at_once)
+        fewer_seconds, without_it, _ = stand.timed(trial)
+        yield EffectCost(name, relative_error(without_it, frames), seconds - fewer_seconds)
 
 
 def _stack(expected: ExpectedFrames) -> tuple[FloatArray, float]:
-    """All frames (captures, pixels, pixels) and their Monte Carlo error."""
-    found = list(expected)
-    frames = np.stack([frame.irradiance for frame in found])
+    """All frames (shots, pixels, pixels) and their Monte Carlo error."""
+    formed = list(expected)
+    frames = np.stack([frame.irradiance for frame in formed])
     if not frames.any():
         raise MitsimError("all frames are dark; nothing can be compared")
-    noise = sum(frame.variance * frame.irradiance.size for frame in found)
+    noise = sum(frame.variance * frame.irradiance.size for frame in formed)
     return frames, float(np.sqrt(noise / np.square(frames).sum()))

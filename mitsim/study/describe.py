@@ -9,7 +9,7 @@ _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)--
 
 
 def scene_line(path: Path) -> str:
-    """Name of the scene's folder, and the first sentence of the comment that opens the file if there is one.
+    """Name of the folder of the scene ``path``, and the first sentence of the comment that opens the file, if any.
 
     A comment further down speaks of its own element and is left alone.
     """

@@ -2,59 +2,47 @@
 
 from __future__ import annotations
 
-import base64
-import math
 from io import BytesIO
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-
-Array = NDArray[Any]
+from mitsim.core.pictures import data_uri, grey_png, lightness
 
 PATTERN_CORNER = 40
-"""Projector pixels a side that are shown of a pattern."""
+"""Projector pixels a side that are shown of a pattern, so that single ones can be told apart."""
+_SMALLEST = 384
+"""Pixels a side of a picture: the width of a column of the page, on a screen of two dots a pixel."""
+_FIGURE_DPI = 160
+"""Figures are 8.6 inches wide: 1376 pixels, what the page's width shows on the same screen."""
 
 
-def reflectance_png(image: Array, name: str = "image") -> str:
-    """Reflectance as an sRGB grey PNG: clipped to 0..1 for display only, so a screen shows its lightness."""
-    linear = np.clip(finite(image, name), 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
-    return _grey_png(encoded)
+def reflectance_uri(image: npt.ArrayLike, name: str = "image") -> str:
+    """Reflectance as a grey PNG: cut to 0..1 for display only, so a screen shows its lightness.
+
+    ``image`` is (rows, columns), ``name`` what messages call it. MitsimError as :func:`finite`.
+    """
+    return data_uri(grey_png(lightness(finite(image, name)), smallest=_SMALLEST))
 
 
-def pattern_png(pattern: Array) -> str:
-    """Top left corner of a pattern, where single pixels can be told apart: 0..1 as it is, -1..1 with -1 black."""
+def pattern_uri(pattern: npt.ArrayLike) -> str:
+    """Top left corner of a ``pattern`` (n, n): 0..1 as it is, -1..1 with -1 black. MitsimError as :func:`finite`."""
     values = finite(pattern, "pattern")[:PATTERN_CORNER, :PATTERN_CORNER]
-    return _grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values)
+    return data_uri(grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values, smallest=_SMALLEST))
 
 
-def _grey_png(values: Array) -> str:
-    """Values 0..1 as a grey PNG of at least 384 pixels a side, whole copies of each pixel, as a data URI."""
-    from matplotlib.image import imsave
-
-    copies = max(1, math.ceil(384 / max(values.shape)))
-    buffer = BytesIO()
-    large = np.kron(values, np.ones((copies, copies)))
-    imsave(buffer, large, cmap="gray", vmin=0.0, vmax=1.0, format="png")
-    return _data_uri(buffer)
+def figure_uri(figure: Figure) -> str:
+    """A ``figure`` as a PNG."""
+    figure.savefig(buffer := BytesIO(), format="png", dpi=_FIGURE_DPI)
+    return data_uri(buffer.getvalue())
 
 
-def figure_png(figure: Figure) -> str:
-    """A figure as a data URI, 160 pixels an inch."""
-    figure.savefig(buffer := BytesIO(), format="png", dpi=160)
-    return _data_uri(buffer)
-
-
-def _data_uri(buffer: BytesIO) -> str:
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def finite(image: Array, name: str) -> NDArray[np.float64]:
-    """The image as float64; MitsimError unless it is rows x columns of finite numbers."""
+def finite(image: npt.ArrayLike, name: str) -> FloatArray:
+    """The ``image`` in double precision; MitsimError, with its ``name``, unless it is rows x columns of finite
+    numbers."""
     values = np.asarray(image, dtype=np.float64)
     if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
         raise MitsimError(f"report: {name} of shape {values.shape} must be rows x columns of finite numbers")

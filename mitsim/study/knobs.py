@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, Evidence, Settings
+from mitsim.capture.light import Light, Target
 from mitsim.capture.plan import Plan
+from mitsim.capture.simulation import Simulation
 from mitsim.optics.frames import ExpectedFrames
 
-Target = Callable[[ExpectedFrames], float]
 CELLS = (1, 2, 4)
 ANCHORS = (1, 2, 3, 5)
 LAYERS = (1, 2, 4, 8)
+"""Cells of a pixel and anchors a side, and layers: each about halves the error of the one before."""
 LINE_WIDTH_NM = 2.0
 """Assumed width of a laser diode's line, for the finer spectrum."""
 SAMPLES = (1, 8, 64)
+"""Steps of 8, over which the error of independent samples falls by 2.8."""
 
 
 @dataclass(frozen=True)
-class Variant:
-    """One setting of the factored estimator: what was turned, to what, and the bench and plan that it makes.
+class Trial:
+    """One setting of the factored estimator.
 
-    ``target`` as in :func:`mitsim.capture.light.collect`; the plan's own without it.
+    Attributes
+    ----------
+    knob, setting
+        what was turned, and to what.
+    bench, plan
+        that it makes.
+    target
+        error to stop at; None: the plan's own.
     """
 
     knob: str
@@ -33,50 +44,67 @@ class Variant:
     target: Target | None = None
 
 
-def at_once(_: ExpectedFrames) -> float:
-    """A target that any error meets: sampling stops after its first round, half of what the settings predict."""
+def at_once(expected: ExpectedFrames) -> float:
+    """A target that any error of the ``expected`` frames meets: sampling stops after its first round, half of what the
+    settings predict."""
     return float("inf")
 
 
 def sampled(settings: Settings, samples: int) -> Settings:
-    """Settings under which the first round takes so many samples of a projector pixel and of a cell in each group."""
+    """``settings`` whose first round takes so many ``samples`` of a projector pixel and of a cell in each group."""
     each = 2.0 * samples
     return replace(
         settings, direct_samples=each, anchored_samples=each / 8, indirect_samples=each, from_camera_samples=each
     )
 
 
-def variants(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Iterator[Variant]:
-    """The plan with one knob turned; what would be traced for longer than ``patience`` [s] is left out."""
+def reformed(light: Light, absent: frozenset[str]) -> Light:
+    """The same ``light``, traced no further, whose frames are formed with the effects ``absent`` at their neutral
+    values: of such as need no light to be traced anew."""
+    simulation = light.simulation
+    settings = replace(simulation.settings, effects=simulation.settings.effects - absent)
+    return replace(light, simulation=Simulation(simulation.bench, settings))
+
+
+def trials(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Iterator[Trial]:
+    """A plan with one knob turned.
+
+    Parameters
+    ----------
+    bench, plan
+        where the knobs stand at first.
+    evidence
+        the pilot's, of the same bench.
+    patience
+        what would be traced for longer, and for longer than the plan itself, is left out [s].
+    """
     now = plan.settings
-
-    def changed(knob: str, setting: str, settings: Settings) -> Variant:
-        return Variant(knob, setting, bench, replace(plan, settings=settings))
-
-    for samples in SAMPLES:
-        fixed = sampled(now, samples)
-        if _tracing(fixed, evidence) <= patience:
-            yield Variant("samples", f"{GROUPS * samples} samples", bench, replace(plan, settings=fixed), at_once)
-    for cells in CELLS:
-        yield changed("cells", f"{cells}x{cells} a pixel", replace(now, subdivision=cells))
-    for anchors in ANCHORS:
-        settings = replace(now, anchors=anchors)
-        if _tracing(settings, evidence) <= patience:
-            yield changed("anchors", f"{anchors}x{anchors}", settings)
-    for layers in LAYERS:
-        if layers in evidence.layers and (layers > 1 or len(evidence.layers) > 1):
-            depths = evidence.layers[layers] if layers > 1 else ()
-            yield changed("layers", str(layers), replace(now, layers=depths))
-    yield changed("bounces", "one reflection", replace(now, effects=now.effects - {"interreflection"}))
-    bounced = replace(now, effects=now.effects | {"interreflection"})
-    if _tracing(bounced, evidence) <= patience:
-        yield changed("bounces", "all, roulette", bounced)
-    yield from (Variant("wavelengths", name, lit, plan) for name, lit in _spectra(bench))
+    longest = max(patience, _tracing(now, evidence))
+    choices: list[tuple[str, str, Settings, Target | None]] = [
+        ("samples", f"{GROUPS * samples} samples", sampled(now, samples), at_once) for samples in SAMPLES
+    ]
+    choices += [("cells", f"{cells}x{cells} a pixel", replace(now, subdivision=cells), None) for cells in CELLS]
+    choices += [("anchors", f"{anchors}x{anchors}", replace(now, anchors=anchors), None) for anchors in ANCHORS]
+    if len(evidence.layers) > 1:
+        depths = {layers: evidence.layers[layers] for layers in LAYERS if layers in evidence.layers}
+        choices += [
+            ("layers", str(count), replace(now, layers=each if count > 1 else ()), None)
+            for count, each in depths.items()
+        ]
+    bounces = frozenset({"interreflection"})
+    choices.append(("bounces", "one reflection", replace(now, effects=now.effects - bounces), None))
+    choices.append(("bounces", "all, roulette", replace(now, effects=now.effects | bounces), None))
+    for knob, setting, settings, target in choices:
+        if _tracing(settings, evidence) <= longest:
+            yield Trial(knob, setting, bench, replace(plan, settings=settings), target)
+    for setting, lit in _lights(bench):
+        yield Trial("wavelengths", setting, lit, plan)
 
 
-def without(settings: Settings, names: frozenset[str]) -> Iterator[tuple[str, Settings]]:
-    """Each effect's name, and the settings without it; numbers fall to one."""
-    for name in sorted(names - {"speckle"}):
+def without(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, Settings]]:
+    """The name of each effect of those ``present`` that shows in expected frames, and ``settings`` without it; numbers
+    fall to one."""
+    for name in sorted(present & names(lambda effect: effect.in_frames)):
         yield name, replace(settings, effects=settings.effects - {name})
     if settings.anchors > 1:
         yield "anchors", replace(settings, anchors=1)
@@ -84,7 +112,7 @@ def without(settings: Settings, names: frozenset[str]) -> Iterator[tuple[str, Se
         yield "layers", replace(settings, layers=())
 
 
-def _spectra(bench: Bench) -> Iterator[tuple[str, Bench]]:
+def _lights(bench: Bench) -> Iterator[tuple[str, Bench]]:
     """One effective wavelength, the projector's lines, and each of them as three of a line's width."""
     model = bench.projector
     lines = model.wavelengths_nm or (model.effective_wavelength_nm,)

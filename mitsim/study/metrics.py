@@ -6,6 +6,7 @@ clips: a reconstruction of the wrong brightness is a wrong reconstruction.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -16,8 +17,22 @@ from mitsim.core.runs import Capture
 
 Image = NDArray[np.floating[Any]]
 
-SSIM_WINDOW = 7
+_SSIM_WINDOW = 7
 """Pixels a side; scikit-image's default."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How close an image is to the truth: ``psnr_db`` as :func:`psnr`, and ``ssim`` as :func:`ssim`; None for images
+    smaller than its window."""
+
+    psnr_db: float
+    ssim: float | None
+
+    @classmethod
+    def of(cls, image: Image, truth: Image) -> Quality:
+        """That of ``image`` (rows, columns) beside ``truth``; MitsimError as :func:`psnr`."""
+        return cls(psnr(image, truth), ssim(image, truth) if min(truth.shape) >= _SSIM_WINDOW else None)
 
 
 def psnr(image: Image, truth: Image) -> float:
@@ -38,9 +53,9 @@ def ssim(image: Image, truth: Image) -> float:
     from skimage.metrics import structural_similarity
 
     image, truth = _pair(image, truth)
-    if min(image.shape) < SSIM_WINDOW:
-        raise MitsimError(f"SSIM: image is {_size(image)} pixels; needs at least {SSIM_WINDOW} x {SSIM_WINDOW}")
-    return float(structural_similarity(image, truth, win_size=SSIM_WINDOW, data_range=1.0))
+    if min(image.shape) < _SSIM_WINDOW:
+        raise MitsimError(f"SSIM: image is {_size(image)} pixels; needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW}")
+    return float(structural_similarity(image, truth, win_size=_SSIM_WINDOW, data_range=1.0))
 
 
 def relative_error(values: Image, reference: Image) -> float:

@@ -10,37 +10,43 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
-from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:
     from mitsim.study.solver_cost import SolverRow
 
-# Okabe and Ito's palette: distinct in all common forms of colour blindness, and in grey.
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
-PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
+"""Okabe and Ito's palette: distinct in all common forms of colour blindness, and in grey."""
+_PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-_GRID = "#e5e7eb"
-_FONT = 11.0  # points
+"""Seven of each, so that as many curves can be told apart."""
+_GRID, _LINK, _GREY = "#e5e7eb", "#d1d5db", "#6b7280"
+"""Lines behind the data, between them, and beside them: lighter than any curve."""
+_FONT = 11.0
+"""Points: as large as the text of a page of 8.6 inches."""
+_WIDTH, _FRAME_WIDTH = 8.6, 3.6
+"""Inches: a page of text, and three frames side by side with room for their labels."""
+_SHORT_AXIS = 30.0
+"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
 _BEST = "best for its time"
 Point = tuple[float, float]
 """Wall seconds, relative error."""
 
 
-def frame(values: ArrayLike, unit: str = "DN", width: float = 3.6) -> Figure:
-    """A sensor frame (m, m) with its colour bar in `unit`; width in inches. Pixel (0, 0) is top left."""
-    image = np.asarray(values, dtype=np.float64)
+def frame(values: npt.ArrayLike) -> Figure:
+    """A sensor frame ``values`` (m, m) [DN] with its colour bar; pixel (0, 0) is top left."""
     # "compressed" makes room around an image of fixed aspect; "constrained" lets the row label run off the figure.
-    figure, axes = _figure(width, 0.75 * width, layout="compressed")
-    drawn = axes.imshow(image, cmap="viridis", interpolation="none")
+    figure, axes = _figure(0.75 * _FRAME_WIDTH, _FRAME_WIDTH, layout="compressed")
+    drawn = axes.imshow(np.asarray(values, dtype=np.float64), cmap="viridis", interpolation="none")
     bar = figure.colorbar(drawn, ax=axes)
-    bar.set_label(f"signal [{unit}]", fontsize=_FONT - 1)
+    bar.set_label("signal [DN]", fontsize=_FONT - 1)
     bar.ax.tick_params(labelsize=_FONT - 2)
     axes.set_xlabel("sensor column [pixel]", fontsize=_FONT - 1)
     axes.set_ylabel("sensor row [pixel]", fontsize=_FONT - 1)
@@ -48,78 +54,64 @@ def frame(values: ArrayLike, unit: str = "DN", width: float = 3.6) -> Figure:
     return figure
 
 
-def singular_values(spectra: Mapping[str, ArrayLike], width: float = 8.6) -> Figure:
+def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     """Singular values of each family's system, {family: values in any order}, log scale over rank in percent.
 
-    Each curve is divided by its own largest value: what remains is the conditioning.
+    Each of the ``curves`` is divided by its own largest value: what remains is the conditioning.
     """
-    figure, axes = _figure(width, 0.42 * width)
-    for index, (name, values) in enumerate(spectra.items()):
+    figure, axes = _figure(0.42 * _WIDTH)
+    for index, (name, values) in enumerate(curves.items()):
         ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
         share = 100.0 * np.arange(1, ordered.size + 1) / ordered.size
-        axes.semilogy(
-            share,
-            ordered / ordered[0],
-            linestyle=_STYLES[index % len(_STYLES)],
-            color=PALETTE[index % len(PALETTE)],
-            linewidth=2.0,
-            label=name,
-        )
-    axes.set_xlabel("singular value's rank [% of all]", fontsize=_FONT)
-    axes.set_ylabel("relative to the largest [1]", fontsize=_FONT)
+        axes.semilogy(share, ordered / ordered[0], lw=2.0, label=name, **_line(index))
     axes.set_xlim(0, 100)
-    axes.grid(True, which="major", color="#e5e7eb")
+    _label(axes, "singular value's rank [% of all]", "relative to the largest [1]")
     axes.legend(fontsize=_FONT - 1, frameon=False, loc="lower left")
     return figure
 
 
-def quality_bars(
-    names: Sequence[str], idealised_db: Sequence[float], rendered_db: Sequence[float], width: float = 8.6
-) -> Figure:
-    """PSNR in dB of each family, a pair of bars each: the paper's idealised model and the rendered light."""
-    figure, axes = _figure(width, 0.36 * width)
-    place = np.arange(len(names), dtype=np.float64)
-    for values, shift, colour, hatch, label in (
-        (idealised_db, -0.2, "#c7d2de", "", "idealised model, ideal factors"),
-        (rendered_db, 0.2, BLUE, "", "rendered light, calibrated factors"),
-    ):
-        bars = axes.bar(place + shift, values, 0.38, color=colour, hatch=hatch, label=label)
+def quality_bars(quality: Mapping[str, tuple[float, float]]) -> Figure:
+    """PSNR [dB] by family, a pair of bars each: ``quality`` of the idealised model, and of the rendered light."""
+    figure, axes = _figure(0.36 * _WIDTH)
+    place = np.arange(len(quality), dtype=np.float64)
+    looks = (-0.2, "#c7d2de", "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
+    for values, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
+        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label)
         axes.bar_label(bars, fmt="%.1f", fontsize=_FONT - 1, padding=2)
-    axes.set_xticks(place, names, fontsize=_FONT)
-    axes.set_ylabel("PSNR [dB]", fontsize=_FONT)
+    axes.set_xticks(place, list(quality), fontsize=_FONT)
     axes.margins(y=0.14)
-    axes.grid(True, axis="y", color="#e5e7eb")
-    axes.set_axisbelow(True)
+    _label(axes, "", "PSNR [dB]", grid="y")
     axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", ncols=2, bbox_to_anchor=(0, 1.16))
     return figure
 
 
-def error_bars(errors: Mapping[str, float], limit: float | None = None, width: float = 8.6) -> Figure:
-    """Relative errors {name: value > 0} on a logarithmic axis, largest on top; `limit`: accuracy asked.
+def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figure:
+    """Relative ``errors`` {name: value > 0} on a logarithmic axis, largest on top; ``limit``: accuracy asked for.
 
     The values stand in a column beside the axes, where no line can cross them.
     """
-    return _error_dots(sorted(errors.items(), key=lambda item: item[1]), limit, width)
+    return _error_dots(sorted(errors.items(), key=lambda item: item[1]), limit)
 
 
-def effect_costs(rows: Sequence[tuple[str, float, float]], limit: float | None = None, width: float = 8.6) -> Figure:
-    """What each effect buys and costs: rows (name, error when it is left out, seconds it takes), largest error on top.
+def effect_costs(rows: Sequence[tuple[str, float, float]], limit: float | None = None) -> Figure:
+    """What each effect buys and costs: ``rows`` (name, error when it is left out, seconds it takes), largest on top.
 
-    An error of 0 has no dot, and its row stands at the bottom. Error and seconds are columns beside the axes.
+    An error of 0 has no dot, and its row stands at the bottom. Error and seconds are columns beside the axes; ``limit``
+    is the accuracy asked for.
     """
     ordered = sorted(rows, key=lambda row: row[1])
-    figure = _error_dots([(name, error) for name, error, _ in ordered], limit, width)
+    figure = _error_dots([(name, error) for name, error, _ in ordered], limit)
     axes = figure.axes[0]
     for place, (_, _, seconds) in enumerate(ordered):
         _beside(axes, place, 76, f"{seconds:.2g} s")
     for points, heading in ((8, "error"), (76, "takes")):
-        _beside(axes, len(ordered) - 0.2, points, heading, color="#6b7280")
+        _beside(axes, len(ordered) - 0.2, points, heading, color=_GREY)
     axes.set_xlabel("relative error of the frames if left out [1]", fontsize=_FONT)
     return figure
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
-    """Points that no other beats in both seconds and error, fastest first."""
+    """Those of ``points`` that no other beats in both seconds and error, fastest first."""
     front: list[Point] = []
     for seconds, error in sorted(points):
         if not front or error < front[-1][1]:
@@ -127,109 +119,143 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
     return front
 
 
-def pareto(
-    series: Mapping[str, Sequence[Point]],
-    front: Sequence[Point] | None = None,
-    noise: float | None = None,
-    width: float = 8.6,
-    apart: Collection[str] = (),
-) -> Figure:
-    """Error against wall seconds of several ways to the same result, log-log, {name: [(seconds, error), ...]}.
+def pareto(series: Mapping[str, Sequence[Point]], noise: float | None = None, apart: Collection[str] = ()) -> Figure:
+    """Error against wall seconds of several ways to the same result, log-log.
 
-    ``front`` are the points that nothing beats (found among all when not given), joined by a staircase: the best error
-    to be had in a given time. ``noise``: relative error that the sensor's noise makes anyway, a horizontal line.
-    ``apart`` names series whose points are different things, not steps of one, and are not joined.
+    Points that nothing beats are ringed and joined by a staircase: the best error to be had in a given time.
+
+    Parameters
+    ----------
+    series
+        points (seconds, error) by name.
+    noise
+        relative error that the sensor's noise makes anyway, a horizontal line.
+    apart
+        names of series whose points are different things, not steps of one, and are not joined.
     """
-    figure, axes = _figure(width, 0.55 * width)
+    figure, axes = _figure(0.55 * _WIDTH)
     for index, (name, points) in enumerate(series.items()):
         seconds, error = zip(*sorted(points), strict=True)
-        colour, marker = PALETTE[index % len(PALETTE)], _MARKERS[index % len(_MARKERS)]
+        colour, marker = _PALETTE[index % len(_PALETTE)], _MARKERS[index % len(_MARKERS)]
         line = "" if name in apart else "-"
         axes.plot(seconds, error, marker, ls=line, color=colour, lw=1.2, ms=7, label=name, zorder=3)
-    _draw_front(axes, pareto_front([p for points in series.values() for p in points]) if front is None else front)
+    _draw_front(axes, [point for points in series.values() for point in points])
     if noise is not None:
-        axes.axhline(noise, color="#6b7280", lw=1.8, ls="--", label=f"sensor noise, {noise:.1e}")
+        axes.axhline(noise, color=_GREY, lw=1.8, ls="--", label=f"sensor noise, {noise:.1e}")
     _log_log(axes)
-    axes.set_xlabel("wall time for all frames [s]", fontsize=_FONT)
-    axes.set_ylabel("relative error of the frames [1]", fontsize=_FONT)
+    _label(axes, "wall time for all frames [s]", "relative error of the frames [1]")
     axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     return figure
 
 
-def solver_costs(rows: Sequence[SolverRow], width: float = 8.6) -> Figure:
-    """Error of the image against seconds of the solver, a panel for each lambda; points that nothing beats ringed."""
+def solver_costs(rows: Sequence[SolverRow]) -> Figure:
+    """Error of the image against seconds of the solver in ``rows``, a panel for each lambda, the best ringed."""
     lambdas = sorted({row.lambda_rel for row in rows}, reverse=True)
-    figure, _ = _figure(width, 0.55 * width)
+    figure, _ = _figure(0.55 * _WIDTH)
     figure.clear()
     panels: Any = figure.subplots(1, len(lambdas), sharex=True, sharey=True, squeeze=False)[0]
     colours = (BLUE, ORANGE, VERMILION, GREEN)
     precisions = list(dict.fromkeys(row.precision for row in rows))
     forms = list(dict.fromkeys((row.method, row.layout) for row in rows))
     for axes, lam in zip(panels, lambdas, strict=True):
-        here = [row for row in rows if row.lambda_rel == lam]
-        for row in here:
+        panel = [row for row in rows if row.lambda_rel == lam]
+        for row in panel:
             colour = colours[precisions.index(row.precision)]
             marker = _MARKERS[forms.index((row.method, row.layout))]
             axes.plot([row.seconds], [row.error], marker, color=colour, ms=8, mec="white", mew=0.6, zorder=3)
-        _draw_front(axes, pareto_front([(row.seconds, row.error) for row in here]))
+        _draw_front(axes, [(row.seconds, row.error) for row in panel])
         _log_log(axes)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=_FONT - 1)
         axes.set_title(rf"relative $\lambda$ {lam:.0e}", fontsize=_FONT)
-        axes.set_xlabel("wall time [s]", fontsize=_FONT)
+        _label(axes, "wall time [s]", "")
     panels[0].set_ylabel("relative error of the image [1]", fontsize=_FONT)
-    grey = "#9ca3af"
     entries = [(Line2D([], [], ls="", marker="o", color=colours[i], ms=8), name) for i, name in enumerate(precisions)]
     entries.append((panels[0].lines[-1], _BEST))
     marks = [
-        (Line2D([], [], ls="", marker=_MARKERS[i], color=grey, ms=8), f"{method}, {layout}")
+        (Line2D([], [], ls="", marker=_MARKERS[i], color="#9ca3af", ms=8), f"{method}, {layout}")
         for i, (method, layout) in enumerate(forms)
     ]
     # A legend is filled column by column: one row for the colours, one for the markers.
     empty = (Line2D([], [], ls=""), "")
     both = [entry for pair in zip_longest(entries, marks, fillvalue=empty) for entry in pair]
-    figure.legend(
-        *zip(*both, strict=True), fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=len(both) // 2
-    )
+    handles, labels = zip(*both, strict=True)
+    _legend_below(figure, handles, labels, len(both) // 2)
     return figure
 
 
-def error_against_time(series: Mapping[str, Sequence[tuple[float, float]]], width: float = 8.6) -> Figure:
-    """Relative error over wall seconds for all frames, log-log; {estimator: [(seconds, error), ...]}."""
-    figure, axes = _figure(width, 0.55 * width)
-    for index, (name, points) in enumerate(series.items()):
-        seconds, error = zip(*sorted(points), strict=True)
-        axes.loglog(seconds, error, "o-", color=(BLUE, VERMILION)[index % 2], linewidth=2.0, label=name)
-    axes.set_xlabel("wall time for all frames [s]", fontsize=_FONT)
-    axes.set_ylabel("relative error of the frames [1]", fontsize=_FONT)
-    axes.grid(True, which="major", color="#e5e7eb")
-    axes.legend(fontsize=_FONT, frameon=False)
-    return figure
-
-
-def seconds_by_stage(seconds: Mapping[str, float], width: float = 8.6) -> Figure:
-    """Wall time {stage: seconds} as horizontal bars in the order given."""
-    figure, axes = _figure(width, 0.7 + 0.34 * len(seconds))
+def seconds_by_stage(seconds: Mapping[str, float]) -> Figure:
+    """Wall time {stage: ``seconds``} as horizontal bars in the order given."""
+    figure, axes = _figure(0.7 + 0.34 * len(seconds))
     place = np.arange(len(seconds))[::-1]
     bars = axes.barh(place, list(seconds.values()), 0.62, color=BLUE)
     axes.bar_label(bars, fmt="%.2g s", fontsize=_FONT - 1, padding=4)
     axes.set_yticks(place, list(seconds), fontsize=_FONT)
-    axes.set_xlabel("wall time [s]", fontsize=_FONT)
     axes.margins(x=0.12)
-    axes.grid(True, axis="x", color="#e5e7eb")
-    axes.set_axisbelow(True)
+    _label(axes, "wall time [s]", "", grid="x")
     return figure
 
 
-def _error_dots(ordered: Sequence[tuple[str, float]], limit: float | None, width: float) -> Figure:
+def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> Figure:
+    """PSNR [dB] of each system by the factors that its solver used, ``rows`` (system, factors, PSNR), first on top;
+    ``message`` above."""
+    systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
+    factors = list(dict.fromkeys(name for _, name, _ in rows))
+    figure, axes = _figure(1.3 + 0.46 * len(systems))
+    for place, system in enumerate(systems):
+        values = [value for name, _, value in rows if name == system]
+        axes.plot([min(values), max(values)], [place, place], color=_LINK, lw=2, zorder=1)
+    for index, name in enumerate(factors):
+        points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
+        style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
+        axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
+    axes.set_yticks(range(len(systems)), systems, fontsize=_FONT - 2)
+    _label(axes, "PSNR of the image [dB]", "", grid="x")
+    figure.suptitle(message, fontsize=_FONT)
+    handles, labels = axes.get_legend_handles_labels()
+    _legend_below(figure, handles, labels, len(factors))
+    return figure
+
+
+def shadow_profiles(
+    position_mm: npt.ArrayLike, profiles: Mapping[str, npt.ArrayLike], reach_mm: float, message: str
+) -> Figure:
+    """Shadows on one row of the sensor.
+
+    Parameters
+    ----------
+    position_mm
+        (pixels,) along the row.
+    profiles
+        (pixels,) relative irradiance by light.
+    reach_mm
+        how far from the middle is shown.
+    message
+        above the figure.
+    """
+    figure, axes = _figure(0.4 * _WIDTH)
+    position = np.asarray(position_mm, dtype=np.float64)
+    inside = np.abs(position) <= reach_mm
+    for index, (name, values) in enumerate(profiles.items()):
+        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **_line(index))
+    axes.set_title(message, fontsize=_FONT)
+    _label(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
+    axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    return figure
+
+
+# ---- parts of figures ------------------------------------------------------------------------------------------------
+
+
+def _error_dots(ordered: Sequence[tuple[str, float]], limit: float | None) -> Figure:
     """Dots for values >= 0 in the order given, the last on top, each with its value beside the axes."""
-    figure, axes = _figure(width, 0.7 + 0.36 * len(ordered))
+    figure, axes = _figure(0.7 + 0.36 * len(ordered))
     values = np.array([value for _, value in ordered], dtype=np.float64)
     reference = np.append(values[values > 0], [] if limit is None else limit)
     low, high = (reference.min(), reference.max()) if reference.size else (1e-3, 1e-3)
     left = 10.0 ** np.floor(np.log10(low) - 0.3)
     seen = np.flatnonzero(values > 0)
-    axes.hlines(seen, left, values[seen], color="#d1d5db", lw=2)
+    axes.hlines(seen, left, values[seen], color=_LINK, lw=2)
     axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
     for row, value in enumerate(values):
         _beside(axes, row, 8, f"{value:.1e}" if value > 0 else "0")
@@ -248,9 +274,7 @@ def _error_dots(ordered: Sequence[tuple[str, float]], limit: float | None, width
     axes.set_xlim(left, 3.0 * high)
     axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=_FONT)
     axes.set_ylim(-0.6, len(values) - 0.4)
-    axes.set_xlabel("relative error [1]", fontsize=_FONT)
-    axes.grid(True, axis="x", which="major", color=_GRID)
-    axes.set_axisbelow(True)
+    _label(axes, "relative error [1]", "", grid="x")
     return figure
 
 
@@ -262,30 +286,45 @@ def _beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> N
     )
 
 
-def _draw_front(axes: Axes, front: Sequence[Point]) -> None:
-    """Rings around the points of a Pareto front and the staircase that joins them."""
-    seconds, error = zip(*sorted(front), strict=True)
-    style: dict[str, Any] = {"color": "#6b7280", "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
-    axes.plot(seconds, error, "o", ms=13, mfc="none", mec="#6b7280", mew=1.3, label=_BEST, **style)
+def _draw_front(axes: Axes, points: Sequence[Point]) -> None:
+    """Rings around the points that nothing beats, and the staircase that joins them."""
+    seconds, error = zip(*pareto_front(points), strict=True)
+    style: dict[str, Any] = {"color": _GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
+    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=_GREY, mew=1.3, label=_BEST, **style)
 
 
 def _log_log(axes: Axes) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     low, high = axes.dataLim.intervalx
-    if high < 30 * low:
-        # Ticks at powers of ten alone would leave a short axis with one or none.
+    if high < _SHORT_AXIS * low:
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.grid(True, which="major", color=_GRID)
+
+
+def _line(index: int) -> dict[str, Any]:
+    return {"color": _PALETTE[index % len(_PALETTE)], "ls": _STYLES[index % len(_STYLES)]}
+
+
+def _label(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
+    """Names of the axes, where given, and a grid behind the data."""
+    if x:
+        axes.set_xlabel(x, fontsize=_FONT)
+    if y:
+        axes.set_ylabel(y, fontsize=_FONT)
+    axes.grid(True, which="major", axis=grid, color=_GRID)
     axes.set_axisbelow(True)
 
 
+def _legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
+    figure.legend(handles, labels, fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
+
+
 def _figure(
-    width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained"
+    height: float, width: float = _WIDTH, layout: Literal["constrained", "compressed"] = "constrained"
 ) -> tuple[Figure, Axes]:
-    """An empty figure, width x height in inches, with its own Agg canvas and one open axes."""
+    """An empty figure of that many inches, with its own Agg canvas and one open axes."""
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot()
@@ -293,44 +332,3 @@ def _figure(
         axes.spines[side].set_visible(False)
     axes.tick_params(labelsize=_FONT - 1)
     return figure, axes
-
-
-def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str, width: float = 8.6) -> Figure:
-    """PSNR [dB] of each system by the factors that its solver used, rows (system, factors, PSNR), first on top."""
-    systems = list(dict.fromkeys(system for system, _, _ in rows))
-    factors = list(dict.fromkeys(name for _, name, _ in rows))
-    figure, axes = _figure(width, 1.3 + 0.46 * len(systems))
-    for place, system in enumerate(reversed(systems)):
-        here = [value for one, _, value in rows if one == system]
-        axes.plot([min(here), max(here)], [place, place], color="#d1d5db", lw=2, zorder=1)
-    for index, name in enumerate(factors):
-        values = [(value, len(systems) - 1 - systems.index(one)) for one, kind, value in rows if kind == name]
-        style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
-        axes.plot(*zip(*values, strict=True), ls="", ms=8, label=name, zorder=3, **style)
-    axes.set_yticks(range(len(systems)), reversed(systems), fontsize=_FONT - 2)
-    axes.set_xlabel("PSNR of the image [dB]", fontsize=_FONT)
-    axes.grid(True, axis="x", color=_GRID)
-    axes.set_axisbelow(True)
-    figure.suptitle(message, fontsize=_FONT)
-    figure.legend(fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=len(factors))
-    return figure
-
-
-def shadow_profiles(
-    position_mm: ArrayLike, profiles: Mapping[str, ArrayLike], reach_mm: float, message: str, width: float = 8.6
-) -> Figure:
-    """Shadows {light: relative irradiance of each sensor pixel of one row} within ``reach_mm`` of the middle."""
-    figure, axes = _figure(width, 0.4 * width)
-    position = np.asarray(position_mm, dtype=np.float64)
-    inside = np.abs(position) <= reach_mm
-    for index, (name, values) in enumerate(profiles.items()):
-        shown = np.asarray(values, dtype=np.float64)[inside]
-        style = {"color": PALETTE[index % len(PALETTE)], "ls": _STYLES[index % len(_STYLES)]}
-        axes.plot(position[inside], shown, lw=1.8, label=name, **style)
-    axes.set_xlabel("position on the sensor [mm]", fontsize=_FONT)
-    axes.set_ylabel("irradiance, open sensor = 1 [1]", fontsize=_FONT)
-    axes.grid(True, color=_GRID)
-    axes.set_axisbelow(True)
-    axes.set_title(message, fontsize=_FONT)
-    axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    return figure

@@ -12,22 +12,21 @@ from mitsim.core.runs import load_run
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruction import Reconstruction, inputs, may_replace
 from mitsim.reconstruct.reconstruction import reconstruct as solve
-from mitsim.study.metrics import SSIM_WINDOW, psnr, ssim, truth_for
+from mitsim.study.metrics import Quality, truth_for
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A reconstruction with its quality: ``psnr`` [dB] and ``ssim`` are None for frames without a truth, ``ssim`` also
-    for images smaller than its window; ``output`` is the folder that holds it."""
+    """A reconstruction, its quality (None for frames without a truth), and the folder ``output`` that holds it."""
 
     reconstruction: Reconstruction
-    psnr: float | None
-    ssim: float | None
+    quality: Quality | None
     output: str
 
     def summary(self) -> dict[str, Any]:
         """All but the image, by the keys of the command line's JSON."""
-        return {"psnr": self.psnr, "ssim": self.ssim, **self.reconstruction.summary(), "output": self.output}
+        measured = {"psnr": self.quality and self.quality.psnr_db, "ssim": self.quality and self.quality.ssim}
+        return {**measured, **self.reconstruction.summary(), "output": self.output}
 
 
 def reconstruct(
@@ -66,8 +65,7 @@ def reconstruct(
         image = solve(shots, factors, lam, method)
         judged = Judged(
             reconstruction=replace(image, seconds={"read": read, **image.seconds}),
-            psnr=None if truth is None else psnr(image.image, truth),
-            ssim=None if truth is None or min(truth.shape) < SSIM_WINDOW else ssim(image.image, truth),
+            quality=None if truth is None else Quality.of(image.image, truth),
             output=str(folder),
         )
         judged.reconstruction.write(folder, judged.summary())

@@ -12,77 +12,72 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
+import numpy.typing as npt
 
+from mitsim.capture.plan import PlanRow
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.output import whole_file
 from mitsim.study import plots
-from mitsim.study.images import PATTERN_CORNER, figure_png, finite, pattern_png, reflectance_png
-
-Array = NDArray[Any]
+from mitsim.study.images import PATTERN_CORNER, figure_uri, finite, pattern_uri, reflectance_uri
+from mitsim.study.metrics import Quality
 
 _DASH = "\N{EN DASH}"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_WORTH_TELLING = 0.01
+"""Part of the total time below which what is in no stage is left out: the stages are shown to two digits."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recovery:
-    """One reconstruction: (n, n) reflectance, PSNR [dB, peak 1, no fit], SSIM, the lambda it took, and the
-    solver's sentence, shown only when it says more than "Solved: ...".
+    """One reconstruction.
+
+    Attributes
+    ----------
+    image
+        (n, n) reflectance.
+    quality
+        beside the truth.
+    lam
+        the lambda that it took.
+    status
+        the solver's sentence, shown only when it says more than "Solved: ...".
     """
 
-    image: Array
-    psnr_db: float
-    ssim: float
+    image: FloatArray
+    quality: Quality
     lam: float | None = None
     status: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FamilyResult:
-    """A pattern family, e.g. name "dots:7", label "49 dots". `patterns`: some (n, n) examples, 0..1 or -1..1.
+    """What came of one pattern family.
 
-    `captures` counts frames taken (a signed pattern is two). `idealised` solves the paper's noisy ideal model
-    with its own factors, `rendered` the rendered frames with calibrated factors.
+    Attributes
+    ----------
+    name, label
+        such as "dots:7" and "49 dots".
+    shots
+        frames taken; a signed pattern is two.
+    patterns
+        some (n, n) examples, 0..1 or -1..1.
+    singular_values
+        of its system, relative to the largest.
+    idealised, rendered
+        the paper's noisy ideal model solved with its own factors, and rendered frames with calibrated ones.
+    by_exposure
+        PSNR [dB] of the rendered one by exposure convention.
     """
 
     name: str
     label: str
-    captures: int
-    patterns: tuple[Array, ...] = ()
-    singular_values: Array | None = None
+    shots: int
+    patterns: tuple[FloatArray, ...] = ()
+    singular_values: FloatArray | None = None
     idealised: Recovery | None = None
     rendered: Recovery | None = None
-
-
-@dataclass(frozen=True)
-class CapturedFrame:
-    """One frame as the camera gave it: (m, m) DN, with a short label ("49 dots, frame 1 of 49")."""
-
-    label: str
-    dn: Array
-
-
-@dataclass(frozen=True)
-class ExposureRow:
-    """PSNR in dB of one family under the three exposure conventions; None: not computed."""
-
-    family: str
-    equal_peak_db: float | None = None
-    equal_frame_db: float | None = None
-    equal_total_db: float | None = None
-
-
-@dataclass(frozen=True)
-class CalibrationFacts:
-    """What calibration found: scene pixels a side, frames, relative residuals [1], condition of A_L [1]."""
-
-    n: int
-    frames: int
-    separability_residual: float
-    phi_error: float | None
-    condition: float
-    status: str = ""
+    by_exposure: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -94,41 +89,47 @@ class BudgetRow:
     meaning: str
 
 
-@dataclass(frozen=True)
-class EffectRow:
-    """One line of the effect plan. `state`: exact, approximate or off; error relative [1], cost in s."""
-
-    name: str
-    state: str
-    reason: str
-    error_if_off: float | None = None
-    seconds: float | None = None
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReportData:
     """All that one report shows.
 
-    Images are as seen along +z, row 0 at the top; `truth` (n, n) and `render` (any size) are reflectances,
-    1 = calibration board. `seconds` maps stages to wall time, in order. `exposure_used` says which convention
-    the reconstructions above the table used.
+    Attributes
+    ----------
+    title, verdict, verdict_detail, scene, notes
+        sentences.
+    truth, render
+        (n, n) and any size: reflectances, 1 = calibration board, as seen along +z, row 0 at the top.
+    families
+        first the one that the tiles compare the best with.
+    frames
+        (m, m) [DN] as the camera gave them, by caption.
+    exposure
+        which convention the reconstructions above the table used.
+    calibration
+        what `calibrate --json` says of the session, and its ``status``.
+    budget
+        sources of error, the simulation's own first.
+    accuracy, effects
+        of the plan.
+    seconds
+        wall time by stage, in order.
+    configuration, seeds, versions
+        what repeats it, by name.
     """
 
     title: str
     verdict: str
-    truth: Array
+    truth: FloatArray
     scene: str
     verdict_detail: str = ""
-    render: Array | None = None
-    render_caption: str = ""
+    render: FloatArray | None = None
     families: tuple[FamilyResult, ...] = ()
-    frames: tuple[CapturedFrame, ...] = ()
-    exposure: tuple[ExposureRow, ...] = ()
-    exposure_used: str = ""
-    calibration: CalibrationFacts | None = None
+    frames: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    exposure: str = ""
+    calibration: Mapping[str, Any] | None = None
     budget: tuple[BudgetRow, ...] = ()
     accuracy: float | None = None
-    effects: tuple[EffectRow, ...] = ()
+    effects: tuple[PlanRow, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     configuration: Mapping[str, object] = field(default_factory=dict)
     seeds: Mapping[str, int] = field(default_factory=dict)
@@ -137,28 +138,31 @@ class ReportData:
 
 
 def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
-    """Headline and detail from the rendered results: "49 dots beat uniform by 11.0 dB", and both PSNRs.
+    """Headline and detail from the rendered results of the ``best`` family and of the ``baseline``: "49 dots beat
+    uniform by 11.0 dB", and both PSNRs.
 
-    Raises MitsimError when one of the two has no rendered result.
+    MitsimError when one of the two has no rendered result.
     """
     if best.rendered is None or baseline.rendered is None:
         raise MitsimError(f"report: no rendered result of {best.label} or {baseline.label}; reconstruct both first")
-    gain = best.rendered.psnr_db - baseline.rendered.psnr_db
-    other = baseline.label[:1].lower() + baseline.label[1:]
-    beat = f"{best.label} beat {other} by {gain:.1f} dB"
-    headline = beat if gain >= 0 else f"{best.label}: {-gain:.1f} dB below {other}"
-    ours, theirs = best.rendered.psnr_db, baseline.rendered.psnr_db
+    ours, theirs = best.rendered.quality.psnr_db, baseline.rendered.quality.psnr_db
+    if best.name == baseline.name:
+        return f"{best.label}: {ours:.1f} dB", "PSNR, rendered light and calibrated factors."
+    gain = ours - theirs
+    name = baseline.label[:1].lower() + baseline.label[1:]
+    beat = f"{best.label} beat {name} by {gain:.1f} dB"
+    headline = beat if gain >= 0 else f"{best.label}: {-gain:.1f} dB below {name}"
     detail = f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors."
     if best.idealised is not None and baseline.idealised is not None:
-        ideal = best.idealised.psnr_db - baseline.idealised.psnr_db
+        ideal = best.idealised.quality.psnr_db - baseline.idealised.quality.psnr_db
         detail += f" The idealised model says {ideal:+.1f} dB."
     return headline, detail
 
 
 def build_report(report: ReportData, path: Path) -> Path:
-    """Write the page to `path`, all or nothing, and return it.
+    """Write the page of a ``report`` to ``path``, all or nothing, and return it.
 
-    Raises MitsimError when an image holds values that are not finite or the place cannot be written.
+    MitsimError when an image holds values that are not finite or the place cannot be written.
     """
     text = render_html(report)
     with whole_file(path) as part:
@@ -167,7 +171,7 @@ def build_report(report: ReportData, path: Path) -> Path:
 
 
 def render_html(report: ReportData) -> str:
-    """The page as text; `build_report` writes it."""
+    """The page of a ``report`` as text; `build_report` writes it."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -182,8 +186,8 @@ def render_html(report: ReportData) -> str:
         db=_decibel,
         seconds=_seconds,
         trouble=_trouble,
-        reflectance=reflectance_png,
-        pattern=pattern_png,
+        reflectance=reflectance_uri,
+        pattern=pattern_uri,
     )
     page = environment.get_template("report.html")
     return page.render(
@@ -194,38 +198,32 @@ def render_html(report: ReportData) -> str:
 def _figures(report: ReportData) -> dict[str, Any]:
     """The page's plots as data URIs, by name, where there are data for them; and the total time in s."""
     figures: dict[str, Any] = {"total": report.seconds.get("total", math.fsum(report.seconds.values()))}
-    figures["frames"] = [(f.label, figure_png(plots.frame(finite(f.dn, f.label)))) for f in report.frames]
-    spectra = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
-    if spectra:
-        figures["spectra"] = figure_png(plots.singular_values(spectra))
-    both = [
-        (f.label, f.idealised, f.rendered)
+    figures["frames"] = {name: figure_uri(plots.frame(finite(dn, name))) for name, dn in report.frames.items()}
+    curves = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
+    if curves:
+        figures["singular_values"] = figure_uri(plots.singular_values(curves))
+    both = {
+        f.label: (f.idealised.quality.psnr_db, f.rendered.quality.psnr_db)
         for f in report.families
         if f.idealised is not None and f.rendered is not None
-    ]
+    }
     if both:
-        figures["quality"] = figure_png(
-            plots.quality_bars(
-                [label for label, _, _ in both],
-                [ideal.psnr_db for _, ideal, _ in both],
-                [rendered.psnr_db for _, _, rendered in both],
-            )
-        )
+        figures["quality"] = figure_uri(plots.quality_bars(both))
     positive = {row.name: row.value for row in report.budget if row.value > 0.0}
     if positive:
-        figures["budget"] = figure_png(plots.error_bars(positive, report.accuracy))
+        figures["budget"] = figure_uri(plots.error_bars(positive, report.accuracy))
     figures["stages"] = _stages(report.seconds)
     if figures["stages"]:
-        figures["seconds"] = figure_png(plots.seconds_by_stage(figures["stages"]))
+        figures["seconds"] = figure_uri(plots.seconds_by_stage(figures["stages"]))
     return figures
 
 
 def _stages(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Seconds by stage, and as "not in a stage" what the total holds beside them, where that is more than 1 %."""
+    """Seconds by stage, and as "not in a stage" what the total holds beside them, where that is worth telling."""
     stages = {name: value for name, value in seconds.items() if name != "total"}
     total = seconds.get("total", 0.0)
     rest = total - math.fsum(stages.values())
-    if stages and rest > 0.01 * total:
+    if stages and rest > _WORTH_TELLING * total:
         stages["not in a stage"] = rest
     return stages
 
@@ -234,8 +232,8 @@ def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
     """Name of the family of highest PSNR, for each of the two rows of reconstructions."""
     best: dict[str, str] = {}
     for row in ("idealised", "rendered"):
-        found = {f.name: getattr(f, row).psnr_db for f in families if getattr(f, row) is not None}
-        best[row] = max(found, key=lambda name: found[name]) if found else ""
+        psnr = {f.name: getattr(f, row).quality.psnr_db for f in families if getattr(f, row) is not None}
+        best[row] = max(psnr, key=lambda name: psnr[name]) if psnr else ""
     return best
 
 
@@ -253,9 +251,7 @@ def _decibel(value: float | None) -> str:
     return _DASH if value is None else f"{value:.1f} dB"
 
 
-def _seconds(value: float | None) -> str:
-    if value is None:
-        return _DASH
+def _seconds(value: float) -> str:
     return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
 
 

@@ -17,6 +17,7 @@ from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import relative_error
 
 BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
+"""What a camera with a usual filter sees, in bands of 23 nm, over which a shadow's fringes hardly move."""
 GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
 
 
@@ -24,10 +25,20 @@ GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector
 class ShadowRow:
     """One mask in one light against its geometric shadow; relative rms differences of operators, no unit.
 
-    ``terms``: separable terms of the operator. ``point_source`` and ``scene_pixel``: difference from the geometric
-    shadow, for point sources at the centres of projector pixels and averaged over these pixels. ``factor``: difference
-    of the factor that a solver uses on one side. ``separability``: what the best single separable term leaves of the
-    operator, and ``separability_centred`` once row and column means are taken off its frames.
+    Attributes
+    ----------
+    mask, light
+        of which the row is.
+    wavelengths, terms
+        lines of the light (0: no diffraction), and separable terms of the operator.
+    point_source, scene_pixel
+        difference from the geometric shadow, for point sources at the centres of projector pixels and averaged over
+        these pixels.
+    factor
+        difference of the factor that a solver uses on one side.
+    separability, separability_centred
+        what the best single separable term leaves of the operator, as it is and once row and column means are taken off
+        its frames.
     """
 
     mask: str
@@ -42,7 +53,7 @@ class ShadowRow:
 
 
 def lights(bench: Bench) -> dict[str, Spectrum | None]:
-    """The study's lights by name; None is light that does not diffract."""
+    """The study's lights on ``bench`` by name; None is light that does not diffract."""
     edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
     return {
         GEOMETRIC: None,
@@ -53,7 +64,7 @@ def lights(bench: Bench) -> dict[str, Spectrum | None]:
 
 
 def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
-    """One light's system compared with the geometric one of the same mask."""
+    """The camera in one ``light`` of the ``systems`` of one mask, compared with the geometric one of them."""
     system, geometric = systems[light], systems[GEOMETRIC]
     factor, assumed = system.factors[0], geometric.factors[0]
     # (left, right) and (-left, -right) are one camera.
@@ -72,7 +83,8 @@ def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
 
 
 def point_profiles(bench: Bench) -> dict[str, FloatArray]:
-    """(pixels,) shadow of a point on the axis along one side of the sensor, through the separable mask, by light."""
+    """(pixels,) shadow of a point on the axis of ``bench`` along one side of the sensor, through the separable mask, by
+    light."""
     camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
     return {
         name: best_term(shadow_terms(camera, axis, axis, camera.scene_distance, spectrum)).left[:, 0]

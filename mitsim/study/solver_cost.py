@@ -46,19 +46,37 @@ PRECISIONS: tuple[Precision, ...] = ("float64", "float32 frames", "float32 produ
 METHODS: tuple[Method, ...] = ("svd", "gram")
 LAYOUTS: tuple[Structure, ...] = ("block", "full")
 LAMBDAS = (1e-4, 1e-8, 1e-12)
+"""From what noise calls for to where double precision ends."""
 REPEATS = 3
+"""The best of three is what an idle machine takes."""
 _SCENE_PIXELS, _DOTS, _SCENE_WIDTH = 128, 7, 120.0
+"""The paper's: pixels a side, 49 dots, and the scene's side [mm]."""
 _DIGITS = 1e-18
+"""A hundredth of the rounding of double precision: the exact image is then right to the last bit."""
 _FRACTION_BITS = 160
+"""Of numbers in the judge: 48 digits, far below what is asked of them."""
 _DIVERGED = 10.0
+"""A correction larger than the image times this grows on."""
+_MOST_STEPS = 20
+"""Each correction gains the digits that the conditioning leaves of 16; one digit each is enough."""
 
 
 @dataclass(frozen=True)
 class SolverRow:
     """One form of the solution at one lambda.
 
-    ``lambda_rel`` is lambda over the largest squared singular value; ``seconds`` wall time of one reconstruction;
-    ``error`` relative, against the exact image; ``judge_error`` what that image is uncertain by, relative.
+    Attributes
+    ----------
+    method, precision, layout
+        the form.
+    lambda_rel
+        lambda over the largest squared singular value.
+    seconds
+        wall time of one reconstruction.
+    error, judge_error
+        relative, against the exact image, and what that image is uncertain by.
+    seed
+        of the image.
     """
 
     method: str
@@ -73,9 +91,16 @@ class SolverRow:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Noise-free measurement of one image: ``factor`` Phi (m, n) of both sides, ``k`` x ``k`` shifting dots.
+    """Noise-free measurement of one image under ``k`` x ``k`` shifting dots.
 
-    ``frames`` are (k * k, m, m), pattern (i, j) at i k + j.
+    Attributes
+    ----------
+    factor
+        Phi (m, n) of both sides.
+    k, image
+        patterns a side, and (n, n).
+    frames
+        (k * k, m, m), pattern (i, j) at i k + j.
     """
 
     factor: FloatArray
@@ -95,7 +120,7 @@ class Problem:
 
 
 def dots(n: int, k: int) -> FloatArray:
-    """(n, k) shifting dots."""
+    """(n, k) shifting dots: column i lights every ``k``-th of ``n`` pixels from i on."""
     return np.asarray(np.arange(n)[:, None] % k == np.arange(k), dtype=np.float64)
 
 
@@ -110,19 +135,38 @@ def paper_factor() -> FloatArray:
 
 
 def make_problem(factor: FloatArray, k: int, seed: int) -> Problem:
-    """A random image in 0..1 and its frames through ``factor``."""
+    """A random image in 0..1 and its frames.
+
+    Parameters
+    ----------
+    factor
+        Phi (m, n) of both sides.
+    k
+        dots a side.
+    seed
+        of the image.
+    """
     image = stream(seed, "solver cost").random((factor.shape[1],) * 2)
     sides = [factor[:, i::k] for i in range(k)]
     frames = [sides[i] @ image[i::k, j::k] @ sides[j].T for i, j in product(range(k), repeat=2)]
     return Problem(factor, k, image, np.stack(frames))
 
 
-def solver_costs(
+def time_solver(
     seed: int, progress: Progress, problem: Problem | None = None, repeats: int = REPEATS
 ) -> tuple[SolverRow, ...]:
     """Error and seconds of every form at every lambda of LAMBDAS.
 
-    ``problem`` is the paper's geometry unless another is given.
+    Parameters
+    ----------
+    seed
+        of the image.
+    progress
+        told how far the work is.
+    problem
+        None: the paper's geometry.
+    repeats
+        rounds, of which the fastest counts.
 
     Raises
     ------
@@ -152,12 +196,12 @@ def solver_costs(
             precision=precision,
             layout=layout,
             lambda_rel=relative,
-            seconds=min(timed[index][0] for timed in found),
-            error=relative_error(found[-1][index][1], answers[index][0]),
+            seconds=min(timed[index][0] for timed in rounds),
+            error=relative_error(rounds[-1][index][1], answers[index][0]),
             judge_error=answers[index][1],
             seed=seed,
         )
-        for (method, layout, precision), found in measured.items()
+        for (method, layout, precision), rounds in measured.items()
         for index, relative in enumerate(LAMBDAS)
     )
 
@@ -176,12 +220,12 @@ def _reconstruct(
     prepared = prepare(problem.factor, problem.factor, patterns, patterns, method=method, structure=layout)
     solve = add(prepared, frames, problem.k)
     shared = time.perf_counter() - started
-    found = []
+    timed = []
     for relative in LAMBDAS:
         started = time.perf_counter()
         image = solve(relative * scale)
-        found.append((shared + time.perf_counter() - started, image))
-    return found
+        timed.append((shared + time.perf_counter() - started, image))
+    return timed
 
 
 def _add(prepared: Prepared, frames: npt.NDArray[Any], k: int) -> Callable[[float], FloatArray]:
@@ -223,11 +267,12 @@ class Judge:
         self._eigen = [np.linalg.eigh(_double(gram, 2 * self._bits)) for gram in self._gram]
 
     def image(self, lam: float) -> tuple[FloatArray, float]:
-        """X (n, n) for lambda > 0, rounded to double precision, and its relative error (that of X before rounding)."""
+        """X (n, n) for a lambda ``lam`` > 0, rounded to double precision, and its relative error (that of X before
+        rounding). MitsimError when double precision cannot correct it."""
         image, largest = np.empty_like(self._image), 0.0
         for i, j in product(range(self._k), repeat=2):
-            here = (slice(i, None, self._k), slice(j, None, self._k))
-            image[here], error = self._block(i, j, self._image[here], lam)
+            block = (slice(i, None, self._k), slice(j, None, self._k))
+            image[block], error = self._block(i, j, self._image[block], lam)
             largest = max(largest, error)
         return image, largest
 
@@ -239,16 +284,16 @@ class Judge:
         target = _whole(truth, _FRACTION_BITS)
         gap: Any = np.zeros_like(target)  # E, units of 2^-160
         size = float(np.linalg.norm(truth))
-        for _ in range(20):
+        for _ in range(_MOST_STEPS):
             residual = whole_lam * (target - gap) - self._gram[i] @ gap @ self._gram[j]
             correction = left @ (left.T @ _double(residual, unit + _FRACTION_BITS) @ right / weight) @ right.T
-            found = float(np.linalg.norm(correction)) / size
-            if not found < _DIVERGED:
+            step = float(np.linalg.norm(correction)) / size
+            if not step < _DIVERGED:
                 break
             gap = gap + _whole(correction, _FRACTION_BITS)
-            if found < _DIGITS:
-                return _double(target - gap, _FRACTION_BITS), found
-        raise MitsimError(f"solver study: the exact image did not settle ({found:.1e} left); raise lambda ({lam:g})")
+            if step < _DIGITS:
+                return _double(target - gap, _FRACTION_BITS), step
+        raise MitsimError(f"solver study: the exact image did not settle ({step:.1e} left); raise lambda ({lam:g})")
 
 
 def _whole(values: FloatArray, bits: int) -> Any:

@@ -8,7 +8,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import Digital, Patterns, RunManifest, ShotFile
 from mitsim.core.runs import Capture
-from mitsim.study.metrics import contrast, psnr, relative_error, ssim, truth_for
+from mitsim.study.metrics import Quality, contrast, psnr, relative_error, ssim, truth_for
 
 RNG = np.random.default_rng(11)
 TRUTH = RNG.uniform(0.05, 0.9, (24, 20))
@@ -35,6 +35,11 @@ def test_ssim_is_one_for_equal_and_follows_the_formula_for_flat_images() -> None
 def test_ssim_keeps_the_data_range_of_dark_images() -> None:
     """Images of range 0.01 must not be stretched: noise below the constants (0.03^2) changes SSIM little."""
     assert ssim(0.01 * TRUTH, 0.01 * TRUTH[::-1]) > 0.9
+
+
+def test_quality_of_an_image_smaller_than_the_window_has_no_ssim() -> None:
+    assert Quality.of(TRUTH + 0.1, TRUTH) == Quality(psnr(TRUTH + 0.1, TRUTH), ssim(TRUTH + 0.1, TRUTH))
+    assert Quality.of(TRUTH[:6] + 0.1, TRUTH[:6]) == Quality(pytest.approx(20.0), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("lines", ["vertical", "horizontal"])

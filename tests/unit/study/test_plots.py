@@ -24,7 +24,7 @@ def test_every_axis_has_a_unit() -> None:
         plots.singular_values({"a": np.ones(3)}),
         plots.error_bars({"a": 1e-3}, 1e-2),
         plots.seconds_by_stage({"a": 1.0}),
-        plots.quality_bars(["a"], [20.0], [10.0]),
+        plots.quality_bars({"a": (20.0, 10.0)}),
         plots.pareto({"a": [(1.0, 0.1)]}),
         plots.effect_costs([("a", 1e-3, 0.1)]),
         plots.solver_costs(SOLVER_ROWS),
@@ -37,13 +37,13 @@ def test_every_axis_has_a_unit() -> None:
 
 def test_frame_shows_row_zero_at_the_top_with_its_own_range() -> None:
     values = np.arange(12.0).reshape(3, 4)
-    figure = plots.frame(values, unit="e-")
+    figure = plots.frame(values)
     drawn = figure.axes[0].images[0]
     assert np.array_equal(np.asarray(drawn.get_array()), values)
     assert drawn.get_clim() == (0.0, 11.0)
     low, high = figure.axes[0].get_ylim()
     assert low > high, "rows grow downwards"
-    assert figure.axes[1].get_ylabel() == "signal [e-]"
+    assert figure.axes[1].get_ylabel() == "signal [DN]"
 
 
 def test_singular_values_are_sorted_and_relative_to_the_largest() -> None:
@@ -98,8 +98,6 @@ def test_pareto_rings_the_front_and_draws_the_noise() -> None:
     assert list(zip(*ring.get_data(), strict=True)) == [(1.0, 0.5), (3.0, 0.1), (4.0, 0.05)]
     assert list(np.asarray(lines["sensor noise, 2.0e-01"].get_ydata())) == [0.2, 0.2]
     assert [line.get_linestyle() for line in plots.pareto(series, apart=["b"]).axes[0].lines[:2]] == ["-", "None"]
-    given = plots.pareto(series, front=[(2.0, 0.6)]).axes[0]
-    assert [list(line.get_xdata()) for line in given.lines if line.get_label() == "best for its time"] == [[2.0]]
 
 
 def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.capture.plan import PlanRow
 from mitsim.core.errors import MitsimError
 from mitsim.study import images
 from mitsim.study import report as R
+from mitsim.study.metrics import Quality
 
 N = 32
 
@@ -26,7 +28,7 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
 
     def recovery(decibel: float) -> R.Recovery:
         image = truth + 10 ** (-decibel / 20) * rng.standard_normal((n, n))
-        return R.Recovery(image, decibel, 0.98 - 0.6 * 10 ** (-decibel / 20), 3e-6)
+        return R.Recovery(image, Quality(decibel, 0.98 - 0.6 * 10 ** (-decibel / 20)), 3e-6)
 
     def dots(k: int) -> np.ndarray:
         row = np.arange(n) % k == 0
@@ -44,22 +46,23 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
         R.FamilyResult(
             name,
             label,
-            captures,
+            shots,
             (pattern,),
-            10 ** (-np.linspace(0, 6 / captures**0.4, n)),
+            10 ** (-np.linspace(0, 6 / shots**0.4, n)),
             recovery(a),
             recovery(b),
+            {"equal peak": b, "equal frame": 20.0 + k} | ({} if k == 2 else {"equal total": 19.0 + k}),
         )
-        for name, label, captures, pattern, a, b in rows
+        for k, (name, label, shots, pattern, a, b) in enumerate(rows)
     )
-    frames = tuple(
-        R.CapturedFrame(label, rng.poisson(level * (1 + np.outer(*2 * [np.sin(np.arange(frame_size) / 5)]))))
+    frames = {
+        label: rng.poisson(level * (1 + np.outer(*2 * [np.sin(np.arange(frame_size) / 5)])))
         for label, level in (
             ("Uniform", 2400),
             ("49 dots, frame 1 of 49", 2100),
             ("64 Hadamard, frame 3 of 128", 2300),
         )
-    )
+    }
     headline, detail = R.verdict(families[3], families[0])
     return R.ReportData(
         title="mitsim demo: a printed photograph",
@@ -68,15 +71,17 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
         truth=truth,
         scene="A printed photograph, 400 mm from the camera; a projector beside it lights 120 x 120 mm.",
         render=np.kron(truth, np.ones((2, 2))),
-        render_caption="Seen from the camera's place under uniform light.",
         families=families,
         frames=frames,
-        exposure=tuple(
-            R.ExposureRow(f.label, f.rendered.psnr_db, 20.0 + i, None if i == 2 else 19.0 + i)  # type: ignore[union-attr]
-            for i, f in enumerate(families)
-        ),
-        exposure_used="equal peak, 80 % of full well",
-        calibration=R.CalibrationFacts(128, 512, 1.2e-3, 4.1e-3, 2.6e5, "Factors agree with the noise-free ones."),
+        exposure="equal peak, 80 % of full well",
+        calibration={
+            "n": 128,
+            "frames": 512,
+            "separability_residual": 1.2e-3,
+            "phi_error": 4.1e-3,
+            "condition": 2.6e5,
+            "status": "Factors agree with the noise-free ones.",
+        },
         budget=(
             R.BudgetRow("Monte Carlo noise", 2.1e-4, "Reached; five times below the accuracy asked for."),
             R.BudgetRow("Sensor noise", 6.3e-3, "Shot and read noise of one frame; limits the result."),
@@ -85,10 +90,10 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
         ),
         accuracy=1e-3,
         effects=(
-            R.EffectRow("anchors", "exact", "Lambertian plane: falloff needs 3 a side", 6e-4, 0.1),
-            R.EffectRow("mask diffraction", "approximate", "Fresnel number 3.3 at 550 nm; three lines", 0.36, 0.8),
-            R.EffectRow("interreflection", "off", "one convex sheet: no second bounce", 0.0, 0.0),
-            R.EffectRow("ambient light", "off", "no emitter besides the projector", None, None),
+            PlanRow("anchors", "exact", "Lambertian plane: falloff needs 3 a side", 6e-4, 0.1),
+            PlanRow("mask diffraction", "approximate", "Fresnel number 3.3 at 550 nm; three lines", 0.36, 0.8),
+            PlanRow("interreflection", "off", "one convex sheet: no second bounce", 0.0, 0.0),
+            PlanRow("ambient light", "off", "no emitter besides the projector", None, 0.0),
         ),
         seconds={
             "plan": 0.21,
@@ -163,6 +168,19 @@ def test_an_empty_report_has_no_empty_section() -> None:
     assert re.findall(r"<h2>(.*?)</h2>", page) == ["The scene"]
 
 
+def test_best_of_each_exposure_convention_and_a_dash_where_there_is_none(page: str) -> None:
+    table = page.split("<h2>Exposure decides who wins</h2>")[1].split("</table>")[0]
+    best = re.findall(r'class="n best">(.*?)<', table)
+    assert best == ["31.8 dB", "24.0 dB", "23.0 dB"] and table.count("\N{EN DASH}") == 1
+
+
+def test_an_image_too_small_for_ssim_is_shown_without(page: str) -> None:
+    family = example().families[0]
+    small = replace(family, rendered=R.Recovery(np.ones((4, 4)), Quality(20.0, None)))
+    text = R.render_html(replace(example(), families=(small,)))
+    assert text.count("SSIM") == 1 and page.count("SSIM") == 12, "10 recoveries and 2 tiles"
+
+
 def test_text_cannot_become_markup() -> None:
     page = R.render_html(replace(example(), verdict="<b>&", configuration={"<i>": "</table>"}))
     assert "&lt;b&gt;&amp;" in page and "&lt;/table&gt;" in page and "<i>" not in page
@@ -204,23 +222,24 @@ def test_time_outside_all_stages_is_not_hidden() -> None:
 def test_patterns_are_cut_to_a_corner_where_pixels_can_be_seen() -> None:
     pattern = np.indices((128, 128)).sum(axis=0) % 7 == 0
     corner = images.PATTERN_CORNER
-    assert images.pattern_png(pattern) == images.pattern_png(pattern[:corner, :corner])
-    assert images.pattern_png(pattern) != images.pattern_png(pattern[1 : corner + 1, :corner])
+    assert images.pattern_uri(pattern) == images.pattern_uri(pattern[:corner, :corner])
+    assert images.pattern_uri(pattern) != images.pattern_uri(pattern[1 : corner + 1, :corner])
 
 
 def test_display_clips_but_the_numbers_do_not() -> None:
     bright = np.full((8, 8), 7.0)
-    assert images.reflectance_png(bright) == images.reflectance_png(np.ones((8, 8)))
-    assert images.reflectance_png(bright) != images.reflectance_png(np.full((8, 8), 0.99))
+    assert images.reflectance_uri(bright) == images.reflectance_uri(np.ones((8, 8)))
+    assert images.reflectance_uri(bright) != images.reflectance_uri(np.full((8, 8), 0.99))
 
 
 def test_signed_patterns_show_minus_one_black() -> None:
-    assert images.pattern_png(np.array([[1.0, 0.0, -1.0]])) == images.pattern_png(np.array([[1.0, 0.5, 0.0]]))
+    assert images.pattern_uri(np.array([[1.0, 0.0, -1.0]])) == images.pattern_uri(np.array([[1.0, 0.5, 0.0]]))
 
 
 def test_a_loss_is_called_a_loss() -> None:
     families = example().families
     assert R.verdict(families[0], families[3])[0] == "Uniform: 13.1 dB below 49 dots"
+    assert R.verdict(families[0], families[0])[0] == "Uniform: 18.7 dB", "nothing to compare with"
 
 
 def test_refuses_what_it_cannot_show() -> None:

@@ -23,7 +23,7 @@ from mitsim.study.solver_cost import (
     dots,
     make_problem,
     paper_factor,
-    solver_costs,
+    time_solver,
 )
 
 SEED, K = 5, 2
@@ -38,7 +38,7 @@ def small_problem(condition: float = 100.0, k: int = K) -> Problem:
 
 @pytest.fixture(scope="module")
 def rows() -> tuple[SolverRow, ...]:
-    return solver_costs(SEED, lambda stage, part: None, small_problem(), repeats=1)
+    return time_solver(SEED, lambda stage, part: None, small_problem(), repeats=1)
 
 
 def find(rows: tuple[SolverRow, ...], **wanted: object) -> SolverRow:
@@ -128,7 +128,7 @@ def test_precision_lost_is_what_rounding_predicts(rows: tuple[SolverRow, ...], l
 
 def test_errors_do_not_depend_on_the_run(rows: tuple[SolverRow, ...]) -> None:
     seen: list[float] = []
-    again = solver_costs(SEED, lambda stage, part: seen.append(part), small_problem(), repeats=2)
+    again = time_solver(SEED, lambda stage, part: seen.append(part), small_problem(), repeats=2)
     assert [row.error for row in again] == [row.error for row in rows]
     assert seen == sorted(seen) and seen[-1] == pytest.approx(1.0)
 

@@ -1,0 +1,137 @@
+"""What all studies share: a bench and what to measure in; findings, and the folder that holds them, out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, Protocol
+
+from matplotlib.figure import Figure
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.request import Request
+from mitsim.core.job import Job
+from mitsim.core.manifest import read_json, write_json
+from mitsim.core.output import output_folder, sweep, whole_file
+from mitsim.core.versions import versions
+
+_DPI = 150
+"""Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
+
+
+class Findings(Protocol):
+    """What a study measured."""
+
+    def payload(self) -> dict[str, Any]:
+        """As JSON holds it."""
+
+    def lines(self) -> list[str]:
+        """For people."""
+
+    def figures(self) -> Mapping[str, Figure]:
+        """By file name."""
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """Findings, and where they lie.
+
+    Attributes
+    ----------
+    findings
+        of the study.
+    scene, patterns, output
+        what was studied, and the folder.
+    """
+
+    findings: Findings
+    scene: str
+    patterns: str
+    output: str
+
+    def payload(self) -> dict[str, Any]:
+        """What the command line reports."""
+        where = {"scene": self.scene, "patterns": self.patterns, "output": self.output}
+        return {**self.findings.payload(), **where}
+
+    def lines(self) -> list[str]:
+        """For people."""
+        return [*self.findings.lines(), f"JSON and plots: {self.output}"]
+
+
+Measure = Callable[[Bench, Request, Job], Findings]
+Study = Callable[[Bench, Path | str, Request | None, Job | None], StudyResult]
+
+
+def run_study(
+    name: str,
+    measure: Measure,
+    bench: Bench,
+    output: Path | str,
+    request: Request | None = None,
+    job: Job | None = None,
+) -> StudyResult:
+    """Measure, and write NAME.json and the figures to a folder.
+
+    Parameters
+    ----------
+    name, measure
+        of the study.
+    bench
+        what is studied.
+    output
+        new or empty folder, or one with an earlier study of that name, which is replaced.
+    request
+        patterns and seed, and what else the study takes from it.
+    job
+        clock, progress and limits.
+
+    Raises
+    ------
+    MitsimError
+        for patterns that do not fit, an output that cannot be written or holds something else, a scene without light,
+        or a camera that the study cannot expose.
+    """
+    request = request or Request.of()
+    with study_folder(output, name, ("*.png",)) as folder:
+        findings = measure(bench, request, job or Job())
+        result = StudyResult(findings, str(bench.loaded.path), request.patterns, str(folder))
+        provenance = {"kind": name, "seed": request.seed, "versions": versions()}
+        write_json(folder / f"{name}.json", {**result.payload(), **provenance})
+        for file, figure in findings.figures().items():
+            with whole_file(folder / file) as part:
+                figure.savefig(part, dpi=_DPI, format="png")
+        return result
+
+
+@contextmanager
+def study_folder(output: Path | str, name: str, parts: Sequence[str]) -> Iterator[Path]:
+    """The folder of a study, held while the context lasts.
+
+    Parameters
+    ----------
+    output
+        new or empty, or with an earlier study of that name alone; nothing of it is removed.
+    name
+        of the study; its NAME.json says ``"kind": NAME``.
+    parts
+        patterns of the names of what else an earlier one has written.
+
+    Raises
+    ------
+    MitsimError
+        when the folder holds anything else, or cannot be written.
+    """
+    place, json_name = Path(output), f"{name}.json"
+    earlier = False
+    if (place / json_name).is_file():
+        head = read_json(place / json_name)
+        earlier = isinstance(head, dict) and head.get("kind") == name
+        known = (json_name, ".*", *parts)
+        earlier = earlier and all(any(fnmatch(item.name, one) for one in known) for item in place.iterdir())
+    with output_folder(place, overwrite=earlier) as folder:
+        sweep(folder)
+        yield folder
