@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.manifest import read_json, write_json
 from mitsim.core.output import output_folder, whole_file
@@ -170,21 +170,25 @@ def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator
     expected = len(factors.left), len(factors.right)
     for measurement, row, column in shots.measurements():
         if measurement.shape != expected:
+            captures = shots.manifest.patterns.captures
+            file = next(shot.file for shot in captures if (shot.row, shot.column) == (row, column))
             raise MitsimError(
-                f"{shots.name}: the frame of pattern ({row}, {column}) is {_size(measurement.shape)}, but the "
-                f"calibration's are {_size(expected)}; calibrate this camera"
+                f"{shots.name}/{file}: is {_size(measurement.shape)}, but the calibration's frames are "
+                f"{_size(expected)}; calibrate this camera"
             )
         frames.add(measurement, row, column)
     return prepared, frames
 
 
-def inputs(shots: Capture, factors: Factors, lam: float | Literal["auto"], method: str) -> dict[str, str | float]:
+def inputs(shots: Capture, factors: Factors, lam: float | str, method: str) -> dict[str, str | float]:
     """What decides an image: fingerprints of ``shots`` and ``factors``, ``lam`` and ``method`` as asked for.
 
-    MitsimError for an unknown method.
+    ArgumentError for an unknown method, or another lambda than reconstruct takes.
     """
     if method not in METHODS:
-        raise MitsimError(f"method {method!r}: use {' or '.join(METHODS)}")
+        raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
+    if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < np.inf):
+        raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
     return {"run": shots.fingerprint, "calibration": factors.fingerprint, "lambda": lam, "method": method}
 
 

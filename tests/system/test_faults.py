@@ -52,7 +52,9 @@ def assert_resumed(call: Callable[..., Any], lab: Any, run: Path, whole: Path) -
 def stopped(call: Callable[..., Any], lab: Any, run: Path, whole: Path, how: signal.Signals, least: int) -> None:
     """One run ended by a signal after so many frames, and resumed."""
     done = cut_short(how, least, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS, "--json")
-    said = {signal.SIGINT: "mitsim: interrupted\n", signal.SIGTERM: "mitsim: ended by SIGTERM\n", signal.SIGKILL: ""}
+    ends = {signal.SIGINT: "interrupted", signal.SIGTERM: "ended by SIGTERM"}
+    advice = "finished work is kept, go on with --resume"
+    said = {signal.SIGKILL: "", **{sent: f"mitsim: {end}; {advice}\n" for sent, end in ends.items()}}
     status = -how if how == signal.SIGKILL else 128 + how
     assert (done.returncode, done.stdout, done.stderr) == (status, "", said[how])
     assert len(list(run.glob("frame_*.exr"))) >= least

@@ -42,8 +42,10 @@ def test_a_killed_run_has_whole_frames_only(killed: Path, whole: Path) -> None:
 def test_a_killed_run_is_no_run(refused: Callable[..., str], lab: Any, interrupted: Path) -> None:
     line = refused("reconstruct", "run", "--calibration", lab.calibration)
     assert "run: the capture is incomplete" in line and "--resume" in line
+    frames = len(list(interrupted.glob("frame_*.exr")))
     line = refused("capture", *lab.rig, "-o", "run", "--patterns", PATTERNS)
-    assert "run: the folder holds files already" in line
+    assert "run: the folder holds files already" in line and f"{frames} finished frames" in line
+    assert "go on with --resume" in line and "empty" not in line, "emptying it would throw the frames away"
 
 
 def test_resume_finishes_it(call: Callable[..., Any], lab: Any, interrupted: Path, whole: Path) -> None:
@@ -136,4 +138,5 @@ def test_resume_refuses_a_foreign_folder(refused: Callable[..., str], lab: Any, 
 
 def test_control_c_is_one_line_and_status_130(lab: Any, tmp_path: Path) -> None:
     done = cut_short(signal.SIGINT, 50, "capture", *lab.rig, "-o", tmp_path / "run", "--patterns", PATTERNS, "--json")
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "mitsim: interrupted\n")
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "mitsim: interrupted; finished work is kept, go on with --resume\n"
