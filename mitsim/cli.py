@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 import mitsim
-from mitsim.core.arrays import Progress, silent
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped
@@ -27,6 +27,7 @@ from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
     from mitsim.capture.plan import Plan
+    from mitsim.core.arrays import Progress
     from mitsim.core.job import Job
 
 app = typer.Typer(
@@ -107,11 +108,13 @@ def _spoken(error: MitsimError) -> str:
 def _usage(error: Any) -> str:
     """Click's sentence about a command line, with the value that a typer which checks with pydantic leaves out."""
     message: str = error.format_message()
+    if message.startswith("Usage:"):  # no command was given, and click's sentence is the whole help
+        print(message, file=sys.stderr)
+        return "give one of the commands above"
     checked = getattr(error.__cause__, "errors", None)
     if checked is not None:
         message += f"; got {checked()[0].get('input')!r}"
-    # Without arguments the help has been shown already and says what to do.
-    return message or "give one of the commands above"
+    return message
 
 
 def _fail(message: str) -> None:
@@ -253,10 +256,15 @@ def calibrate(
         bench = _open(scene, variant, camera, projector, define, outside)
         factors = bench.calibrate(seed, accuracy, session, output, resume, job)
     payload = {**factors.manifest.result, "output": str(output)}
+    # JSON has no numbers beyond the finite ones.
+    residual, clean, error, condition = (
+        math.inf if payload[name] is None else payload[name]
+        for name in ("separability_residual", "noise_free_residual", "phi_error", "condition")
+    )
     lines = [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
-        f"separability residual {payload['separability_residual']:.2%} ({payload['noise_free_residual']:.1e} without "
-        f"noise), factor error {payload['phi_error']:.1e}, condition {payload['condition']:.2e}",
+        f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
+        f"{condition:.2e}",
     ]
     return _finish(as_json, payload, lines, factors.warnings)
 
@@ -440,6 +448,8 @@ def _job(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = 
 def _progress(hidden: bool) -> Iterator[Progress]:
     """A progress bar on stderr; nothing when asked to be quiet, or when stderr is no terminal."""
     if hidden or not sys.stderr.isatty():
+        from mitsim.core.arrays import silent
+
         yield silent
         return
     from rich.console import Console

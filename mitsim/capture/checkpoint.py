@@ -109,12 +109,12 @@ def claimed_session(
 def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
     manifest = read_json(path / MANIFEST)
     if not isinstance(manifest, dict) or manifest.get("kind") != KIND:
-        raise MitsimError(f"resume: {path}/{MANIFEST} is not that of a calibration; use another folder")
+        raise MitsimError(f"resume=True: {path}/{MANIFEST} is not that of a calibration; use another folder")
     before = manifest.get("configuration")
     before = before if isinstance(before, dict) else {}
     changed = [key for key in {**configuration, **before} if before.get(key) != configuration.get(key)]
     if changed:
         raise MitsimError(
-            f"resume: {path} holds a session of another configuration ({', '.join(changed)} differ); "
+            f"resume=True: {path} holds a session of another configuration ({', '.join(changed)} differ); "
             "use the same options, or another folder"
         )

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
 
@@ -264,9 +264,10 @@ def parse_switches(text: str) -> dict[str, bool]:
     switches: dict[str, bool] = {}
     for word in filter(None, (part.strip() for part in text.split(","))):
         if word[0] not in "+-" or word[1:] not in SWITCHES:
-            raise MitsimError(f"effects {text!r}: {word!r} is not +NAME or -NAME; the names are {', '.join(SWITCHES)}")
+            allowed = ", ".join(SWITCHES)
+            raise ArgumentError("effects", f"{text!r}: {word!r} is not +NAME or -NAME; the names are {allowed}")
         if switches.get(word[1:], word[0] == "+") != (word[0] == "+"):
-            raise MitsimError(f"effects {text!r}: {word[1:]} is switched both on and off; keep one")
+            raise ArgumentError("effects", f"{text!r}: {word[1:]} is switched both on and off; keep one")
         switches[word[1:]] = word[0] == "+"
     return switches
 

@@ -275,7 +275,7 @@ def read_head(folder: Path) -> RunHead:
     """The head of the run in ``folder``, finished or not; MitsimError when it holds none."""
     data = read_json(folder / MANIFEST)
     if not isinstance(data, dict) or data.get("kind") != "capture":
-        raise MitsimError(f"resume: {folder}/{MANIFEST} is not that of a capture; use another folder")
+        raise MitsimError(f"resume=True: {folder}/{MANIFEST} is not that of a capture; use another folder")
     return validated(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
 
 

@@ -439,7 +439,7 @@ def _checked(path: Path, head: RunHead) -> Mapping[str, str]:
     if before.configuration_sha256 != head.configuration_sha256:
         changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
         raise MitsimError(
-            f"resume: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
+            f"resume=True: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
             "use the same options, or another folder"
         )
     return read_manifest(path, RunManifest).checksums if before.status == "complete" else {}

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.manifest import read_json, write_json
 from mitsim.core.output import output_folder, whole_file
@@ -172,7 +172,7 @@ def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator
     return prepared, frames
 
 
-def inputs(shots: Capture, factors: Factors, lam: float | Literal["auto"], method: str) -> dict[str, str | float]:
+def inputs(shots: Capture, factors: Factors, lam: float | str, method: str) -> dict[str, str | float]:
     """What decides an image.
 
     Parameters
@@ -180,10 +180,12 @@ def inputs(shots: Capture, factors: Factors, lam: float | Literal["auto"], metho
     shots, factors
         told by their fingerprints.
     lam, method
-        as asked for; MitsimError for an unknown method.
+        as asked for; ArgumentError for an unknown method, or another lambda than reconstruct takes.
     """
     if method not in METHODS:
-        raise MitsimError(f"method {method!r}: use {' or '.join(METHODS)}")
+        raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
+    if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < np.inf):
+        raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
     return {"run": shots.fingerprint, "calibration": factors.fingerprint, "lambda": lam, "method": method}
 
 

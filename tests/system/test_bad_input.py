@@ -32,7 +32,7 @@ def mentions(line: str, *fragments: str) -> None:
         ("render", "-o", "new.exr"),
         ("render", "-o", "new.exr", "--estimator", "factored"),
         ("study", "accuracy", *NEW),
-        ("demo", *NEW, "--scene"),
+        ("demo", *NEW),
     ],
     ids=lambda verb: verb[0],
 )
@@ -224,7 +224,10 @@ def test_calibrate_refuses(refused: Refused, lab: Any, options: list[str], fragm
         (["--spp", "many"], ["'many'"]),
         (["--estimator", "fast"], ["'fast'", "reference or factored"]),
         (["--estimator", "factored", "--accuracy", "0"], ["--accuracy 0"]),
-        (["--spp", "100000", "--max-seconds", "0.1"], ["--spp 100000: would take about", "allowed are 0.1 s"]),
+        (
+            ["--spp", "100000", "--max-seconds", "0.1"],
+            ["100000 samples a pixel: would take about", "allowed are 0.1 s"],
+        ),
         (["--estimator", "factored", "--max-memory", "0.1"], ["would take about", "of memory"]),
         (["--seed", "-1"], ["-1"]),
         (["--variant", "llvm_ad_grey"], ["llvm_ad_grey"]),
@@ -276,7 +279,7 @@ def test_a_study_refuses_patterns_that_do_not_fit(refused: Refused, lab: Any) ->
 
 
 def test_a_demo_refuses_a_projector_too_small_for_its_families(refused: Refused, lab: Any) -> None:
-    mentions(refused("demo", *NEW, "--scene", lab.write_scene("tiny", n=4)), "dots:", "4")
+    mentions(refused("demo", *NEW, lab.write_scene("tiny", n=4)), "dots:", "4")
 
 
 # ---- camera, projector and recipe files ------------------------------------------------------------------------------
@@ -360,7 +363,7 @@ def to(request: pytest.FixtureRequest, lab: Any) -> Callable[[str], tuple[object
         "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration),
         "render": ("render", lab.scene, "--spp", "4"),
         "study": ("study", "accuracy", lab.scene),
-        "demo": ("demo", "--scene", lab.scene),
+        "demo": ("demo", lab.scene),
     }[request.param]
     return lambda output: (*verb, "-o", output)
 
@@ -397,7 +400,7 @@ def test_a_folder_that_holds_something(refused: Refused, lab: Any, tmp_path: Pat
     arguments = {
         "capture": ("capture", *lab.rig, "--patterns", "dots:4"),
         "calibrate": ("calibrate", *lab.rig),
-        "demo": ("demo", "--scene", lab.scene),
+        "demo": ("demo", lab.scene),
         "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration),
     }[verb]
     mentions(refused(*arguments, "-o", "mine"), "mine", "holds files")

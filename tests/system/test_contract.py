@@ -88,7 +88,9 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     assert_seconds(found["seconds"])
     assert found["output"] == str(tmp_path / "image")
     assert sorted(path.name for path in (tmp_path / "image").iterdir()) == ["image.exr", "image.png", "result.json"]
-    assert json.loads((tmp_path / "image" / "result.json").read_text()) == found
+    written = json.loads((tmp_path / "image" / "result.json").read_text())
+    assert written.pop("inputs").keys() == {"run", "calibration", "lambda", "method"}
+    assert written == found
 
 
 def test_reconstruct_writes_into_the_run_by_default(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
@@ -157,7 +159,7 @@ def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], la
     for verb in (("plan", *lab.rig), ("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4")):
         outcome = call(*verb, "--effects=-diffraction", "--accuracy", "0.005", "--json")
         assert outcome.code == 1
-        assert outcome.payload["warnings"] and "no diffraction" in outcome.payload["warnings"][0]
+        assert outcome.payload["warnings"] and "diffraction (off)" in outcome.payload["warnings"][0]
         lines = outcome.err.splitlines()
         assert len(lines) == len(outcome.payload["warnings"])
         assert all(line.startswith("mitsim: warning: ") for line in lines)
@@ -182,7 +184,7 @@ def test_a_program_error_is_not_hidden(call: Callable[..., Any], monkeypatch: py
     def broken(*arguments: object) -> None:
         raise ZeroDivisionError("planted")
 
-    monkeypatch.setattr("mitsim.capture.light.make_plan", broken)
+    monkeypatch.setattr("mitsim.capture.run.make_plan", broken)
     with pytest.raises(ZeroDivisionError, match="planted"):
         call("plan", *lab.rig)
 

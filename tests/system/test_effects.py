@@ -48,7 +48,7 @@ def test_a_plan_as_json(call: Callable[..., Any], lab: Any) -> None:
         assert all(set(row) >= ROW and row["seconds"] >= 0 for row in rows.values())
         assert block["accuracy"] == 0.005 and block["predicted_seconds"] > 0
     rows = {row["name"]: row for row in forced["effects"]}
-    assert rows["diffraction"]["state"] == "off" and "--effects" in rows["diffraction"]["reason"]
+    assert rows["diffraction"]["state"] == "off" and "by the user" in rows["diffraction"]["reason"]
     assert rows["anchors"]["state"] == "approximate" and rows["ambient"]["state"] == "exact"
 
 

@@ -42,7 +42,8 @@ def recover(call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path
 
     @cache
     def recovered(patterns: str, *options: object) -> dict[str, Any]:
-        return call("reconstruct", runs(patterns)[0], "--calibration", lab.calibration, "--json", *options).payload
+        arguments = "--calibration", lab.calibration, "--overwrite", "--json", *options
+        return call("reconstruct", runs(patterns)[0], *arguments).payload
 
     return recovered
 
@@ -146,13 +147,32 @@ def test_no_total_variation_at_all_is_least_squares(recover: Callable[..., Any])
     assert recover("dots:4", "--method", "tv", "--lambda", 0)["psnr"] == pytest.approx(plain["psnr"], abs=0.5)
 
 
-def test_a_second_reconstruction_replaces_the_first(
+def test_a_second_reconstruction_replaces_the_first_when_it_is_asked_to(
     call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
 ) -> None:
-    options = "--calibration", lab.calibration, "-o", tmp_path / "image", "--json"
-    for value in (1.0, 1e9):
-        call("reconstruct", runs("dots:4")[0], *options, "--lambda", value)
-        assert json.loads((tmp_path / "image" / "result.json").read_text())["lambda"] == value
+    """Of the same inputs at once; of others with --overwrite alone, and the refusal says what differs."""
+    run, image = runs("dots:4")[0], tmp_path / "image"
+    options = "--calibration", lab.calibration, "-o", image, "--json"
+
+    def written() -> object:
+        return json.loads((image / "result.json").read_text())["lambda"]
+
+    for _ in range(2):
+        call("reconstruct", run, *options, "--lambda", 1.0)
+        assert written() == 1.0
+    before = {path.name: path.read_bytes() for path in image.iterdir()}
+    for other, differ in (
+        (("--lambda", 1e9), "lambda differ"),
+        (("--lambda", 1.0, "--method", "tv"), "method differ"),
+        ((), "lambda differ"),
+    ):
+        line = call("reconstruct", run, *options, *other).refusal
+        assert str(image) in line and f"({differ})" in line and "--overwrite" in line
+    line = call("reconstruct", runs("hadamard:4")[0], *options, "--lambda", 1.0).refusal
+    assert "(run differ)" in line
+    assert {path.name: path.read_bytes() for path in image.iterdir()} == before
+    call("reconstruct", run, *options, "--lambda", 1e9, "--overwrite")
+    assert written() == 1e9
 
 
 def test_the_same_seed_gives_the_same_frames_and_another_gives_others(

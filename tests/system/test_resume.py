@@ -44,9 +44,11 @@ def test_a_killed_run_has_whole_frames_only(killed: Path, whole: Path) -> None:
 
 def test_a_killed_run_is_no_run(refused: Callable[..., str], lab: Any, interrupted: Path) -> None:
     line = refused("reconstruct", "run", "--calibration", lab.calibration)
-    assert "run: the capture is incomplete" in line and "resume" in line
+    assert "run: the capture is incomplete" in line and "--resume" in line
+    frames = len(list(interrupted.glob("frame_*.exr")))
     line = refused("capture", *lab.rig, "-o", "run", "--patterns", PATTERNS)
-    assert "run: the folder holds files already: an unfinished capture with" in line and "resume" in line
+    assert "run: the folder holds files already" in line and f"{frames} finished frames" in line
+    assert "go on with --resume" in line and "empty" not in line, "emptying it would throw the frames away"
 
 
 def test_resume_finishes_it(call: Callable[..., Any], lab: Any, interrupted: Path, whole: Path) -> None:

@@ -1,0 +1,78 @@
+"""What may be asked of a bench: one model, whose refusals name the argument, the value and what is allowed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from mitsim.capture.request import Exposure, Request
+from mitsim.core.errors import ArgumentError, MitsimError
+
+
+def test_what_is_asked_by_default() -> None:
+    request = Request.of()
+    assert (request.patterns, request.accuracy, request.seed, request.exposure) == ("dots:7", 1e-3, 0, "auto")
+    assert (request.exposure_fraction, request.effects, request.noise_fraction) == (0.8, {}, None)
+    assert request.timing == Exposure(None, 0.8)
+    assert Request.of(exposure=0.01).timing == Exposure(0.01, 0.8)
+
+
+def test_effects_may_be_written_as_on_the_command_line() -> None:
+    assert Request.of(effects="+ambient,-diffraction").effects == {"ambient": True, "diffraction": False}
+    assert Request.of(effects={"ambient": True}).effects == {"ambient": True}
+    assert Request.of(effects="").effects == {}
+
+
+def test_a_request_is_a_value() -> None:
+    """Frozen, and equal to another of the same fields; a change gives another one."""
+    request = Request.of(seed=3)
+    assert request == Request.of(seed=3) and request.changed(seed=3) == request
+    assert request.changed(patterns="uniform") == Request.of(seed=3, patterns="uniform")
+    with pytest.raises(ValueError, match="frozen"):
+        request.seed = 4  # type: ignore[misc]
+    assert Request.of(**request.model_dump(mode="json")) == request, "as the manifest holds it"
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "allowed"),
+    [
+        *(("accuracy", value, "from 1e-06 to 0.3") for value in (0.0, -1e-3, 0.5, math.nan, math.inf)),
+        *(("noise_fraction", value, "from 0.001 to 1") for value in (1e-300, 0.0, -0.1, 1.5, math.nan, 5e-324)),
+        *(("exposure", value, "above 0, up to 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
+        *(("exposure_fraction", value, "above 0, up to 1") for value in (0.0, -0.5, 1.01, math.nan)),
+        *(("effects", value, "diffraction") for value in ("fog", "+fog", "diffraction", {"fog": True})),
+        ("effects", "+ambient,-ambient", "keep one"),
+    ],
+)
+def test_values_out_of_range_name_the_argument(argument: str, value: Any, allowed: str) -> None:
+    """As Python spells it: the command line alone writes dashes."""
+    with pytest.raises(ArgumentError) as caught:
+        Request.of(**{argument: value})
+    line = str(caught.value)
+    assert caught.value.argument == argument and line.startswith(f"{argument} ")
+    assert allowed in line and "\n" not in line and "--" not in line
+    if isinstance(value, float):
+        assert str(value) in line or f"{value:g}" in line
+
+
+@pytest.mark.parametrize(
+    ("values", "fragments"),
+    [
+        ({"acuracy": 1e-3}, ["acuracy", "did you mean accuracy?", "noise_fraction"]),
+        ({"seed": 1.5}, ["seed", "1.5", "integer"]),
+        ({"seed": True}, ["seed", "True"]),
+        ({"seed": "1"}, ["seed", "'1'"]),
+        ({"accuracy": "fine"}, ["accuracy", "'fine'"]),
+        ({"accuracy": True}, ["accuracy", "True"]),
+        ({"exposure": "long"}, ["exposure", "'long'"]),
+        ({"patterns": 7}, ["patterns", "7"]),
+    ],
+    ids=str,
+)
+def test_values_of_another_kind_are_refused(values: dict[str, Any], fragments: list[str]) -> None:
+    with pytest.raises(MitsimError) as caught:
+        Request.of(**values)
+    assert all(fragment in str(caught.value) for fragment in fragments), str(caught.value)
+    assert "\n" not in str(caught.value)
