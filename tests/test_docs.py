@@ -41,14 +41,6 @@ ELSEWHERE = {"--check", "--strict"}
 NO_MODULES = {"mitsim.key"}
 """Names in the docs that only look like modules: metadata of OpenEXR files."""
 
-MODULES_PENDING = {
-    "mitsim/capture/run.py",
-    "mitsim/optics/frames.py",
-    "mitsim/scene/guard/check.py",
-    "mitsim/study/compare.py",
-}
-"""Modules that still mention a design page."""
-
 ACCURACY = "0.02"
 """For examples that name none: how the verbs fit together does not depend on it, and they take a tenth of the time."""
 
@@ -261,7 +253,7 @@ def resolves(dotted: str) -> bool:
 def test_nothing_refers_to_a_page_that_is_not_there() -> None:
     modules = [path.relative_to(ROOT).as_posix() for path in (ROOT / "mitsim").rglob("*.py")]
     offenders = {name for name in [*PAGES, *modules] if re.search(r"\bDESIGN\b|design page", text_of(name))}
-    assert offenders <= MODULES_PENDING, offenders - MODULES_PENDING
+    assert not offenders
 
 
 def test_the_first_screen_says_what_shows_a_picture_and_two_commands() -> None:

@@ -63,8 +63,17 @@ def scaled(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]) -> str:
-    """HTML of an object in a notebook: its ``title``, reflectances or scaled ``pictures`` by caption, lines of
-    ``facts``."""
+    """HTML of an object in a notebook.
+
+    Parameters
+    ----------
+    title
+        above all.
+    pictures
+        reflectances, or numbers scaled to 0..1, by caption.
+    facts
+        lines below them.
+    """
     sources = {caption: data_uri(png(values, _LARGEST_INLINE)) for caption, values in pictures.items()}
     figures = "".join(
         '<figure style="display:inline-block;margin:0 8px 4px 0">'

@@ -13,9 +13,7 @@ from mitsim.capture.plan import Plan
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.frames import ExpectedFrames
 
-CELLS = (1, 2, 4)
-ANCHORS = (1, 2, 3, 5)
-LAYERS = (1, 2, 4, 8)
+CELLS, ANCHORS, LAYERS = (1, 2, 4), (1, 2, 3, 5), (1, 2, 4, 8)
 """Cells of a pixel and anchors a side, and layers: each about halves the error of the one before."""
 LINE_WIDTH_NM = 2.0
 """Assumed width of a laser diode's line, for the finer spectrum."""

@@ -255,7 +255,7 @@ def _add_single(prepared: Prepared, frames: npt.NDArray[Any], k: int) -> Callabl
 
 
 class Judge:
-    """The Tikhonov image of a problem's exact frames, by refinement with residuals in exact integer arithmetic."""
+    """The Tikhonov image of the exact frames of a ``problem``, refined with residuals in exact integer arithmetic."""
 
     def __init__(self, problem: Problem) -> None:
         self._image, self._k = problem.image, problem.k

@@ -1,4 +1,4 @@
-"""The property that makes the effect plan honest, on the shipped scenes (DESIGN section 6).
+"""The property that makes the effect plan honest, on the shipped scenes.
 
 Switching on what the plan left off changes the expected frames by less than the accuracy; switching off what it put on
 changes them by more. Changes are measured apart from the pilot (:mod:`tests.physics.plan_property`), on CAPTURES of the

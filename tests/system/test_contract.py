@@ -1,4 +1,4 @@
-"""What other programs may rely on (DESIGN section 7): verbs, JSON keys, exit statuses, and where output goes."""
+"""What other programs may rely on: verbs, JSON keys, exit statuses, and where output goes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_plan(call: Callable[..., Any], lab: Any) -> None:
         assert isinstance(effect["reason"], str) and effect["reason"]
         assert effect["error_if_off"] is None or number(effect["error_if_off"])
         assert number(effect["seconds"])
-    # The names are those that DESIGN section 6 lists.
+    # The names are those that docs/formats.md lists.
     names = " ".join(effect["name"] for effect in plan["effects"])
     for effect in ("anchors", "layers", "interreflection", "aperture", "ambient", "diffraction", "thickness", "noise"):
         assert effect in names

@@ -60,7 +60,7 @@ def test_every_family_is_captured_and_recovered(
     assert least < found["psnr"] < least + 20 and found["rank"] == 256
     image = read_frame(Path(found["output"]) / "image.exr")[0]["reflectance"]
     truth = read_frame(run / "truth.exr")[0]["reflectance"]
-    # PSNR is peak 1 with no gain or offset fit (DESIGN section 5), so that anyone can compute it from the files.
+    # PSNR is peak 1 with no gain or offset fit, so that anyone can compute it from the files.
     assert found["psnr"] == pytest.approx(-10 * np.log10(np.mean((image - truth.astype(float)) ** 2)), abs=1e-3)
 
 

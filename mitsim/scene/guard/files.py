@@ -53,7 +53,15 @@ class SceneFiles:
         return path
 
     def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
-        """Allow the spectrum ``name`` at ``tag``, where Mitsuba looks for it first; MitsimError as a resource."""
+        """Allow the file of a spectrum; MitsimError as for :meth:`resource`.
+
+        Parameters
+        ----------
+        tag, name
+            that asks for it, and by which name.
+        folder
+            where Mitsuba looks for it first.
+        """
         if self._found(tag, folder, name).stat().st_size > _MOST_SPECTRUM:
             raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
 

@@ -33,7 +33,15 @@ class Range:
     hint: str = ""
 
     def check(self, tag: Tag, name: str, numbers: Iterable[float]) -> None:
-        """MitsimError at ``tag`` for the first of ``numbers``, called ``name``, that is not allowed."""
+        """MitsimError for the first number that is not allowed.
+
+        Parameters
+        ----------
+        tag, name
+            where it stands, and what it is called.
+        numbers
+            in order.
+        """
         for number in numbers:
             if not np.isfinite(number):
                 raise tag.refusal(name, number, "give a finite number")
@@ -102,8 +110,17 @@ TABLES = ("value", "values", "color", "color0", "color1", "scale")
 
 
 def check_transform(tag: Tag, name: str, matrix: npt.NDArray[np.float64], rigid: bool) -> None:
-    """MitsimError at ``tag`` when the (4, 4) ``matrix`` cannot be undone, or when ``rigid`` and it does more than turn
-    and move."""
+    """MitsimError for a transform that cannot be undone.
+
+    Parameters
+    ----------
+    tag, name
+        where it stands, and what it is called.
+    matrix
+        (4, 4).
+    rigid
+        whether it may only turn and move.
+    """
     if not np.isfinite(matrix).all():
         raise tag.refusal(name, np.nan, "give finite numbers")
     turn = matrix[:3, :3]

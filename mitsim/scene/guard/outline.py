@@ -55,7 +55,15 @@ class Tag:
         return f"<{cut(self.name + written, 200)}>"
 
     def refusal(self, what: str, value: object, rule: str) -> MitsimError:
-        """``file:line: what: got value in <tag ...>; rule``, to be raised."""
+        """``file:line: what: got value in <tag ...>; rule``, to be raised.
+
+        Parameters
+        ----------
+        what, value
+            what is wrong, and what was given.
+        rule
+            what is allowed, and what to do.
+        """
         got = cut(value if isinstance(value, str) else f"{value:g}")
         return MitsimError(f"{self.path}:{self.line}: {cut(what)}: got {got} in {self}; {rule}")
 
@@ -100,7 +108,7 @@ class Outline:
                 raise MitsimError(f"-D {cut(name)}={cut(defines[name])}: {place}; it knows {known}")
 
     def tag(self, node: mi.parser.SceneNode, name: str = "") -> Tag:
-        """The tag of an object, or that of its property ``name``."""
+        """The tag of the object ``node``, or that of its property ``name``."""
         key = node.file_index, node.offset
         return self._tags.get((*key, name)) or self._tags[(*key, "")]
 
