@@ -148,3 +148,19 @@ def test_the_rule_catches_a_planted_function(source: str, left_out: list[str]) -
 )
 def test_the_rule_lets_private_functions_be(source: str) -> None:
     assert not [name for name, names, _ in public_functions(source) if names]
+
+
+MOST_PARAMETERS = 7
+"""Chosen: more ask for a type that holds what travels together. The command line's verbs take their options from one."""
+
+
+def test_no_function_takes_more_than_seven_parameters() -> None:
+    long = [
+        f"{module}.{node.name}: {len(names)}"
+        for module, path in modules()
+        for node in ast.walk(ast.parse(Path(path).read_text(encoding="utf-8")))
+        if isinstance(node, Function)
+        and not any(ast.unparse(decorator).startswith("app.") for decorator in node.decorator_list)
+        and len(names := {*parameters(node)} - {"self", "cls"}) > MOST_PARAMETERS
+    ]
+    assert not long, long

@@ -205,3 +205,19 @@ def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Pa
     )
     found = effects.present(open_bench(small_scene(), projector=projector))
     assert found == ("interreflection", "diffraction", "aperture", "blur", "black-level", "speckle")
+
+
+def test_the_pace_of_frames_is_that_of_one_cell_a_pixel(
+    bench: Bench, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plan multiplies it by cells and layers: measured with two cells a pixel it was 1.5 times too high."""
+    timed: list[Settings] = []
+
+    def seconds(self: direct.FineLight, simulation: Simulation) -> float:
+        timed.append(simulation.settings)
+        return 1.0
+
+    monkeypatch.setattr(direct.FineLight, "_seconds", seconds)
+    assert len(evidence.layers) > 1, "the first frames that are formed have two cells a pixel"
+    assert measured(bench, seed=3).seconds_per_frame == 1.0
+    assert [(one.subdivision, one.layers, one.anchors) for one in timed] == [(1, (), 1)]

@@ -281,3 +281,11 @@ def test_samples_take_the_fewest_paths_for_the_target() -> None:
     assert math.sqrt(variance / GROUPS) == pytest.approx(found.sampling_target)
     ratios = [count / math.sqrt(effort.variance / effort.paths) for effort, count in zip(efforts, counts, strict=True)]
     assert ratios == pytest.approx([ratios[0]] * 3) and min(counts) > 1
+
+
+@pytest.mark.parametrize(
+    ("keystone", "state", "words"), [(0.0, "off", "squarely"), (2.5, "exact", "2.5 of its pixels")]
+)
+def test_a_keystone_is_there_or_not(keystone: float, state: str, words: str) -> None:
+    row = rows(plan(facts=replace(FACTS, keystone=keystone)))["keystone"]
+    assert row.state == state and words in row.reason
