@@ -151,7 +151,7 @@ def test_the_rule_lets_private_functions_be(source: str) -> None:
 
 
 MOST_PARAMETERS = 7
-"""Chosen: more ask for a type that holds what travels together. The command line's verbs take their options from one."""
+"""Chosen: more ask for a type of what travels together. The verbs of the command line take their options from one."""
 
 
 def test_no_function_takes_more_than_seven_parameters() -> None:
