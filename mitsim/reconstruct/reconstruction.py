@@ -173,7 +173,7 @@ def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator
             captures = shots.manifest.patterns.captures
             file = next(shot.file for shot in captures if (shot.row, shot.column) == (row, column))
             raise MitsimError(
-                f"{shots.name}/{file}: is {_size(measurement.shape)}, but the calibration's frames are "
+                f"{shots.name}/{file}: is {_size(measurement.shape)}, but the calibration's are "
                 f"{_size(expected)}; calibrate this camera"
             )
         frames.add(measurement, row, column)
