@@ -30,7 +30,7 @@ def test_effects_that_make_no_sense(refused: Callable[..., str], lab: Any, verb:
         assert all(name in line for name in SWITCHES)
 
 
-@pytest.mark.parametrize("fraction", ["2", "0", "-1", "nan", "much"])
+@pytest.mark.parametrize("fraction", ["2", "0", "-1", "1e-300", "nan", "much"])
 def test_noise_fractions_that_make_no_sense(refused: Callable[..., str], lab: Any, fraction: str) -> None:
     line = refused("capture", *lab.rig, "-o", "new", "--patterns", "dots:4", "--noise-fraction", fraction)
     assert "--noise-fraction" in line and fraction in line

@@ -40,8 +40,8 @@ def test_a_request_is_a_value() -> None:
     [
         *(("accuracy", value, "from 1e-06 to 0.3") for value in (0.0, -1e-3, 0.5, math.nan, math.inf)),
         *(("noise_fraction", value, "from 0.001 to 1") for value in (1e-300, 0.0, -0.1, 1.5, math.nan, 5e-324)),
-        *(("exposure", value, "above 0, up to 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
-        *(("exposure_fraction", value, "above 0, up to 1") for value in (0.0, -0.5, 1.01, math.nan)),
+        *(("exposure", value, "to 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
+        *(("exposure_fraction", value, "to 1") for value in (0.0, -0.5, 1.01, math.nan)),
         *(("effects", value, "diffraction") for value in ("fog", "+fog", "diffraction", {"fog": True})),
         ("effects", "+ambient,-ambient", "keep one"),
     ],

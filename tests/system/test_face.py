@@ -1,0 +1,375 @@
+"""The Python face: `import mitsim as ms` gives all that the command line does, lazily, and the same numbers."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.capture import light, run
+from mitsim.core.framefile import read_frame
+
+pytestmark = pytest.mark.usefixtures("variant")
+ACCURACY, SEED = 0.02, 4
+ALBEDO = 0.4
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path]) -> ms.Bench:
+    return ms.open_bench(shared_scene("face"), albedo=ALBEDO)
+
+
+@pytest.fixture(scope="module")
+def shots(bench: ms.Bench) -> ms.Capture:
+    return bench.capture("dots:3", accuracy=ACCURACY, seed=SEED)
+
+
+@pytest.fixture(scope="module")
+def factors(bench: ms.Bench) -> ms.Factors:
+    return bench.calibrate(accuracy=ACCURACY)
+
+
+# ---- names -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_name_is_fetched_from_its_home_when_it_is_used() -> None:
+    """In a process of its own, each name first: whatever else was imported, it is the same object."""
+    program = """
+import importlib, sys
+import mitsim as ms
+assert not {"numpy", "scipy", "mitsuba", "drjit", "pydantic"} & set(sys.modules), "the package alone imports nothing"
+assert set(ms._HOMES) == set(ms.__all__) and set(dir(ms)) == {*ms.__all__, "__version__"}
+for name in sys.argv[1:]:
+    importlib.import_module(f"mitsim.{ms._HOMES[name]}")
+tracing = ["Light", "Rendered"]
+for name in sorted(ms.__all__, key=tracing.__contains__):
+    assert name in tracing or "mitsuba" not in sys.modules, "only what traces imports the renderer"
+    home = importlib.import_module(f"mitsim.{ms._HOMES[name]}")
+    assert getattr(ms, name) is getattr(home, name), name
+try:
+    ms.nonsense
+except AttributeError as error:
+    assert "nonsense" in str(error)
+else:
+    raise SystemExit("no such name, and no error")
+"""
+    # The room `reconstruct` and the function of that name: whichever is imported first.
+    for first in ((), ("load_calibration",)):
+        done = subprocess.run([sys.executable, "-c", program, *first], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+def test_the_function_is_no_room() -> None:
+    room = importlib.import_module("mitsim.reconstruct")
+    assert ms.reconstruct is importlib.import_module("mitsim.reconstruct.reconstruction").reconstruct is not room
+    ms.reconstruct = room  # as Python does when the room is imported
+    assert callable(ms.reconstruct)
+
+
+def test_type_checkers_see_the_same_homes() -> None:
+    blocks = [node for node in ast.parse(Path(ms.__file__).read_text()).body if isinstance(node, ast.If)]
+    imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
+    seen = {alias.name: node.module for node in imports for alias in node.names}
+    assert seen == {name: f"mitsim.{home}" for name, home in ms._HOMES.items()}
+
+
+# ---- from a scene to an image ----------------------------------------------------------------------------------------
+
+
+def test_the_lines_that_the_package_opens_with(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
+    print_ = np.kron(np.random.default_rng(3).integers(40, 250, (16, 16)), np.ones((15, 15)))
+    scene = shared_scene("lines", reflectance=np.pad(print_, 8, mode="edge"), sheet_z="$sheet_z")
+    albedo = '<default name="albedo" value="0.5"/>'
+    scene.write_text(scene.read_text().replace(albedo, albedo + '<default name="sheet_z" value="390"/>'))
+    bench = ms.open_bench(scene, sheet_z=400)
+    plan = bench.plan("dots:4", accuracy=5e-3)
+    shots = bench.capture(plan, seed=0)
+    assert shots.save(tmp_path / "run") == tmp_path / "run"
+    factors = bench.calibrate(seed=0, accuracy=5e-3)
+    factors.save(tmp_path / "cal")
+    image = ms.reconstruct(shots, factors, lam="auto")
+    assert image.ok, image.status
+    assert ms.psnr(image.image, shots.truth) > 25 and ms.ssim(image.image, shots.truth) > 0.8
+    light = bench.light("dots:4", accuracy=5e-3)
+    for k in (1, 2):
+        assert len(light.expose(f"dots:{k}").dn) == k**2
+    operator = factors.operator("dots:4")
+    model = operator @ image.image.ravel()
+    data = np.concatenate([frame.ravel() for frame, _, _ in shots.measurements()])
+    assert np.linalg.norm(data - model) / np.linalg.norm(data) == pytest.approx(image.residual, rel=1e-3)
+
+
+def test_what_a_capture_holds(shots: ms.Capture, bench: ms.Bench) -> None:
+    assert shots.dn.shape == shots.electrons.shape == (9, 64, 64) and shots.dn.dtype == np.uint32
+    assert shots.truth.shape == (16, 16) and shots.truth.mean() == pytest.approx(ALBEDO / 0.99, rel=0.02)
+    assert shots.exposure_s > 0 and shots.warnings == () and shots.folder is None
+    assert shots.plan["accuracy"] == ACCURACY and {"effects", "settings"} <= shots.plan.keys()
+    summary = shots.summary()
+    assert (summary["frames"], summary["shape"], summary["seed"], summary["output"]) == (9, (64, 64), SEED, None)
+
+
+def test_a_saved_capture_is_that_of_the_command_line(
+    call: Callable[..., Any], shots: ms.Capture, bench: ms.Bench, tmp_path: Path
+) -> None:
+    """The same files with the same pixels, and manifests that differ in seconds alone."""
+    shots.save(tmp_path / "saved")
+    options = "--patterns", "dots:3", "--accuracy", ACCURACY, "--seed", SEED, "-D", f"albedo={ALBEDO}"
+    told = call("capture", bench.loaded.path, *options, "-o", tmp_path / "told", "--json").payload
+    bench.capture("dots:3", tmp_path / "direct", accuracy=ACCURACY, seed=SEED)
+    names = sorted(path.name for path in (tmp_path / "told").iterdir())
+    assert names == [*(f"frame_{index:05d}.exr" for index in range(9)), "manifest.json", "truth.exr"]
+    manifest = untimed(tmp_path / "told")
+    for other in ("saved", "direct"):
+        assert sorted(path.name for path in (tmp_path / other).iterdir()) == names
+        assert untimed(tmp_path / other) == manifest
+        for name in names:
+            if name.endswith(".exr"):
+                assert_equal_files(tmp_path / other / name, tmp_path / "told" / name)
+    summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": told["output"]}
+    assert {**summary, "seconds": 0} == {**told, "seconds": 0}
+
+
+def untimed(folder: Path) -> dict[str, Any]:
+    """The manifest without what the clock says: stages, and the plan's predictions from measured paces."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    plan = manifest["plan"]
+    rows = [{**row, "seconds": 0} for row in plan["effects"]]
+    return {**manifest, "seconds": {}, "plan": {**plan, "effects": rows, "predicted_seconds": 0}}
+
+
+def assert_equal_files(one: Path, other: Path) -> None:
+    (ours, mine), (theirs, stated) = read_frame(one), read_frame(other)
+    assert mine == stated and ours.keys() == theirs.keys()
+    for name, values in ours.items():
+        assert values.dtype == theirs[name].dtype and np.array_equal(values, theirs[name]), (one, name)
+
+
+def test_a_loaded_capture_is_the_one_in_memory(shots: ms.Capture, tmp_path: Path) -> None:
+    loaded = ms.load_run(shots.save(tmp_path / "run"))
+    for name in ("dn", "electrons", "truth"):
+        ours, theirs = getattr(shots, name), getattr(loaded, name)
+        assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs), name
+    assert (loaded.exposure_s, loaded.warnings, loaded.plan) == (shots.exposure_s, shots.warnings, shots.plan)
+    assert loaded.fingerprint == shots.fingerprint and loaded.truth_board == shots.truth_board
+    again = loaded.save(tmp_path / "again")
+    assert (again / "manifest.json").read_bytes() == (tmp_path / "run" / "manifest.json").read_bytes()
+    with pytest.raises(ms.MitsimError, match="holds files already"):
+        shots.save(tmp_path / "run")
+
+
+def test_images_from_memory_and_from_disk_are_equal(shots: ms.Capture, factors: ms.Factors, tmp_path: Path) -> None:
+    run, cal = ms.load_run(shots.save(tmp_path / "run")), ms.load_calibration(factors.save(tmp_path / "cal"))
+    assert np.array_equal(cal.left, factors.left) and np.array_equal(cal.right, factors.right)
+    assert cal.fingerprint == factors.fingerprint and str(cal.status) == str(factors.status)
+    for method in ("tikhonov", "tv"):
+        first, second = ms.reconstruct(shots, factors, method=method), ms.reconstruct(run, cal, method=method)
+        assert np.array_equal(first.image, second.image) and first.inputs == second.inputs, method
+        assert first.save(tmp_path / method) == second.save(tmp_path / method), "the same inputs may be written again"
+
+
+@pytest.mark.parametrize("lam", [-1.0, math.nan, math.inf, "automatic"])
+def test_lambda_out_of_range(shots: ms.Capture, factors: ms.Factors, lam: Any) -> None:
+    with pytest.raises(ms.ArgumentError, match=r"lam .*at least 0, or auto") as caught:
+        ms.reconstruct(shots, factors, lam)
+    assert caught.value.argument == "lam" and str(lam) in str(caught.value)
+
+
+# ---- light that is traced once ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Purposes of all light that was traced since."""
+    purposes: list[str] = []
+    original = light.trace_light
+
+    def counted(bench: Any, plan: Any, lighting: Any, seed: int, sampling: Any = None, progress: Any = None) -> Any:
+        purposes.append((sampling or light.Sampling()).purpose)
+        return original(bench, plan, lighting, seed, sampling, *([progress] if progress else []))
+
+    for module in (light, run):
+        monkeypatch.setattr(module, "trace_light", counted)
+    return purposes
+
+
+def same_light(ours: ms.Capture, theirs: ms.Capture) -> None:
+    """Single precision of the light's sums by pixel and by class: 1e-6 of the brightest pixel."""
+    assert ours.exposure_s == pytest.approx(theirs.exposure_s, rel=1e-6)
+    assert np.abs(ours.electrons - theirs.electrons).max() < 1e-6 * theirs.electrons.max()
+    assert np.array_equal(ours.truth, theirs.truth)
+
+
+def test_light_is_that_of_a_capture(bench: ms.Bench, shots: ms.Capture, traced: list[str]) -> None:
+    """Of the family that it was traced for: the same plan, and so the same paths."""
+    same_light(bench.light("dots:3", accuracy=ACCURACY, seed=SEED).expose("dots:3"), shots)
+    assert traced == ["scene", "board"]
+
+
+def test_light_serves_any_family_and_is_traced_once(
+    bench: ms.Bench, monkeypatch: pytest.MonkeyPatch, traced: list[str]
+) -> None:
+    """Against captures of each family with the same number of paths: one plan for all, and sampling in one round."""
+    plan = replace(bench.plan("dots:3", accuracy=ACCURACY, seed=SEED), sampling_target=math.inf)
+
+    def planned(self: ms.Bench, patterns: str, **request: Any) -> ms.Plan:
+        return replace(plan, request=ms.Request.of(patterns=patterns, **request))
+
+    monkeypatch.setattr(ms.Bench, "plan", planned)
+    light = bench.light("dots:3", accuracy=ACCURACY, seed=SEED)
+    families = "dots:1", "dots:2", "dots:5", "uniform", "hadamard:2"
+    exposed = {patterns: light.expose(patterns) for patterns in families}
+    assert traced == ["scene", "board"]
+    for patterns, ours in exposed.items():
+        same_light(ours, bench.capture(planned(bench, patterns, accuracy=ACCURACY, seed=SEED)))
+    assert len(traced) == 2 + 2 * len(families), "a capture of its own traces anew"
+
+
+def test_light_is_exposed_with_other_seeds_and_times_but_no_other_light(bench: ms.Bench) -> None:
+    light = bench.light("uniform", accuracy=0.1, seed=SEED, effects="-diffraction")
+    first, other = light.expose("uniform", exposure=0.01), light.expose("uniform", exposure=0.02, seed=SEED + 1)
+    assert (first.exposure_s, other.exposure_s) == (0.01, 0.02)
+    assert np.allclose(2 * first.electrons, other.electrons, rtol=1e-6) and not np.array_equal(first.dn, other.dn)
+    for name, value in (("accuracy", 1e-3), ("effects", {}), ("patterns", "dots:2")):
+        with pytest.raises((ms.ArgumentError, TypeError)) as caught:
+            light.expose("uniform", **{name: value})
+        assert name in str(caught.value)
+
+
+# ---- the linear model ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:3", "hadamard:2", "random:3"])
+def test_the_operator_and_its_adjoint(factors: ms.Factors, patterns: str) -> None:
+    """<A x, y> = <x, A^H y>, and A x is Phi_L (P o X) Phi_R^T for every pattern P."""
+    from mitsim.rig.patterns import parse_patterns
+
+    operator, family = factors.operator(patterns, seed=2), parse_patterns(patterns, 16, 2)
+    rng = np.random.default_rng(1)
+    x, y = rng.normal(size=operator.shape[1]), rng.normal(size=operator.shape[0])
+    forward, back = operator @ x, operator.H @ y
+    assert abs(forward @ y - x @ back) < 1e-12 * np.linalg.norm(forward) * np.linalg.norm(y)
+    frames = forward.reshape(family.left.shape[1], family.right.shape[1], 64, 64)
+    for i, j in np.ndindex(frames.shape[:2]):
+        shown = np.outer(family.left[:, i], family.right[:, j])
+        expected = factors.left @ (shown * x.reshape(16, 16)) @ factors.right.T
+        assert np.allclose(frames[i, j], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_an_operator_of_other_patterns(factors: ms.Factors, shared_scene: Callable[..., Path]) -> None:
+    with pytest.raises(ms.MitsimError, match="dots:17"):
+        factors.operator("dots:17")
+    with pytest.raises(ms.MitsimError, match="8 x 8 scene pixels, but the factors have 16 x 16"):
+        factors.operator(ms.open_bench(shared_scene("eight", n=8)).family("dots:2"))
+
+
+# ---- notebooks -------------------------------------------------------------------------------------------------------
+
+
+def test_objects_show_themselves(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors) -> None:
+    plan = bench.plan("uniform", accuracy=0.1)
+    page = plan._repr_html_()
+    assert page.count("<tr>") == 1 + len(plan.effects) and "error if off" in page
+    assert all(f">{row.name}<" in page for row in plan.effects)
+    for shown, pictures, words in (
+        (shots, 5, "dots:3"),
+        (factors, 2, "left 64 x 16"),
+        (ms.reconstruct(shots, factors), 1, "residual"),
+        (bench.render(spp=4), 1, "relative noise"),
+    ):
+        page = shown._repr_html_()
+        assert page.count('<img style="height:144px" src="data:image/png;base64,') == pictures, type(shown)
+        assert words in page and len(page) < 1e5
+
+
+# ---- numbers and names -----------------------------------------------------------------------------------------------
+
+
+def test_numbers_may_be_numbers(bench: ms.Bench) -> None:
+    text = ms.open_bench(bench.loaded.path, albedo=str(ALBEDO))
+    assert text.provenance() == bench.provenance() and bench.defines == {"albedo": "0.4"}
+    with pytest.raises(ms.MitsimError, match=r"albdo.*albedo"):
+        ms.open_bench(bench.loaded.path, albdo=ALBEDO)
+
+
+def test_a_shipped_name_wins_over_a_folder_of_that_name(refused: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "photograph").mkdir()
+    (tmp_path / "photograph" / "scene.xml").write_text("<scene")
+    assert "dots:129" in refused("plan", "photograph", "--patterns", "dots:129")
+    for own in ("./photograph", tmp_path / "photograph", "photograph/scene.xml"):
+        assert "photograph/scene.xml" in refused("plan", own, "--patterns", "dots:129")
+
+
+def test_devices_by_name(call: Callable[..., Any], refused: Callable[..., str], bench: ms.Bench) -> None:
+    devices = "--camera", "imx249", "--projector", "mp_cl1"
+    options = "--accuracy", 0.1, "--patterns", "uniform", "--json"
+    assert call("plan", bench.loaded.path, *devices, *options).payload["accuracy"] == 0.1
+    line = refused("plan", bench.loaded.path, "--camera", "imx24")
+    assert "imx24:" in line and "did you mean imx249?" in line and "shipped are" in line
+    assert "did you mean mp_cl1?" in refused("plan", bench.loaded.path, "--projector", "mp_cl2")
+    assert "did you mean photograph?" in refused("plan", "fotograph")
+
+
+@pytest.mark.parametrize("name", ["scene", "variant", "camera", "projector", "allow_outside_files", "for_render"])
+def test_parameters_that_python_takes_for_others(refused: Callable[..., str], bench: ms.Bench, name: str) -> None:
+    line = refused("plan", bench.loaded.path, "-D", f"{name}=x")
+    assert f"-D '{name}=x'" in line and "another" in line
+
+
+# ---- typos -----------------------------------------------------------------------------------------------------------
+
+TYPOS = (
+    (["plan", "photograph", "--accuracy", "5"], "--accuracy 5"),
+    (["plan", "photograph", "--effects", "+x"], "--effects '+x'"),
+    (["plan", "photograph", "--camera", "nosuch"], "nosuch"),
+    (["plan", "photograph", "--projector", "nosuch"], "nosuch"),
+    (["plan", "photograph", "--variant", "llvm_ad_grey"], "llvm_ad_grey"),
+    (["plan", "photograph", "-D", "mask"], "NAME=VALUE"),
+    (["plan", "photograph", "-D", "camera=x"], "camera=x"),
+    (["plan", "photogaph"], "did you mean photograph?"),
+    (["capture", "nosuchscene", "-o", "run", "--patterns", "dots:7"], "nosuchscene"),
+    (["capture", "photograph", "-o", "run", "--patterns", "dots:7", "--noise-fraction", "1e-300"], "1e-300"),
+    (["capture", "photograph", "-o", "run", "--patterns", "dots:7", "--exposure", "-1"], "--exposure -1"),
+    (["capture", "photograph", "-o", "run", "--patterns", "dots:7", "--exposure", "long"], "--exposure 'long'"),
+    (["calibrate", "nosuchscene", "-o", "cal"], "nosuchscene"),
+    (["calibrate", "photograph", "-o", "cal", "--recipe", "nosuch.toml"], "nosuch.toml"),
+    (["render", "photograph", "-o", "frame.png"], "frame.png"),
+    (["render", "nosuchscene", "-o", "frame.exr"], "nosuchscene"),
+    (["reconstruct", "nosuchrun", "--calibration", "cal", "--lambda", "small"], "--lambda 'small'"),
+    (["reconstruct", "nosuchrun", "--calibration", "cal"], "nosuchrun"),
+)
+
+
+def test_typos_are_refused_before_the_renderer_is_imported(tmp_path: Path) -> None:
+    """Mitsuba and scipy.signal take seconds of processor time; no argument needs them to be seen wrong."""
+    program = """
+import contextlib, io, json, sys
+from mitsim import cli
+for arguments, _ in json.loads(sys.argv[1]):
+    sys.argv, err = ["mitsim", *arguments], io.StringIO()
+    with contextlib.redirect_stderr(err):
+        try:
+            cli.run()
+        except SystemExit as stop:
+            code = stop.code
+    heavy = [name for name in ("mitsuba", "drjit", "scipy.signal", "matplotlib") if name in sys.modules]
+    print(json.dumps([code, err.getvalue(), heavy]))
+"""
+    command = [sys.executable, "-c", program, json.dumps(TYPOS)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120)
+    for (arguments, fragment), line in zip(TYPOS, done.stdout.splitlines(), strict=True):
+        code, said, heavy = json.loads(line)
+        assert code == 2 and said.startswith("mitsim: ") and said.count("\n") == 1, (arguments, said)
+        assert fragment in said, (arguments, said)
+        assert heavy == [], f"{arguments} imported {heavy}"
+    assert not list(tmp_path.iterdir())
