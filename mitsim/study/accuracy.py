@@ -12,6 +12,7 @@ PATIENCE are left out and named.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -63,18 +64,9 @@ _SERIES = {
 
 @dataclass(frozen=True)
 class Measured:
-    """One setting of one estimator.
+    """One setting of one estimator: wall seconds for all frames, error against the judge, own Monte Carlo error.
 
-    Attributes
-    ----------
-    estimator, knob, setting
-        which of the two, what was turned, and to what.
-    seconds
-        wall time for all frames.
-    error, mc_error
-        relative, against the judge, and of its own Monte Carlo noise.
-    on_front
-        no other row is as good in less time.
+    ``on_front``: no other row is as good in less time.
     """
 
     estimator: str
@@ -107,21 +99,8 @@ class JudgeFacts:
 
 @dataclass(frozen=True)
 class AccuracyFindings:
-    """All that was measured.
-
-    Attributes
-    ----------
-    rows, effects, solver
-        of the estimators, of effects switched off, and of forms of the solution.
-    judge
-        how far it is to be trusted.
-    sensor_noise
-        relative noise of the sensor at equal peak; None for a camera without a full well.
-    speedup_at_equal_error
-        how much longer the reference would take for the factored error at QUOTED.
-    left_out
-        what was too slow.
-    """
+    """All that was measured, what was too slow for it, and how much longer the reference would take for the factored
+    error at QUOTED; ``sensor_noise`` is relative, at equal peak, and None for a camera without a full well."""
 
     rows: tuple[Measured, ...]
     effects: tuple[EffectCost, ...]
@@ -164,25 +143,22 @@ class AccuracyFindings:
         series: dict[str, list[plots.Point]] = {}
         for row in self.rows:
             series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
-        effects = [(effect.name, effect.error_if_off, effect.seconds) for effect in self.effects]
+        errors = {effect.name: effect.error_if_off for effect in self.effects}
+        seconds = {effect.name: effect.seconds for effect in self.effects}
         return {
             "accuracy.png": plots.pareto(series, noise=self.sensor_noise, apart=(_SERIES["bounces"],)),
-            "effects.png": plots.effect_costs(effects, QUOTED),
+            "effects.png": plots.error_bars(errors, QUOTED, seconds),
             "solver.png": plots.solver_costs(self.solver),
         }
 
 
 def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
-    """Error against time for the patterns of a request.
+    """Error against time.
 
     Parameters
     ----------
-    bench
-        what is studied.
-    request
-        patterns and seed; accuracies are the study's own.
-    job
-        told how far the work is.
+    bench, request, job
+        the scene, patterns and seed (accuracies are the study's own), and who is told how far the work is.
 
     Raises
     ------
@@ -265,13 +241,9 @@ class _Stand:
 
     def left(self, settings: Settings) -> float:
         """What these settings are predicted to leave besides noise."""
-        evidence = self.evidence
-        parts = (
-            evidence.anchor_error[settings.anchors],
-            evidence.layer_error[len(settings.depths)],
-            evidence.cell_error[settings.subdivision],
-        )
-        return float(np.linalg.norm(parts))
+        anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
+        errors = self.evidence
+        return math.hypot(errors.anchor_error[anchors], errors.layer_error[layers], errors.cell_error[cells])
 
 
 @dataclass(frozen=True, eq=False)

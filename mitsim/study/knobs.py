@@ -25,17 +25,8 @@ SAMPLES = (1, 8, 64)
 
 @dataclass(frozen=True)
 class Trial:
-    """One setting of the factored estimator.
-
-    Attributes
-    ----------
-    knob, setting
-        what was turned, and to what.
-    bench, plan
-        that it makes.
-    target
-        error to stop at; None: the plan's own.
-    """
+    """One setting of the factored estimator: what was turned, to what, and the bench and plan that it makes; ``target``
+    is the error to stop at where it is not the plan's own."""
 
     knob: str
     setting: str
@@ -71,10 +62,8 @@ def trials(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Ite
 
     Parameters
     ----------
-    bench, plan
-        where the knobs stand at first.
-    evidence
-        the pilot's, of the same bench.
+    bench, plan, evidence
+        where the knobs stand at first, and what the pilot found there.
     patience
         what would be traced for longer, and for longer than the plan itself, is left out [s].
     """
