@@ -17,7 +17,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.study import accuracy, find_study, plots
 from mitsim.study.accuracy import AccuracyFindings
-from mitsim.study.knobs import at_once, reformed, sampled, trials, without
+from mitsim.study.knobs import Stand, at_once, reformed, sampled, trials, without
 from mitsim.study.runner import StudyResult
 from mitsim.study.solver_cost import make_problem, time_solver
 
@@ -177,9 +177,8 @@ def test_the_judge_of_the_reference_has_what_the_registry_says(
             'name = "soft"\neffective_wavelength_nm = 562.0\naperture_radius_mm = 8.0\nblur_pixels = 1.5\n'
             "focus_mm = 200.0\n"
         )
-    monkeypatch.setattr(accuracy, "ACCURACIES", (1e-2,))  # the pilot looks no closer than that
     bench = open_bench(scene, variant, projector=projector)
-    stand = accuracy._Stand(bench, bench.family("hadamard:2"), SEED, Job())
+    stand = Stand(bench, bench.family("hadamard:2"), SEED, Job(), 1e-2)
     judge = accuracy._Judge.trace(stand, stand.plan(1e-2))
     monkeypatch.setattr(accuracy, "_SAMPLES", (64, 2048))
     for row in judge.reference():
