@@ -21,10 +21,9 @@ from collections.abc import Iterator
 import numpy as np
 from skimage import color, data
 
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import prepare
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
+from mitsim.study.metrics import psnr
+from mitsim.study.solver_cost import dots, paper_factor
 
 N = 128
 PHOTOGRAPHS = ("astronaut", "camera", "coffee", "chelsea", "rocket", "moon", "hubble_deep_field", "coins")
@@ -44,11 +43,6 @@ def photograph(name: str, decode: bool) -> np.ndarray:
     return square.reshape(N, block, N, block).mean(axis=(1, 3))
 
 
-def dots(k: int) -> np.ndarray:
-    """(128, k) shifting dots; k = 1 is uniform light."""
-    return (np.arange(N)[:, None] % k == np.arange(k)).astype(np.float64)
-
-
 def frames(factor: np.ndarray, patterns: np.ndarray, image: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
     """Noise-free frames with their pattern indices."""
     for i, row in enumerate(patterns.T):
@@ -56,16 +50,12 @@ def frames(factor: np.ndarray, patterns: np.ndarray, image: np.ndarray) -> Itera
             yield i, j, (factor * row) @ image @ (factor * column).T
 
 
-def psnr(image: np.ndarray, truth: np.ndarray) -> float:
-    """PSNR [dB] with peak 1."""
-    return float(-10 * np.log10(np.mean((image - truth) ** 2)))
-
-
 def trial(
     factor: np.ndarray, k: int, image: np.ndarray, convention: str, peak: float, full_well: float, seed: int
 ) -> dict[str, float]:
     """PSNR at the oracle and the automatic lambda for one image."""
-    clean = list(frames(factor, dots(k), image))
+    patterns = dots(N, k)
+    clean = list(frames(factor, patterns, image))
     uniform_peak = float((factor @ image @ factor.T).max())
     gain = peak / uniform_peak
     if convention == "equal peak":
@@ -74,7 +64,7 @@ def trial(
         gain /= k * k
     read_noise = full_well * 10 ** (-73 / 20)
     rng = np.random.default_rng([seed, k])
-    prepared = prepare(factor, factor, dots(k), dots(k))
+    prepared = prepare(factor, factor, patterns, patterns)
     sums = prepared.accumulator()
     for i, j, frame in clean:
         noisy = rng.poisson(gain * np.maximum(frame, 0)) + rng.normal(0, read_noise, frame.shape)
@@ -101,9 +91,7 @@ def main() -> None:
     )
     parser.add_argument("--k", type=int, nargs="+", default=[1, 5, 7])
     options = parser.parse_args()
-    factor = scene_factor(
-        mls_mask().terms[0][1], 0.06, centred_edges(512, 0.01172), centred_edges(N, 120 / N), 2.0, 400.0
-    )
+    factor = paper_factor()
     images = [photograph(name, options.reflectance == "linear") for name in PHOTOGRAPHS]
     rows = []
     for convention, peak in CONVENTIONS:

@@ -20,37 +20,34 @@ import tempfile
 import time
 from pathlib import Path
 
-from mitsim.capture.bench import open_bench
-from mitsim.capture.run import capture
-from mitsim.core.configuration import shipped
+import mitsim as ms
 from mitsim.core.versions import versions
-from mitsim.study.accuracy import study_accuracy
+from mitsim.study import find_study
 
-SCENE = shipped("scenes", "photograph", "scene.xml")
-PATTERNS, ACCURACY = "dots:7", 1e-3
+SCENE, PATTERNS, ACCURACY = "photograph", "dots:7", 1e-3
 
 
 def cold() -> dict[str, float]:
     """Seconds of two processes in a row: caches empty, then kernels compiled before."""
-    found = {}
+    seconds = {}
     with tempfile.TemporaryDirectory() as home:
         for name in ("empty_caches", "new_process"):
             run = str(Path(home) / name)
-            command = [sys.executable, "-m", "mitsim", "capture", str(SCENE), "--patterns", PATTERNS]
+            command = [sys.executable, "-m", "mitsim", "capture", SCENE, "--patterns", PATTERNS]
             command += ["--accuracy", str(ACCURACY), "-o", run, "--json"]
             started = time.perf_counter()
             subprocess.run(command, check=True, capture_output=True, env={**os.environ, "HOME": home})
-            found[name] = time.perf_counter() - started
-    return found
+            seconds[name] = time.perf_counter() - started
+    return seconds
 
 
-def warm(repeat: int, scene: Path = SCENE) -> dict[str, float]:
-    """Median seconds by stage over ``repeat`` captures after a first one."""
-    bench = open_bench(scene)
+def warm(repeat: int, scene: str = SCENE) -> dict[str, float]:
+    """Median seconds by stage over ``repeat`` captures of the ``scene`` after a first one."""
+    bench = ms.open_bench(scene)
     runs = []
     with tempfile.TemporaryDirectory() as folder:
         for index in range(repeat + 1):
-            runs.append(capture(bench, PATTERNS, Path(folder) / str(index), ACCURACY))
+            runs.append(bench.capture(PATTERNS, Path(folder) / str(index), accuracy=ACCURACY).manifest)
     stages = {key: statistics.median(run.seconds[key] for run in runs[1:]) for key in runs[0].seconds}
     return {**stages, "transport_and_optics": stages["transport"] + stages["optics"], "mc_error": runs[1].mc_error}
 
@@ -64,21 +61,20 @@ def main() -> None:
     if options.scene:
         report(
             {
-                "warm_seconds": {
-                    name: warm(options.repeat, shipped("scenes", name, "scene.xml")) for name in options.scene
-                },
+                "warm_seconds": {name: warm(options.repeat, name) for name in options.scene},
                 **_circumstances(options.repeat),
             },
             options.json,
         )
         return
     with tempfile.TemporaryDirectory() as folder:
-        study = study_accuracy(open_bench(SCENE), folder, PATTERNS, 0, lambda stage, fraction: None)
+        request = ms.Request.of(patterns=PATTERNS)
+        study = find_study("accuracy")(ms.open_bench(SCENE), folder, request, None).payload()
     result = {
         "cold_seconds": cold(),
         "warm_seconds": warm(options.repeat),
-        "speedup_at_equal_error": study.speedup_at_equal_error,
-        "accuracy_rows": study.payload()["rows"],
+        "speedup_at_equal_error": study["speedup_at_equal_error"],
+        "accuracy_rows": study["rows"],
         **_circumstances(options.repeat),
     }
     report(result, options.json)

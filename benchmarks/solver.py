@@ -21,20 +21,13 @@ from collections.abc import Callable
 import mpmath
 import numpy as np
 
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
+from mitsim.study.solver_cost import dots, paper_factor
 
 N, K = 128, 7
 EPS = float(np.finfo(np.float64).eps)
 Frames = dict[tuple[int, int], np.ndarray]
-
-
-def dots(n: int, k: int) -> np.ndarray:
-    """(n, k) shifting dots."""
-    return (np.arange(n)[:, None] % k == np.arange(k)).astype(np.float64)
 
 
 def frames_of(factor: np.ndarray, patterns: np.ndarray, image: np.ndarray) -> Frames:
@@ -165,9 +158,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    factor = scene_factor(
-        mls_mask().terms[0][1], 0.06, centred_edges(512, 0.01172), centred_edges(N, 120 / N), 2.0, 400.0
-    )
+    factor = paper_factor()
     report = {
         "seed": options.seed,
         "cores": os.cpu_count(),

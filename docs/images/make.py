@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mitsim.core.framefile import read_frame
+from mitsim.core.pictures import lightness
 
 COMMANDS = {
     "run": ("capture", "photograph", "--patterns", "dots:7"),
@@ -63,12 +64,6 @@ def mitsim(work: Path, *arguments: str) -> None:
     program = [sys.executable, "-m", "mitsim", *arguments, "--quiet"]
     if subprocess.run(program, cwd=work, check=False).returncode > 1:
         raise SystemExit(2)
-
-
-def lightness(reflectance: np.ndarray) -> np.ndarray:
-    """For display: cut to 0..1 and sRGB-encoded (IEC 61966-2-1)."""
-    linear = np.clip(reflectance, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 if __name__ == "__main__":

@@ -15,28 +15,23 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS, Physics, names, present
-from mitsim.capture.evidence import Evidence, Settings
 from mitsim.capture.exposer import NoiseTarget
-from mitsim.capture.light import Light, Sampling, trace_light
-from mitsim.capture.plan import Plan, SceneFacts, decide
+from mitsim.capture.light import Light
+from mitsim.capture.plan import Plan
 from mitsim.capture.render import projected
 from mitsim.capture.request import Exposure, Request
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.study import plots
-from mitsim.study.knobs import Trial, at_once, reformed, sampled, trials, without
+from mitsim.study.knobs import Stand, Trial, at_once, reformed, sampled, stacked, trials, without
 from mitsim.study.metrics import relative_error
 from mitsim.study.solver_cost import SolverRow, time_solver
 
@@ -63,18 +58,9 @@ _SERIES = {
 
 @dataclass(frozen=True)
 class Measured:
-    """One setting of one estimator.
+    """One setting of one estimator: wall seconds for all frames, error against the judge, own Monte Carlo error.
 
-    Attributes
-    ----------
-    estimator, knob, setting
-        which of the two, what was turned, and to what.
-    seconds
-        wall time for all frames.
-    error, mc_error
-        relative, against the judge, and of its own Monte Carlo noise.
-    on_front
-        no other row is as good in less time.
+    ``on_front``: no other row is as good in less time.
     """
 
     estimator: str
@@ -107,21 +93,8 @@ class JudgeFacts:
 
 @dataclass(frozen=True)
 class AccuracyFindings:
-    """All that was measured.
-
-    Attributes
-    ----------
-    rows, effects, solver
-        of the estimators, of effects switched off, and of forms of the solution.
-    judge
-        how far it is to be trusted.
-    sensor_noise
-        relative noise of the sensor at equal peak; None for a camera without a full well.
-    speedup_at_equal_error
-        how much longer the reference would take for the factored error at QUOTED.
-    left_out
-        what was too slow.
-    """
+    """All that was measured, what was too slow for it, and how much longer the reference would take for the factored
+    error at QUOTED; ``sensor_noise`` is relative, at equal peak, and None for a camera without a full well."""
 
     rows: tuple[Measured, ...]
     effects: tuple[EffectCost, ...]
@@ -164,32 +137,29 @@ class AccuracyFindings:
         series: dict[str, list[plots.Point]] = {}
         for row in self.rows:
             series.setdefault(_SERIES.get(row.knob, row.knob), []).append((row.seconds, row.error))
-        effects = [(effect.name, effect.error_if_off, effect.seconds) for effect in self.effects]
+        errors = {effect.name: effect.error_if_off for effect in self.effects}
+        seconds = {effect.name: effect.seconds for effect in self.effects}
         return {
             "accuracy.png": plots.pareto(series, noise=self.sensor_noise, apart=(_SERIES["bounces"],)),
-            "effects.png": plots.effect_costs(effects, QUOTED),
+            "effects.png": plots.error_bars(errors, QUOTED, seconds),
             "solver.png": plots.solver_costs(self.solver),
         }
 
 
 def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
-    """Error against time for the patterns of a request.
+    """Error against time.
 
     Parameters
     ----------
-    bench
-        what is studied.
-    request
-        patterns and seed; accuracies are the study's own.
-    job
-        told how far the work is.
+    bench, request, job
+        the scene, patterns and seed (accuracies are the study's own), and who is told how far the work is.
 
     Raises
     ------
     MitsimError
         for patterns that do not fit, or a scene without light.
     """
-    stand = _Stand(bench, bench.family(request.patterns, request.seed), request.seed, job)
+    stand = Stand(bench, bench.family(request.patterns, request.seed), request.seed, job, min(ACCURACIES))
     plans = {accuracy: stand.plan(accuracy) for accuracy in ACCURACIES}
     chosen = [a for a, plan in plans.items() if plan.predicted_seconds <= PATIENCE or a == QUOTED]
     quoted = plans[QUOTED]
@@ -215,84 +185,24 @@ def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stand:
-    """What all rows share: scene, family and seed, and what the pilot found of them."""
-
-    bench: Bench
-    family: PatternFamily
-    seed: int
-    job: Job
-
-    @cached_property
-    def evidence(self) -> Evidence:
-        return pilot.measure(self.bench, self.lighting, min(ACCURACIES), self.seed)
-
-    @property
-    def lighting(self) -> Lighting:
-        return self.family.lighting
-
-    def plan(self, accuracy: float) -> Plan:
-        return decide(accuracy, self.evidence, len(self.lighting.weights), SceneFacts.of(self.bench))
-
-    def trace(self, trial: Trial, seed: int) -> Light:
-        sampling = Sampling(by_pixel=False, target=trial.target)
-        return trace_light(trial.bench, trial.plan, self.lighting, seed, sampling, self.job.progress)
-
-    def timed(self, trial: Trial) -> tuple[float, FloatArray, float]:
-        """Seconds, frames and Monte Carlo error; one sample beforehand compiles the kernels."""
-        once = replace(trial.plan, settings=sampled(trial.plan.settings, 1))
-        self.trace(replace(trial, plan=once, target=at_once), self.seed)
-        started = time.perf_counter()
-        frames, mc_error = _stack(self.trace(trial, self.seed).frames(self.lighting, self.seed))
-        return time.perf_counter() - started, frames, mc_error
-
-    def finest(self, plan: Plan) -> Plan:
-        """Everything on, and one step finer than ``plan`` in each number."""
-        evidence, now = self.evidence, plan.settings
-        anchors = next((count for count in evidence.anchor_error if count > now.anchors), now.anchors)
-        layers = next((count for count in evidence.layer_error if count > len(now.depths)), len(now.depths))
-        cells = next((count for count in evidence.cell_error if count > now.subdivision), now.subdivision)
-        settings = replace(
-            now,
-            anchors=anchors,
-            layers=evidence.layers[layers] if layers > 1 else (),
-            subdivision=cells,
-            effects=frozenset(present(self.bench)),
-            coarse_cells=cells,
-            coarse_layers=True,
-        )
-        return replace(plan, settings=settings, sampling_target=plan.accuracy / _JUDGE_MARGIN)
-
-    def left(self, settings: Settings) -> float:
-        """What these settings are predicted to leave besides noise."""
-        evidence = self.evidence
-        parts = (
-            evidence.anchor_error[settings.anchors],
-            evidence.layer_error[len(settings.depths)],
-            evidence.cell_error[settings.subdivision],
-        )
-        return float(np.linalg.norm(parts))
-
-
-@dataclass(frozen=True, eq=False)
 class _Judge:
     """The answer that rows are held against: its light, expected frames, and how far it is to be trusted."""
 
-    stand: _Stand
+    stand: Stand
     light: Light
     expected: ExpectedFrames
     frames: FloatArray
     facts: JudgeFacts
 
     @classmethod
-    def trace(cls, stand: _Stand, plan: Plan) -> _Judge:
+    def trace(cls, stand: Stand, plan: Plan) -> _Judge:
         """One step finer than ``plan``, with a seed of its own."""
         started, seed = time.perf_counter(), stand.seed + 1
-        finest = stand.finest(plan)
+        finest = stand.finest(plan, _JUDGE_MARGIN)
         light = stand.trace(Trial("judge", "", stand.bench, finest), seed)
-        expected = light.frames(stand.lighting, seed)
-        frames, mc_error = _stack(expected)
-        facts = JudgeFacts(mc_error, stand.left(finest.settings), time.perf_counter() - started, seed)
+        expected = light.frames(stand.family.lighting, seed)
+        frames, mc_error = stacked(expected)
+        facts = JudgeFacts(mc_error, stand.discretisation(finest.settings), time.perf_counter() - started, seed)
         return cls(stand, light, expected, frames, facts)
 
     def row(self, trial: Trial) -> Measured:
@@ -305,8 +215,8 @@ class _Judge:
         """The reference, against light with the effects that it has."""
         stand, shots = self.stand, self.stand.family.captures
         index, bench = len(shots) // 2, stand.bench
-        lighting = stand.lighting.shots([index])
-        answer, _ = _stack(self.of_reference().frames(lighting, self.facts.seed))
+        lighting = stand.family.lighting.shots([index])
+        answer, _ = stacked(self.of_reference().frames(lighting, self.facts.seed))
         with projected(bench, stand.family.light(shots[index])):
             bench.render("reference", _SAMPLES[0], seed=stand.seed)  # compiles the kernels
             for spp in _SAMPLES:
@@ -331,7 +241,7 @@ class _Judge:
         return NoiseTarget(self.stand.bench, Exposure(), 1.0)(self.expected)
 
 
-def _effects(stand: _Stand, plan: Plan) -> Iterator[EffectCost]:
+def _effects(stand: Stand, plan: Plan) -> Iterator[EffectCost]:
     """Each effect that the scene has, switched off; as many samples with and without, so that noise cancels."""
     everything = frozenset(present(stand.bench))
     full = replace(plan, settings=replace(sampled(plan.settings, _EFFECT_SAMPLES), effects=everything))
@@ -340,13 +250,3 @@ def _effects(stand: _Stand, plan: Plan) -> Iterator[EffectCost]:
         trial = Trial("effects", f"no {name}", stand.bench, replace(full, settings=settings), at_once)
         fewer_seconds, without_it, _ = stand.timed(trial)
         yield EffectCost(name, relative_error(without_it, frames), seconds - fewer_seconds)
-
-
-def _stack(expected: ExpectedFrames) -> tuple[FloatArray, float]:
-    """All frames (shots, pixels, pixels) and their Monte Carlo error."""
-    formed = list(expected)
-    frames = np.stack([frame.irradiance for frame in formed])
-    if not frames.any():
-        raise MitsimError("all frames are dark; nothing can be compared")
-    noise = sum(frame.variance * frame.irradiance.size for frame in formed)
-    return frames, float(np.sqrt(noise / np.square(frames).sum()))

@@ -12,7 +12,6 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer, peak_irradiance
 from mitsim.capture.light import Light
 from mitsim.capture.request import Exposure
-from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.accumulator import Accumulator
@@ -55,7 +54,8 @@ class Comparison:
         bench, seed = self.light.bench, self.light.seed
         family = bench.family(name, seed)
         expected = self._merged.frames(family.lighting, seed)
-        model = _model(family, (self.factors.left, self.factors.right), self.factors.manifest.centre)
+        factors, sides = self.factors, (family.left, family.right)
+        model = prepare(factors.left, factors.right, *sides, centre=factors.manifest.centre)
         shots = family.captures
         times = dict(
             zip(CONVENTIONS, (peak_time(bench, expected), self._uniform_s, self._uniform_s / len(shots)), strict=True)
@@ -103,7 +103,8 @@ class Comparison:
         camera = IdealCamera(bench, bench.geometry.mask)
         expected = camera.frames(family, self.light.truth * flux)
         exposer = Exposer(bench, peak_time(bench, expected), self.light.seed + 1)
-        return self._recovery(exposer, family, expected, _model(family, camera.calibrated(flux), camera.centre))
+        model = prepare(*camera.calibrated(flux), family.left, family.right, centre=camera.centre)
+        return self._recovery(exposer, family, expected, model)
 
     def _recovery(self, exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, model: Prepared) -> Recovery:
         (sums,) = accumulate(exposer, family, expected, [model])
@@ -144,7 +145,3 @@ def accumulate(
             for each in sums:
                 each.add(measurement, row, column)
     return sums
-
-
-def _model(family: PatternFamily, factors: tuple[FloatArray, FloatArray], centre: bool) -> Prepared:
-    return prepare(*factors, family.left, family.right, centre=centre)

@@ -6,13 +6,12 @@ families and exposure conventions uses the same light, which is traced once.
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy.typing as npt
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.light import Light, pinhole_view
@@ -27,7 +26,6 @@ from mitsim.core.versions import versions
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.recipe import load_recipe
 from mitsim.study.compare import Comparison, label
-from mitsim.study.describe import scene_line
 from mitsim.study.report import BudgetRow, FamilyResult, ReportData, build_report, verdict
 from mitsim.study.runner import study_folder
 
@@ -36,27 +34,13 @@ _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
 """Families that the main one stands between in the report: the paper's, from the fewest frames to the most."""
 
 
+_OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)-->", re.DOTALL)
+
+
 @dataclass(frozen=True)
 class DemoResult:
-    """What `mitsim demo` reports.
-
-    Attributes
-    ----------
-    psnr, psnr_ideal
-        [dB] by family, rendered and idealised, at equal peak.
-    exposure
-        PSNR [dB] of the rendered ones by family and exposure convention.
-    gain_db
-        PSNR of the main family over that of uniform light; ``verdict`` says it in words.
-    mc_error
-        relative Monte Carlo error of the main family's frames.
-    seconds
-        by stage.
-    report
-        where the page is.
-    warnings
-        why the result is flagged.
-    """
+    """What `mitsim demo` reports: PSNR [dB] by family, rendered and idealised, at equal peak, and by exposure
+    convention; what the main family gains over uniform light, as a number and in words; and where the page is."""
 
     psnr: dict[str, float]
     psnr_ideal: dict[str, float]
@@ -111,8 +95,7 @@ def demo(bench: Bench, output: Path | str, request: Request | None = None, job: 
             shutil.rmtree(folder / part, ignore_errors=True)
         (folder / _PAGE).unlink(missing_ok=True)
         write_json(folder / "demo.json", {"kind": "demo", "status": "incomplete"})
-        evidence = _Evidence.gather(bench, folder, request, job)
-        result = _compare(evidence, names, folder, job)
+        result = _run(bench, folder, request, names, job)
         write_json(folder / "demo.json", {"kind": "demo", **result.payload()})
         return result
 
@@ -129,133 +112,120 @@ def _fitting(bench: Bench, request: Request) -> tuple[str, ...]:
     return tuple(names)
 
 
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """Light of the scene, the shots of the main family in it, and the camera's factors."""
-
-    request: Request
-    light: Light
-    shots: Capture
-    factors: Factors
-
-    @classmethod
-    def gather(cls, bench: Bench, folder: Path, request: Request, job: Job) -> _Evidence:
-        """Trace, expose and calibrate, into the subfolders of ``folder``."""
-        with job.clock.stage("plan"):
-            plan = bench.plan(**request.model_dump())
-        light = trace_request(bench, plan, job)
-        shots = light.expose(request.patterns, folder / "run", job)
-        session = replace(job, clock=Clock())
-        factors = bench.calibrate(request.seed, request.accuracy, output=folder / "calibration", job=session)
-        job.clock.add(session.clock.seconds(), "calibration ")
-        return cls(request, light, shots, factors)
-
-    def frames(self) -> dict[str, Channel]:
-        """Two shots [DN] by caption, for people to look at."""
-        count = len(self.shots.manifest.patterns.captures)
-        folder = self.shots.folder or Path()
-        return {
-            _caption(self.request.patterns, index, count): read_frame(folder / frame_name(index))[0]["DN"]
-            for index in (0, count // 2)
-        }
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Of the capture and of the calibration."""
-        return self.shots.warnings + self.factors.warnings
-
-
-def _compare(evidence: _Evidence, names: tuple[str, ...], folder: Path, job: Job) -> DemoResult:
-    """Every family in the same light, and the page that shows them."""
-    comparison = Comparison(evidence.light, evidence.factors)
-    results = {}
+def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], job: Job) -> DemoResult:
+    """The demo in a folder of its own."""
+    with job.clock.stage("plan"):
+        plan = bench.plan(**request.model_dump())
+    light = trace_request(bench, plan, job)
+    shots = light.expose(request.patterns, folder / "run", job)
+    session = replace(job, clock=Clock())
+    factors = bench.calibrate(request.seed, request.accuracy, output=folder / "calibration", job=session)
+    job.clock.add(session.clock.seconds(), "calibration ")
+    comparison, families = Comparison(light, factors), {}
     with job.clock.stage("compare families"):
         for index, name in enumerate(names):
-            results[name] = comparison.family(name)
+            families[name] = comparison.family(name)
             job.progress(label(name), (index + 1) / len(names))
-    families, main = tuple(results.values()), evidence.request.patterns
-    words = verdict(results[main], results["uniform"])
+    with job.clock.stage("views"):
+        view = pinhole_view(bench, load_recipe().board_reflectance, request.seed)
+        frames = {_caption("uniform", 0, 1): comparison.white(), **_frames(shots, folder / "run", request.patterns)}
+    evidence = _Evidence(light, shots, factors, families, request.patterns)
     with job.clock.stage("report"):
-        frames = {_caption("uniform", 0, 1): comparison.white(), **evidence.frames()}
-        page = _page(evidence, families, frames, words, job)
+        page = replace(_page(evidence), render=view, frames=frames, seconds=job.clock.seconds())
         report = build_report(page, folder / _PAGE)
-    psnr = {f.name: f.rendered.quality.psnr_db for f in families if f.rendered}
+    psnr = {name: f.rendered.quality.psnr_db for name, f in families.items() if f.rendered}
     return DemoResult(
         psnr=psnr,
-        psnr_ideal={f.name: f.idealised.quality.psnr_db for f in families if f.idealised},
-        exposure={f.name: dict(f.by_exposure) for f in families},
-        gain_db=psnr[main] - psnr["uniform"],
-        verdict=words[0],
-        mc_error=evidence.shots.manifest.mc_error or 0.0,
+        psnr_ideal={name: f.idealised.quality.psnr_db for name, f in families.items() if f.idealised},
+        exposure={name: dict(f.by_exposure) for name, f in families.items()},
+        gain_db=psnr[request.patterns] - psnr["uniform"],
+        verdict=page.verdict,
+        mc_error=shots.manifest.mc_error or 0.0,
         seconds=job.clock.seconds(),
         report=str(report),
-        warnings=evidence.warnings,
+        warnings=shots.warnings + factors.warnings,
     )
 
 
-def _page(
-    evidence: _Evidence,
-    families: tuple[FamilyResult, ...],
-    frames: Mapping[str, npt.NDArray[Any]],
-    words: tuple[str, str],
-    job: Job,
-) -> ReportData:
-    bench, plan = evidence.light.bench, evidence.light.plan
-    session, seed = evidence.factors.manifest.result, evidence.request.seed
-    left = f"Beyond the sensor's noise, {session['unexplained_residual']:.1e} of them is left."
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What a demo came to: the scene's light, shots of the ``main`` family in it, factors, and all families."""
+
+    light: Light
+    shots: Capture
+    factors: Factors
+    families: Mapping[str, FamilyResult]
+    main: str
+
+
+def _page(evidence: _Evidence) -> ReportData:
+    light, shots, factors = evidence.light, evidence.shots, evidence.factors
+    bench, session = light.bench, factors.manifest.result
+    headline, detail = verdict(evidence.families[evidence.main], evidence.families["uniform"])
+    unexplained = f"Beyond the sensor's noise, {session['unexplained_residual']:.1e} of them is left."
     return ReportData(
         title=f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
-        verdict=words[0],
-        verdict_detail=words[1],
-        truth=evidence.light.truth,
+        verdict=headline,
+        verdict_detail=detail,
+        truth=light.truth,
         scene=scene_line(bench.loaded.path),
-        render=pinhole_view(bench, load_recipe().board_reflectance, seed),
-        families=families,
-        frames=frames,
-        exposure=f"equal peak: each family's brightest pixel fills {Exposure().fraction:.0%} of the full well",
-        calibration={**session, "status": f"{evidence.factors.status} {left}"},
-        budget=tuple(_budget(evidence)),
-        accuracy=plan.accuracy,
-        effects=plan.effects,
-        seconds=job.clock.seconds(),
+        families=tuple(evidence.families.values()),
+        exposure=f"equal peak: each family's brightest pixel fills {100 * Exposure().fraction:.0f} % of the full well",
+        calibration={**session, "status": f"{factors.status} {unexplained}"},
+        budget=(
+            BudgetRow("Monte Carlo", shots.manifest.mc_error, "rendering noise of the expected frames, from 8 groups"),
+            BudgetRow(
+                "Discretisation", light.plan.systematic_error, "anchors, cells and layers, predicted by the plan"
+            ),
+            BudgetRow("Sensor noise", shots.manifest.sensor_noise, "shot and read noise of the frames, closed form"),
+            BudgetRow("Calibration", session["phi_error"], "error of the factors from noise in the calibration frames"),
+            BudgetRow(
+                "Separable model", session["noise_free_residual"], "what noise-free board frames leave beside it"
+            ),
+        ),
+        accuracy=light.plan.accuracy,
+        effects=light.plan.effects,
         configuration=_configuration(evidence),
-        seeds={"root": seed},
+        seeds={"root": light.seed},
         versions=versions(),
         notes=(
             "PSNR has peak 1 and no gain or offset fit; truth is apparent reflectance relative to the board.",
             "Idealised: the paper's model with its own exact factors and the same sensor noise.",
             "lambda is chosen by an unbiased risk estimate; no result has seen the truth.",
-            *evidence.warnings,
+            *shots.warnings,
+            *factors.warnings,
         ),
     )
+
+
+def scene_line(path: Path) -> str:
+    """Name of the folder of the scene ``path``, and the first sentence of the comment that opens the file, if any.
+
+    A comment further down speaks of its own element and is left alone.
+    """
+    name = path.resolve().parent.name
+    opening = _OPENING.match(path.read_text(encoding="utf-8"))
+    if opening is None:
+        return name
+    text = " ".join(opening[1].split())
+    # A full stop that ends a sentence stands before a capital; "0.90" and "e.g. a sheet" do not.
+    sentence = re.split(r"(?<=\.) (?=[A-Z])", text)[0]
+    return f"{name}: {sentence}" if sentence else name
 
 
 def _caption(name: str, index: int, count: int) -> str:
     return f"{label(name)}, {f'frame {index + 1} of {count}' if count > 1 else 'the only frame'}"
 
 
-def _budget(evidence: _Evidence) -> Iterator[BudgetRow]:
-    shots, session = evidence.shots.manifest, evidence.factors.manifest.result
-    for name, value, meaning in (
-        ("Monte Carlo", shots.mc_error, "rendering noise of the expected frames, from 8 independent groups"),
-        (
-            "Discretisation",
-            evidence.light.plan.systematic_error,
-            "anchors, cells and depth layers, predicted by the plan",
-        ),
-        ("Sensor noise", shots.sensor_noise, "shot and read noise of the frames, closed form"),
-        ("Calibration", session["phi_error"], "error of the factors from noise in the calibration frames"),
-        (
-            "Separable model",
-            session["noise_free_residual"],
-            "what noise-free board frames leave beside Phi_L X Phi_R^T",
-        ),
-    ):
-        yield BudgetRow(name, value or 0.0, meaning)
+def _frames(shots: Capture, folder: Path, name: str) -> dict[str, Channel]:
+    """Two shots [DN] of the family ``name`` by caption."""
+    count = len(shots.manifest.patterns.captures)
+    shown = {_caption(name, index, count): folder / frame_name(index) for index in (0, count // 2)}
+    return {caption: read_frame(path)[0]["DN"] for caption, path in shown.items()}
 
 
 def _configuration(evidence: _Evidence) -> dict[str, object]:
-    bench, request = evidence.light.bench, evidence.request
+    bench = evidence.light.bench
     geometry = bench.geometry
     return {
         "variant": bench.variant,
@@ -266,6 +236,6 @@ def _configuration(evidence: _Evidence) -> dict[str, object]:
         "mask": f"{geometry.mask}, order {geometry.mask_order}, {geometry.mask_feature * 1e3:g} um, "
         f"{geometry.mask_distance:g} mm from the sensor",
         "scene plane": f"{geometry.scene_distance:g} mm, {bench.n} x {bench.n} projector pixels",
-        f"exposure ({label(request.patterns)})": f"{evidence.shots.exposure_s:.3g} s a frame",
-        "accuracy asked for": f"{request.accuracy:g}",
+        f"exposure ({label(evidence.main)})": f"{evidence.shots.exposure_s:.3g} s a frame",
+        "accuracy asked for": f"{evidence.light.plan.accuracy:g}",
     }

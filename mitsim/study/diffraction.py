@@ -36,10 +36,19 @@ from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.recipe import load_recipe
 from mitsim.study import plots
 from mitsim.study.compare import accumulate, peak_time
-from mitsim.study.ideal import IdealCamera, Pair
+from mitsim.study.ideal import (
+    GEOMETRIC,
+    LINE,
+    PROJECTOR,
+    IdealCamera,
+    Pair,
+    ShadowRow,
+    lights,
+    point_profiles,
+    shadow_row,
+)
 from mitsim.study.knobs import reformed
 from mitsim.study.metrics import Quality, psnr
-from mitsim.study.shadows import GEOMETRIC, LINE, PROJECTOR, ShadowRow, lights, point_profiles, shadow_row
 
 MASKS: tuple[MaskKind, ...] = ("separable", "flatcam")
 ASSUMED, SEPARABLE, CALIBRATED = "geometric factors", "best separable factors", "calibrated factors"
@@ -51,27 +60,11 @@ _LAMBDAS = tuple(10.0 ** (-step / 2) for step in range(17))
 
 @dataclass(frozen=True)
 class QualityRow:
-    """One reconstruction.
+    """One reconstruction: which frames (idealised or rendered) in which light, and which factors the solver used.
 
-    Attributes
-    ----------
-    frames, mask, light, patterns
-        which frames (idealised or rendered), through which mask, in which light.
-    factors
-        those that the solver used.
-    captures
-        shots of the family.
-    psnr_db, ssim
-        of the image with the solver's own lambda.
-    psnr_best_db
-        of the best lambda that a judge who knows the truth can choose: an unbiased risk estimate is misled by factors
-        that are wrong.
-    lam
-        the solver's own.
-    residual
-        ||Y - model|| / ||Y||: the sensor's noise, and what the factors cannot explain.
-    status
-        the solver's sentence.
+    ``psnr_db`` and ``ssim`` are of the image with the solver's own lambda, ``psnr_best_db`` of the best lambda that a
+    judge who knows the truth can choose: an unbiased risk estimate is misled by factors that are wrong. ``residual`` is
+    ||Y - model|| / ||Y||: the sensor's noise, and what the factors cannot explain. ``captures`` counts frames.
     """
 
     frames: str
@@ -90,15 +83,7 @@ class QualityRow:
 
 @dataclass(frozen=True, eq=False)
 class DiffractionFindings:
-    """All rows, and the difference in PSNR that each choice of factors makes.
-
-    Attributes
-    ----------
-    bench, patterns
-        what was studied; verdict and figures are of these patterns.
-    shadows, quality
-        a row for each mask and light, and for each reconstruction.
-    """
+    """All rows, and the difference in PSNR that each choice of factors makes; figures are of ``patterns``."""
 
     bench: Bench
     patterns: str
@@ -166,16 +151,12 @@ class DiffractionFindings:
 
 
 def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
-    """Shadows and reconstructions under the patterns of a request, and under uniform light.
+    """Shadows, and reconstructions under the patterns asked for and under uniform light.
 
     Parameters
     ----------
-    bench
-        what is studied; its diffraction is on, whatever it is worth.
-    request
-        patterns, seed and accuracy.
-    job
-        progress and limits.
+    bench, request, job
+        the scene, patterns, seed and accuracy (diffraction is on, whatever it is worth), progress and limits.
 
     Raises
     ------

@@ -2,11 +2,12 @@
 
 A planar scene lit evenly, no falloff, and with a geometric shadow one separable term: the yardstick beside rendered
 measurements. It takes the reflectance and the mean flux of the rendered bench, so exposure and noise are the same and
-only the model differs.
+only the model differs. Its shadows in several lights: how far from the geometric one, how far from one separable term.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +17,7 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
-from mitsim.optics.separable import best_term, centred
+from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
@@ -24,6 +25,11 @@ from mitsim.rig.mask import MaskKind
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.projector import Spectrum
 from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.study.metrics import relative_error
+
+BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
+"""What a camera with a usual filter sees, in bands of 23 nm, over which a shadow's fringes hardly move."""
+GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
 
 Pair = tuple[FloatArray, FloatArray]
 """Left and right factor, (pixels, n) each."""
@@ -31,17 +37,7 @@ Pair = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class IdealCamera:
-    """The idealised camera: projector pixels of the aligned plane to sensor pixels.
-
-    Attributes
-    ----------
-    bench
-        whose geometry, projector and electronics it has.
-    mask
-        its code.
-    spectrum
-        light whose diffraction it shows; None: the geometric shadow.
-    """
+    """The idealised camera of a ``bench``, with one mask in one light (``spectrum`` None: the geometric shadow)."""
 
     bench: Bench
     mask: MaskKind
@@ -97,3 +93,64 @@ class IdealCamera:
     @cached_property
     def _optics(self) -> FrameOptics:
         return FrameOptics(self._geometry, *self._pixels, (self.bench.geometry.scene_distance,), 1, self.spectrum)
+
+
+@dataclass(frozen=True)
+class ShadowRow:
+    """One mask in one light against its geometric shadow; relative rms differences of operators, no unit.
+
+    ``terms``: separable terms of the operator. ``point_source`` and ``scene_pixel``: difference from the geometric
+    shadow, for point sources at the centres of projector pixels and averaged over these pixels. ``factor``: difference
+    of the factor that a solver uses on one side. ``separability``: what the best single separable term leaves of the
+    operator, and ``separability_centred`` once row and column means are taken off its frames.
+    """
+
+    mask: str
+    light: str
+    wavelengths: int
+    terms: int
+    point_source: float
+    scene_pixel: float
+    factor: float
+    separability: float
+    separability_centred: float
+
+
+def lights(bench: Bench) -> dict[str, Spectrum | None]:
+    """The study's lights on ``bench`` by name; None is light that does not diffract."""
+    edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
+    return {
+        GEOMETRIC: None,
+        LINE: Spectrum(np.array([bench.projector.effective_wavelength_nm]), np.ones(1)),
+        PROJECTOR: bench.spectrum,
+        BROADBAND: Spectrum((edges[:-1] + edges[1:]) / 2, np.full(BROADBAND_BANDS, 1 / BROADBAND_BANDS)),
+    }
+
+
+def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
+    """The camera in one ``light`` of the ``systems`` of one mask, compared with the geometric one of them."""
+    system, geometric = systems[light], systems[GEOMETRIC]
+    factor, assumed = system.factors[0], geometric.factors[0]
+    # (left, right) and (-left, -right) are one camera.
+    sign = 1.0 if np.vdot(factor, assumed) >= 0 else -1.0
+    return ShadowRow(
+        mask=system.mask,
+        light=light,
+        wavelengths=len(system.spectrum.weights) if system.spectrum else 0,
+        terms=len(system.terms),
+        point_source=relative_difference(system.points(), geometric.points()),
+        scene_pixel=relative_difference(system.terms, geometric.terms),
+        factor=relative_error(sign * factor, assumed),
+        separability=best_term(system.terms).residual,
+        separability_centred=best_term(centred(system.terms)).residual,
+    )
+
+
+def point_profiles(bench: Bench) -> dict[str, FloatArray]:
+    """(pixels,) shadow of a point on the axis of ``bench`` along one side of the sensor, through the separable mask, by
+    light."""
+    camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
+    return {
+        name: best_term(shadow_terms(camera, axis, axis, camera.scene_distance, spectrum)).left[:, 0]
+        for name, spectrum in lights(bench).items()
+    }

@@ -1,17 +1,27 @@
-"""One knob at a time: from a plan to the plans that differ from it in one choice, for `mitsim study accuracy`."""
+"""One knob at a time: from a plan to trials that differ from it in one choice, and to their frames and seconds."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import numpy as np
+
+from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
-from mitsim.capture.effects import names
+from mitsim.capture.effects import names, present
 from mitsim.capture.evidence import GROUPS, Evidence, Settings
-from mitsim.capture.light import Light, Target
-from mitsim.capture.plan import Plan
+from mitsim.capture.light import Light, Sampling, Target, trace_light
+from mitsim.capture.plan import Plan, SceneFacts, decide
 from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.rig.patterns import PatternFamily
 
 CELLS, ANCHORS, LAYERS = (1, 2, 4), (1, 2, 3, 5), (1, 2, 4, 8)
 """Cells of a pixel and anchors a side, and layers: each about halves the error of the one before."""
@@ -23,17 +33,8 @@ SAMPLES = (1, 8, 64)
 
 @dataclass(frozen=True)
 class Trial:
-    """One setting of the factored estimator.
-
-    Attributes
-    ----------
-    knob, setting
-        what was turned, and to what.
-    bench, plan
-        that it makes.
-    target
-        error to stop at; None: the plan's own.
-    """
+    """One setting of the factored estimator: what was turned, to what, and the bench and plan that it makes; ``target``
+    is the error to stop at where it is not the plan's own."""
 
     knob: str
     setting: str
@@ -69,10 +70,8 @@ def trials(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Ite
 
     Parameters
     ----------
-    bench, plan
-        where the knobs stand at first.
-    evidence
-        the pilot's, of the same bench.
+    bench, plan, evidence
+        where the knobs stand at first, and what the pilot found there.
     patience
         what would be traced for longer, and for longer than the plan itself, is left out [s].
     """
@@ -129,3 +128,70 @@ def _lights(bench: Bench) -> Iterator[tuple[str, Bench]]:
 def _tracing(settings: Settings, evidence: Evidence) -> float:
     """Seconds of tracing what the settings predict, at the pilot's pace."""
     return evidence.connecting(settings, settings.anchors) + evidence.following(settings)
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """What all trials share: scene, family, seed and job, and what the pilot found of them down to ``accuracy``."""
+
+    bench: Bench
+    family: PatternFamily
+    seed: int
+    job: Job
+    accuracy: float
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """Of the pilot."""
+        return pilot.measure(self.bench, self.family.lighting, self.accuracy, self.seed)
+
+    def plan(self, accuracy: float) -> Plan:
+        """What the evidence calls for at an ``accuracy``."""
+        return decide(accuracy, self.evidence, len(self.family.lighting.weights), SceneFacts.of(self.bench))
+
+    def finest(self, plan: Plan, margin: float) -> Plan:
+        """Everything on, one step finer than ``plan`` in each number, and its accuracy over ``margin`` of noise."""
+        evidence, now = self.evidence, plan.settings
+        anchors = next((count for count in evidence.anchor_error if count > now.anchors), now.anchors)
+        layers = next((count for count in evidence.layer_error if count > len(now.depths)), len(now.depths))
+        cells = next((count for count in evidence.cell_error if count > now.subdivision), now.subdivision)
+        settings = replace(
+            now,
+            anchors=anchors,
+            layers=evidence.layers[layers] if layers > 1 else (),
+            subdivision=cells,
+            effects=frozenset(present(self.bench)),
+            coarse_cells=cells,
+            coarse_layers=True,
+        )
+        return replace(plan, settings=settings, sampling_target=plan.accuracy / margin)
+
+    def discretisation(self, settings: Settings) -> float:
+        """Relative error that the numbers in ``settings`` are predicted to leave."""
+        anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
+        errors = self.evidence
+        return math.hypot(errors.anchor_error[anchors], errors.layer_error[layers], errors.cell_error[cells])
+
+    def trace(self, trial: Trial, seed: int) -> Light:
+        """Light of a ``trial``, by the family's classes, from a ``seed``."""
+        sampling = Sampling(by_pixel=False, target=trial.target)
+        return trace_light(trial.bench, trial.plan, self.family.lighting, seed, sampling, self.job.progress)
+
+    def timed(self, trial: Trial) -> tuple[float, FloatArray, float]:
+        """Seconds of a ``trial``, its frames and Monte Carlo error; one sample beforehand compiles the kernels."""
+        once = replace(trial.plan, settings=sampled(trial.plan.settings, 1))
+        self.trace(replace(trial, plan=once, target=at_once), self.seed)
+        started = time.perf_counter()
+        frames, mc_error = stacked(self.trace(trial, self.seed).frames(self.family.lighting, self.seed))
+        return time.perf_counter() - started, frames, mc_error
+
+
+def stacked(expected: ExpectedFrames) -> tuple[FloatArray, float]:
+    """All ``expected`` frames (shots, pixels, pixels) and their relative Monte Carlo error. MitsimError when all are
+    dark."""
+    formed = list(expected)
+    frames = np.stack([frame.irradiance for frame in formed])
+    if not frames.any():
+        raise MitsimError("all frames are dark; nothing can be compared")
+    noise = sum(frame.variance * frame.irradiance.size for frame in formed)
+    return frames, float(np.sqrt(noise / np.square(frames).sum()))

@@ -1,4 +1,4 @@
-"""A recovered image and the truth in; PSNR, SSIM and line contrast out. The only reader of the truth.
+"""A recovered image and the truth in; PSNR and SSIM out. The only reader of the truth.
 
 Images are reflectances, 1.0 = the calibration board. Nothing here fits a gain or an offset, and nothing
 clips: a reconstruction of the wrong brightness is a wrong reconstruction.
@@ -7,7 +7,7 @@ clips: a reconstruction of the wrong brightness is a wrong reconstruction.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,43 +62,6 @@ def relative_error(values: Image, reference: Image) -> float:
     """||a - b|| / ||b|| over all entries of ``values`` a and a ``reference`` b of one shape."""
     b = np.asarray(reference, dtype=np.float64)
     return float(np.linalg.norm(np.asarray(values, dtype=np.float64) - b) / np.linalg.norm(b))
-
-
-def contrast(region: Image, lines: Literal["vertical", "horizontal"] = "vertical", background: float = 0.0) -> float:
-    """Contrast ratio (I_max - I_min) / (I_max + I_min) of one group of lines; the paper's MTF / 100.
-
-    Parameters
-    ----------
-    region
-        (rows, columns) of the group alone; its mean along the lines is the profile.
-    lines
-        ``vertical`` or ``horizontal``.
-    background
-        taken off the profile (the paper's "DC background"), in the image's unit.
-
-    Returns
-    -------
-    float
-        above 1 when the profile goes negative, as least-squares images may.
-
-    Raises
-    ------
-    MitsimError
-        when the region is empty or has no light to compare with.
-    """
-    region = np.asarray(region, dtype=np.float64)
-    if region.ndim != 2 or region.size == 0 or not np.all(np.isfinite(region)):
-        raise MitsimError(f"contrast: region of shape {region.shape}; pass finite rows x columns of one line group")
-    if lines not in ("vertical", "horizontal"):
-        raise MitsimError(f"contrast: lines is {lines!r}; allowed: 'vertical', 'horizontal'")
-    profile = region.mean(axis=0 if lines == "vertical" else 1) - background
-    low, high = float(profile.min()), float(profile.max())
-    if low + high <= 0.0:
-        raise MitsimError(
-            f"contrast: darkest plus brightest line is {low + high:.3g}; must be above 0; "
-            f"lower the background ({background:g})"
-        )
-    return (high - low) / (high + low)
 
 
 def truth_for(shots: Capture, board_reflectance: float | None = None) -> NDArray[np.float64] | None:

@@ -6,7 +6,6 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -85,28 +84,46 @@ def quality_bars(quality: Mapping[str, tuple[float, float]]) -> Figure:
     return figure
 
 
-def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figure:
-    """Relative ``errors`` {name: value > 0} on a logarithmic axis, largest on top; ``limit``: accuracy asked for.
+def error_bars(
+    errors: Mapping[str, float], limit: float | None = None, seconds: Mapping[str, float] | None = None
+) -> Figure:
+    """Relative errors on a logarithmic axis, largest on top; numbers stand beside the axes, where no line crosses them.
 
-    The values stand in a column beside the axes, where no line can cross them.
+    Parameters
+    ----------
+    errors
+        by name, >= 0; one of 0 has no dot.
+    limit
+        accuracy asked for.
+    seconds
+        what each takes, a second column; the errors are then those of leaving it out.
     """
-    return _error_dots(sorted(errors.items(), key=lambda item: item[1]), limit)
-
-
-def effect_costs(rows: Sequence[tuple[str, float, float]], limit: float | None = None) -> Figure:
-    """What each effect buys and costs: ``rows`` (name, error when it is left out, seconds it takes), largest on top.
-
-    An error of 0 has no dot, and its row stands at the bottom. Error and seconds are columns beside the axes; ``limit``
-    is the accuracy asked for.
-    """
-    ordered = sorted(rows, key=lambda row: row[1])
-    figure = _error_dots([(name, error) for name, error, _ in ordered], limit)
-    axes = figure.axes[0]
-    for place, (_, _, seconds) in enumerate(ordered):
-        _beside(axes, place, 76, f"{seconds:.2g} s")
-    for points, heading in ((8, "error"), (76, "takes")):
-        _beside(axes, len(ordered) - 0.2, points, heading, color=_GREY)
-    axes.set_xlabel("relative error of the frames if left out [1]", fontsize=_FONT)
+    ordered = sorted(errors.items(), key=lambda item: item[1])
+    figure, axes = _figure(0.7 + 0.36 * len(ordered))
+    values = np.array([value for _, value in ordered], dtype=np.float64)
+    shown = np.append(values[values > 0], [] if limit is None else limit)
+    low, high = (shown.min(), shown.max()) if shown.size else (1e-3, 1e-3)
+    left = 10.0 ** np.floor(np.log10(low) - 0.3)
+    seen = np.flatnonzero(values > 0)
+    axes.hlines(seen, left, values[seen], color=_LINK, lw=2)
+    axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
+    for row, (name, value) in enumerate(ordered):
+        _beside(axes, row, 8, f"{value:.1e}" if value > 0 else "0")
+        if seconds is not None:
+            _beside(axes, row, 76, f"{seconds[name]:.2g} s")
+    if seconds is not None:
+        for points, heading in ((8, "error"), (76, "takes")):
+            _beside(axes, len(ordered) - 0.2, points, heading, color=_GREY)
+    if limit is not None:
+        axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
+        where: Any = axes.get_xaxis_transform()
+        style = {"color": VERMILION, "fontsize": _FONT - 1, "xycoords": where, "textcoords": "offset points"}
+        axes.annotate(f"accuracy asked for: {limit:g}", (limit, 1.0), (4, 3), **style)
+    axes.set_xscale("log")
+    axes.set_xlim(left, 3.0 * high)
+    axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=_FONT)
+    axes.set_ylim(-0.6, len(values) - 0.4)
+    _label(axes, f"relative error{'' if seconds is None else ' of the frames if left out'} [1]", "", grid="x")
     return figure
 
 
@@ -126,12 +143,10 @@ def pareto(series: Mapping[str, Sequence[Point]], noise: float | None = None, ap
 
     Parameters
     ----------
-    series
-        points (seconds, error) by name.
+    series, apart
+        points (seconds, error) by name, and the names of those that are no steps of one thing, and are not joined.
     noise
         relative error that the sensor's noise makes anyway, a horizontal line.
-    apart
-        names of series whose points are different things, not steps of one, and are not joined.
     """
     figure, axes = _figure(0.55 * _WIDTH)
     for index, (name, points) in enumerate(series.items()):
@@ -170,17 +185,11 @@ def solver_costs(rows: Sequence[SolverRow]) -> Figure:
         axes.set_title(rf"relative $\lambda$ {lam:.0e}", fontsize=_FONT)
         _label(axes, "wall time [s]", "")
     panels[0].set_ylabel("relative error of the image [1]", fontsize=_FONT)
-    entries = [(Line2D([], [], ls="", marker="o", color=colours[i], ms=8), name) for i, name in enumerate(precisions)]
+    grey: dict[str, Any] = {"ls": "", "ms": 8, "color": "#9ca3af"}
+    entries = [(Line2D([], [], ls="", ms=8, color=colours[i], marker="o"), name) for i, name in enumerate(precisions)]
     entries.append((panels[0].lines[-1], _BEST))
-    marks = [
-        (Line2D([], [], ls="", marker=_MARKERS[i], color="#9ca3af", ms=8), f"{method}, {layout}")
-        for i, (method, layout) in enumerate(forms)
-    ]
-    # A legend is filled column by column: one row for the colours, one for the markers.
-    empty = (Line2D([], [], ls=""), "")
-    both = [entry for pair in zip_longest(entries, marks, fillvalue=empty) for entry in pair]
-    handles, labels = zip(*both, strict=True)
-    _legend_below(figure, handles, labels, len(both) // 2)
+    entries += [(Line2D([], [], **grey, marker=_MARKERS[i]), ", ".join(form)) for i, form in enumerate(forms)]
+    _legend_below(figure, 4, *zip(*entries, strict=True))
     return figure
 
 
@@ -212,8 +221,7 @@ def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> 
     axes.set_yticks(range(len(systems)), systems, fontsize=_FONT - 2)
     _label(axes, "PSNR of the image [dB]", "", grid="x")
     figure.suptitle(message, fontsize=_FONT)
-    handles, labels = axes.get_legend_handles_labels()
-    _legend_below(figure, handles, labels, len(factors))
+    _legend_below(figure, len(factors), *axes.get_legend_handles_labels())
     return figure
 
 
@@ -224,14 +232,10 @@ def shadow_profiles(
 
     Parameters
     ----------
-    position_mm
-        (pixels,) along the row.
-    profiles
-        (pixels,) relative irradiance by light.
-    reach_mm
-        how far from the middle is shown.
-    message
-        above the figure.
+    position_mm, profiles
+        (pixels,) along the row, and relative irradiance there by light.
+    reach_mm, message
+        how far from the middle is shown, and what is said above.
     """
     figure, axes = _figure(0.4 * _WIDTH)
     position = np.asarray(position_mm, dtype=np.float64)
@@ -245,37 +249,6 @@ def shadow_profiles(
 
 
 # ---- parts of figures ------------------------------------------------------------------------------------------------
-
-
-def _error_dots(ordered: Sequence[tuple[str, float]], limit: float | None) -> Figure:
-    """Dots for values >= 0 in the order given, the last on top, each with its value beside the axes."""
-    figure, axes = _figure(0.7 + 0.36 * len(ordered))
-    values = np.array([value for _, value in ordered], dtype=np.float64)
-    reference = np.append(values[values > 0], [] if limit is None else limit)
-    low, high = (reference.min(), reference.max()) if reference.size else (1e-3, 1e-3)
-    left = 10.0 ** np.floor(np.log10(low) - 0.3)
-    seen = np.flatnonzero(values > 0)
-    axes.hlines(seen, left, values[seen], color=_LINK, lw=2)
-    axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
-    for row, value in enumerate(values):
-        _beside(axes, row, 8, f"{value:.1e}" if value > 0 else "0")
-    if limit is not None:
-        axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
-        axes.annotate(
-            f"accuracy asked for: {limit:g}",
-            (limit, 1.0),
-            (4, 3),
-            xycoords=("data", "axes fraction"),
-            textcoords="offset points",
-            color=VERMILION,
-            fontsize=_FONT - 1,
-        )
-    axes.set_xscale("log")
-    axes.set_xlim(left, 3.0 * high)
-    axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=_FONT)
-    axes.set_ylim(-0.6, len(values) - 0.4)
-    _label(axes, "relative error [1]", "", grid="x")
-    return figure
 
 
 def _beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> None:
@@ -317,7 +290,7 @@ def _label(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both")
     axes.set_axisbelow(True)
 
 
-def _legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
+def _legend_below(figure: Figure, columns: int, handles: Any, labels: Any) -> None:
     figure.legend(handles, labels, fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
 
 

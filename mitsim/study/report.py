@@ -9,40 +9,38 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 
 from mitsim.capture.plan import PlanRow
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.output import whole_file
+from mitsim.core.pictures import data_uri, grey_png, lightness
 from mitsim.study import plots
-from mitsim.study.images import PATTERN_CORNER, figure_uri, finite, pattern_uri, reflectance_uri
 from mitsim.study.metrics import Quality
 
 _DASH = "\N{EN DASH}"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_PATTERN_CORNER = 40
+"""Projector pixels a side that are shown of a pattern, so that single ones can be told apart."""
+_SMALLEST = 384
+"""Pixels a side of a picture: the width of a column of the page, on a screen of two dots a pixel."""
+_FIGURE_DPI = 160
+"""Figures are 8.6 inches wide: 1376 pixels, what the page's width shows on the same screen."""
 _WORTH_TELLING = 0.01
 """Part of the total time below which what is in no stage is left out: the stages are shown to two digits."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """One reconstruction.
-
-    Attributes
-    ----------
-    image
-        (n, n) reflectance.
-    quality
-        beside the truth.
-    lam
-        the lambda that it took.
-    status
-        the solver's sentence, shown only when it says more than "Solved: ...".
-    """
+    """One reconstruction: (n, n) reflectance, its quality, the lambda it took, and the solver's sentence (shown if it
+    says more than "Solved: ...")."""
 
     image: FloatArray
     quality: Quality
@@ -52,22 +50,11 @@ class Recovery:
 
 @dataclass(frozen=True, eq=False)
 class FamilyResult:
-    """What came of one pattern family.
+    """A pattern family, e.g. name "dots:7", label "49 dots"; ``patterns`` are some (n, n) examples, 0..1 or -1..1.
 
-    Attributes
-    ----------
-    name, label
-        such as "dots:7" and "49 dots".
-    shots
-        frames taken; a signed pattern is two.
-    patterns
-        some (n, n) examples, 0..1 or -1..1.
-    singular_values
-        of its system, relative to the largest.
-    idealised, rendered
-        the paper's noisy ideal model solved with its own factors, and rendered frames with calibrated ones.
-    by_exposure
-        PSNR [dB] of the rendered one by exposure convention.
+    ``shots`` counts frames (a signed pattern is two). ``idealised`` solves the paper's noisy ideal model with its own
+    factors, ``rendered`` the rendered frames with calibrated ones, whose PSNR [dB] by exposure convention is
+    ``by_exposure``.
     """
 
     name: str
@@ -80,12 +67,11 @@ class FamilyResult:
     by_exposure: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class BudgetRow:
-    """One source of error: relative rms of the expected frames [1], and what that number means."""
+class BudgetRow(NamedTuple):
+    """One source of error: relative rms of the expected frames [1] (None: unknown), and what that number means."""
 
     name: str
-    value: float
+    value: float | None
     meaning: str
 
 
@@ -93,28 +79,10 @@ class BudgetRow:
 class ReportData:
     """All that one report shows.
 
-    Attributes
-    ----------
-    title, verdict, verdict_detail, scene, notes
-        sentences.
-    truth, render
-        (n, n) and any size: reflectances, 1 = calibration board, as seen along +z, row 0 at the top.
-    families
-        first the one that the tiles compare the best with.
-    frames
-        (m, m) [DN] as the camera gave them, by caption.
-    exposure
-        which convention the reconstructions above the table used.
-    calibration
-        what `calibrate --json` says of the session, and its ``status``.
-    budget
-        sources of error, the simulation's own first.
-    accuracy, effects
-        of the plan.
-    seconds
-        wall time by stage, in order.
-    configuration, seeds, versions
-        what repeats it, by name.
+    ``truth`` (n, n) and ``render`` (any size) are reflectances, 1 = calibration board, as seen along +z, row 0 at the
+    top. The first of the ``families`` is the one that the tiles compare the best with. ``frames`` are (m, m) [DN] by
+    caption, ``exposure`` says which convention the reconstructions used, ``calibration`` is what `calibrate --json`
+    says of the session, and its ``status``. ``accuracy`` and ``effects`` are the plan's.
     """
 
     title: str
@@ -186,35 +154,58 @@ def render_html(report: ReportData) -> str:
         db=_decibel,
         seconds=_seconds,
         trouble=_trouble,
-        reflectance=reflectance_uri,
-        pattern=pattern_uri,
+        reflectance=_reflectance,
+        pattern=_pattern,
     )
     page = environment.get_template("report.html")
     return page.render(
-        report=report, figures=_figures(report), best=_best(report.families), pattern_corner=PATTERN_CORNER
+        report=report, figures=_figures(report), best=_best(report.families), pattern_corner=_PATTERN_CORNER
     )
+
+
+def _reflectance(image: npt.ArrayLike, name: str = "image") -> str:
+    """Reflectance as a grey PNG, cut to 0..1 for display only."""
+    return data_uri(grey_png(lightness(_finite(image, name)), smallest=_SMALLEST))
+
+
+def _pattern(pattern: npt.ArrayLike) -> str:
+    """Top left corner of a pattern: 0..1 as it is, -1..1 with -1 black."""
+    values = _finite(pattern, "pattern")[:_PATTERN_CORNER, :_PATTERN_CORNER]
+    return data_uri(grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values, smallest=_SMALLEST))
+
+
+def _picture(figure: Figure) -> str:
+    figure.savefig(buffer := BytesIO(), format="png", dpi=_FIGURE_DPI)
+    return data_uri(buffer.getvalue())
+
+
+def _finite(image: npt.ArrayLike, name: str) -> FloatArray:
+    values = np.asarray(image, dtype=np.float64)
+    if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
+        raise MitsimError(f"report: {name} of shape {values.shape} must be rows x columns of finite numbers")
+    return values
 
 
 def _figures(report: ReportData) -> dict[str, Any]:
     """The page's plots as data URIs, by name, where there are data for them; and the total time in s."""
     figures: dict[str, Any] = {"total": report.seconds.get("total", math.fsum(report.seconds.values()))}
-    figures["frames"] = {name: figure_uri(plots.frame(finite(dn, name))) for name, dn in report.frames.items()}
+    figures["frames"] = {name: _picture(plots.frame(_finite(dn, name))) for name, dn in report.frames.items()}
     curves = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
     if curves:
-        figures["singular_values"] = figure_uri(plots.singular_values(curves))
+        figures["singular_values"] = _picture(plots.singular_values(curves))
     both = {
         f.label: (f.idealised.quality.psnr_db, f.rendered.quality.psnr_db)
         for f in report.families
         if f.idealised is not None and f.rendered is not None
     }
     if both:
-        figures["quality"] = figure_uri(plots.quality_bars(both))
-    positive = {row.name: row.value for row in report.budget if row.value > 0.0}
+        figures["quality"] = _picture(plots.quality_bars(both))
+    positive = {row.name: row.value for row in report.budget if row.value}
     if positive:
-        figures["budget"] = figure_uri(plots.error_bars(positive, report.accuracy))
+        figures["budget"] = _picture(plots.error_bars(positive, report.accuracy))
     figures["stages"] = _stages(report.seconds)
     if figures["stages"]:
-        figures["seconds"] = figure_uri(plots.seconds_by_stage(figures["stages"]))
+        figures["seconds"] = _picture(plots.seconds_by_stage(figures["stages"]))
     return figures
 
 

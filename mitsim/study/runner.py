@@ -37,15 +37,7 @@ class Findings(Protocol):
 
 @dataclass(frozen=True)
 class StudyResult:
-    """Findings, and where they lie.
-
-    Attributes
-    ----------
-    findings
-        of the study.
-    scene, patterns, output
-        what was studied, and the folder.
-    """
+    """Findings, of which scene and patterns they are, and the folder ``output`` that holds them."""
 
     findings: Findings
     scene: str
@@ -80,20 +72,15 @@ def run_study(
     ----------
     name, measure
         of the study.
-    bench
-        what is studied.
+    bench, request, job
+        what is studied: the scene, patterns and seed; clock, progress and limits.
     output
         new or empty folder, or one with an earlier study of that name, which is replaced.
-    request
-        patterns and seed, and what else the study takes from it.
-    job
-        clock, progress and limits.
 
     Raises
     ------
     MitsimError
-        for patterns that do not fit, an output that cannot be written or holds something else, a scene without light,
-        or a camera that the study cannot expose.
+        for an output that cannot be written or holds something else, and for what the study itself refuses.
     """
     request = request or Request.of()
     with study_folder(output, name, ("*.png",)) as folder:
@@ -115,23 +102,19 @@ def study_folder(output: Path | str, name: str, parts: Sequence[str]) -> Iterato
     ----------
     output
         new or empty, or with an earlier study of that name alone; nothing of it is removed.
-    name
-        of the study; its NAME.json says ``"kind": NAME``.
-    parts
-        patterns of the names of what else an earlier one has written.
+    name, parts
+        of the study, whose NAME.json says ``"kind": NAME``, and of what else it writes, with wildcards.
 
     Raises
     ------
     MitsimError
         when the folder holds anything else, or cannot be written.
     """
-    place, json_name = Path(output), f"{name}.json"
-    earlier = False
-    if (place / json_name).is_file():
-        head = read_json(place / json_name)
-        earlier = isinstance(head, dict) and head.get("kind") == name
-        known = (json_name, ".*", *parts)
-        earlier = earlier and all(any(fnmatch(item.name, one) for one in known) for item in place.iterdir())
+    place, head, names = Path(output), None, (f"{name}.json", ".*", *parts)
+    if (place / names[0]).is_file():
+        head = read_json(place / names[0])
+    earlier = isinstance(head, dict) and head.get("kind") == name
+    earlier = earlier and all(any(fnmatch(item.name, known) for known in names) for item in place.iterdir())
     with output_folder(place, overwrite=earlier) as folder:
         sweep(folder)
         yield folder

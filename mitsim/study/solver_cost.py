@@ -65,18 +65,8 @@ _MOST_STEPS = 20
 class SolverRow:
     """One form of the solution at one lambda.
 
-    Attributes
-    ----------
-    method, precision, layout
-        the form.
-    lambda_rel
-        lambda over the largest squared singular value.
-    seconds
-        wall time of one reconstruction.
-    error, judge_error
-        relative, against the exact image, and what that image is uncertain by.
-    seed
-        of the image.
+    ``lambda_rel`` is lambda over the largest squared singular value; ``seconds`` wall time of one reconstruction;
+    ``error`` relative, against the exact image; ``judge_error`` what that image is uncertain by, relative.
     """
 
     method: str
@@ -91,16 +81,9 @@ class SolverRow:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Noise-free measurement of one image under ``k`` x ``k`` shifting dots.
+    """Noise-free measurement of one image (n, n): ``factor`` Phi (m, n) of both sides, ``k`` x ``k`` shifting dots.
 
-    Attributes
-    ----------
-    factor
-        Phi (m, n) of both sides.
-    k, image
-        patterns a side, and (n, n).
-    frames
-        (k * k, m, m), pattern (i, j) at i k + j.
+    ``frames`` are (k * k, m, m), pattern (i, j) at i k + j.
     """
 
     factor: FloatArray
@@ -139,12 +122,8 @@ def make_problem(factor: FloatArray, k: int, seed: int) -> Problem:
 
     Parameters
     ----------
-    factor
-        Phi (m, n) of both sides.
-    k
-        dots a side.
-    seed
-        of the image.
+    factor, k, seed
+        Phi (m, n) of both sides, dots a side, and the image's.
     """
     image = stream(seed, "solver cost").random((factor.shape[1],) * 2)
     sides = [factor[:, i::k] for i in range(k)]
@@ -159,14 +138,10 @@ def time_solver(
 
     Parameters
     ----------
-    seed
-        of the image.
-    progress
-        told how far the work is.
-    problem
-        None: the paper's geometry.
-    repeats
-        rounds, of which the fastest counts.
+    seed, progress
+        of the image, and who is told how far the work is.
+    problem, repeats
+        None: the paper's geometry; rounds, of which the fastest counts.
 
     Raises
     ------

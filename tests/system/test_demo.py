@@ -46,7 +46,7 @@ def assert_self_contained(page: Path) -> str:
 def done(call: Callable[..., Any], lab: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """A finished demo and its report."""
     folder: Path = tmp_path_factory.mktemp("demo") / "demo"
-    options = "--scene", lab.scene, "-o", folder, "--accuracy", "0.02", "--json"
+    options = lab.scene, "-o", folder, "--accuracy", "0.02", "--json"
     outcome = call("demo", *options)
     assert outcome.code == 0, outcome.err
     return folder, outcome.payload
@@ -79,9 +79,20 @@ def test_the_folders_are_those_of_capture_and_calibrate(
     assert found["psnr"] == pytest.approx(report["psnr"]["dots:7"], abs=0.01)
 
 
+def test_ones_own_devices_and_patterns_have_a_report(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    scene = lab.write_scene("grey_demo", reflectance=None)
+    options = "--patterns", "dots:2", "-D", "albedo=0.4", "--json"
+    report = call("demo", scene, *lab.electronics, "-o", tmp_path / "demo", *options).payload
+    assert tuple(report["psnr"]) == ("uniform", "dots:4", "dots:5", "dots:2", "hadamard:8")
+    page = assert_self_contained(tmp_path / "demo" / "report.html")
+    for words in ("test camera", "test projector", "albedo = 0.4", "4 dots", "exposure (4 dots)"):
+        assert words in page, words
+    assert report["verdict"].startswith("4 dots") and report["verdict"] in page
+
+
 def test_a_second_demo_replaces_the_first(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     folder = tmp_path / "demo"
-    options = "--scene", lab.scene, "-o", folder, "--accuracy", "0.05", "--quiet"
+    options = lab.scene, "-o", folder, "--accuracy", "0.05", "--quiet"
     first = call("demo", *options)
     assert first.code == 0 and "49 dots" in first.out and str(folder / "report.html") in first.out
     old = (folder / "report.html").stat().st_mtime_ns
@@ -98,7 +109,7 @@ def test_what_a_user_put_beside_a_demo_stays(call: Callable[..., Any], lab: Any,
     folder.mkdir()
     (folder / "demo.json").write_text('{"kind": "demo", "status": "incomplete"}')
     (folder / "letter.txt").write_text("keep me")
-    assert "holds files" in call("demo", "--scene", lab.scene, "-o", folder).refusal
+    assert "holds files" in call("demo", lab.scene, "-o", folder).refusal
     assert (folder / "letter.txt").read_text() == "keep me"
 
 
@@ -106,7 +117,7 @@ def test_a_refused_demo_keeps_the_earlier_one(refused: Callable[..., str], tmp_p
     (tmp_path / "demo" / "run").mkdir(parents=True)
     (tmp_path / "demo" / "demo.json").write_text('{"kind": "demo"}')
     (tmp_path / "demo" / "report.html").write_text("<p>yesterday's")
-    refused("demo", "-o", "demo", "--scene", "nowhere.xml")
+    refused("demo", "nowhere.xml", "-o", "demo")
 
 
 @pytest.mark.parametrize(
@@ -118,7 +129,7 @@ def test_a_folder_with_another_demo_json_is_refused(
 ) -> None:
     (tmp_path / "demo" / "run").mkdir(parents=True)
     (tmp_path / "demo" / "demo.json").write_text(text)
-    assert "demo" in refused("demo", "-o", "demo", "--scene", lab.scene)
+    assert "demo" in refused("demo", lab.scene, "-o", "demo")
 
 
 @pytest.mark.slow
@@ -133,7 +144,7 @@ def test_the_shipped_demo(shell: Callable[..., Any], tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["colour_chart", "resolution_target"])
 def test_the_demo_on_the_other_shipped_scenes(shell: Callable[..., Any], tmp_path: Path, scene: str) -> None:
-    outcome = shell("demo", "--scene", scene, "-o", "demo", "--json", cwd=tmp_path)
+    outcome = shell("demo", scene, "-o", "demo", "--json", cwd=tmp_path)
     assert outcome.code in (0, 1)
     assert outcome.payload["gain_db"] > 0
     assert_self_contained(tmp_path / "demo" / "report.html")

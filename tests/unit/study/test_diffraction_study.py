@@ -16,7 +16,7 @@ from mitsim.reconstruct.calibration import estimate_factors
 from mitsim.rig.patterns import hadamard_matrix
 from mitsim.rig.projector import Spectrum
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.study import diffraction, find_study, shadows
+from mitsim.study import diffraction, find_study, ideal
 from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import relative_error
 from mitsim.study.runner import StudyResult
@@ -63,7 +63,7 @@ def test_without_diffraction_its_factors_are_the_papers(bench: Bench) -> None:
 
 def test_frames_are_what_the_terms_say(bench: Bench) -> None:
     """Checked at one pattern: the wave-optical operator applied to the lit image, term by term."""
-    camera = IdealCamera(bench, bench.geometry.mask, shadows.lights(bench)["broadband"])
+    camera = IdealCamera(bench, bench.geometry.mask, ideal.lights(bench)["broadband"])
     image, family = np.random.default_rng(6).random((N, N)), bench.family("dots:2")
     lit = image * np.outer(family.left[:, 1], family.right[:, 0])
     expected = sum(left @ lit @ right.T for left, right in camera.terms)
@@ -74,14 +74,14 @@ def test_frames_are_what_the_terms_say(bench: Bench) -> None:
 
 def test_light_of_short_waves_is_not_told_from_rays(bench: Bench) -> None:
     systems = {
-        shadows.GEOMETRIC: IdealCamera(bench, bench.geometry.mask),
+        ideal.GEOMETRIC: IdealCamera(bench, bench.geometry.mask),
         "short": IdealCamera(bench, bench.geometry.mask, Spectrum(np.array([550 / 256]), np.ones(1))),
         "green": IdealCamera(bench, bench.geometry.mask, Spectrum(np.array([550.0]), np.ones(1))),
     }
-    rows = {name: shadows.shadow_row(name, systems) for name in systems}
+    rows = {name: ideal.shadow_row(name, systems) for name in systems}
     for measure in ("scene_pixel", "factor"):
         found = {name: getattr(row, measure) for name, row in rows.items()}
-        assert found[shadows.GEOMETRIC] < 1e-7 and found["short"] < 1e-2 < 0.05 < found["green"], found
+        assert found[ideal.GEOMETRIC] < 1e-7 and found["short"] < 1e-2 < 0.05 < found["green"], found
     assert rows["short"].separability_centred < 1e-2
 
 
@@ -92,7 +92,7 @@ def test_calibration_finds_the_best_separable_factors(bench: Bench) -> None:
     light that is uniform along one axis) and the nearest ones are two compromises. They differ by less than what one
     separable operator leaves.
     """
-    camera = IdealCamera(bench, bench.geometry.mask, shadows.lights(bench)[shadows.LINE])
+    camera = IdealCamera(bench, bench.geometry.mask, ideal.lights(bench)[ideal.LINE])
     signs = hadamard_matrix(N).astype(float)
     ones = np.ones(N)
     stripes = [[sum(np.outer(a @ h, b @ ones) for a, b in camera.terms) for h in signs.T]]

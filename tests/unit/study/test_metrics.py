@@ -8,7 +8,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import Digital, Patterns, RunManifest, ShotFile
 from mitsim.core.runs import Capture
-from mitsim.study.metrics import Quality, contrast, psnr, relative_error, ssim, truth_for
+from mitsim.study.metrics import Quality, psnr, relative_error, ssim, truth_for
 
 RNG = np.random.default_rng(11)
 TRUTH = RNG.uniform(0.05, 0.9, (24, 20))
@@ -42,22 +42,6 @@ def test_quality_of_an_image_smaller_than_the_window_has_no_ssim() -> None:
     assert Quality.of(TRUTH[:6] + 0.1, TRUTH[:6]) == Quality(pytest.approx(20.0), None)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("lines", ["vertical", "horizontal"])
-def test_contrast_of_known_bars(lines: str) -> None:
-    bars = np.tile(np.repeat([0.8, 0.2], 3), 4)[None, :] * np.ones((10, 1))
-    region = bars if lines == "vertical" else bars.T
-    other = "horizontal" if lines == "vertical" else "vertical"
-    assert contrast(region, lines) == pytest.approx(0.6)  # type: ignore[arg-type]
-    assert contrast(region, other) == pytest.approx(0.0)  # type: ignore[arg-type]
-    assert contrast(region, lines, background=0.1) == pytest.approx(0.6 / 0.8)  # type: ignore[arg-type]
-
-
-def test_contrast_averages_noise_along_the_lines() -> None:
-    """Zero-mean noise of 0.1 along 10000 texels a line leaves 1e-3 a line; 5 sigma over min and max: 0.01."""
-    bars = np.tile([0.8, 0.2], 4)[None, :] + 0.1 * np.random.default_rng(5).standard_normal((10000, 8))
-    assert contrast(bars) == pytest.approx(0.6, abs=0.01)
-
-
 def test_refusals_are_one_line_that_names_the_trouble() -> None:
     broken = TRUTH.copy()
     broken[0, :3] = np.nan
@@ -66,9 +50,6 @@ def test_refusals_are_one_line_that_names_the_trouble() -> None:
         (lambda: psnr(broken, TRUTH), "image has 3 values that are not finite"),
         (lambda: ssim(TRUTH, broken), "truth has 3 values"),
         (lambda: ssim(TRUTH[:6], TRUTH[:6]), "6 x 20 pixels; needs at least 7 x 7"),
-        (lambda: contrast(np.zeros((4, 4))), "must be above 0"),
-        (lambda: contrast(np.zeros((0, 4))), "shape"),
-        (lambda: contrast(TRUTH, "diagonal"), "'diagonal'"),  # type: ignore[arg-type]
     ):
         with pytest.raises(MitsimError, match=words) as caught:
             call()

@@ -26,7 +26,7 @@ def test_every_axis_has_a_unit() -> None:
         plots.seconds_by_stage({"a": 1.0}),
         plots.quality_bars({"a": (20.0, 10.0)}),
         plots.pareto({"a": [(1.0, 0.1)]}),
-        plots.effect_costs([("a", 1e-3, 0.1)]),
+        plots.error_bars({"a": 1e-3}, None, {"a": 0.1}),
         plots.solver_costs(SOLVER_ROWS),
     )
     for figure in figures:
@@ -121,17 +121,17 @@ def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
 
 
 def test_effects_are_sorted_and_columns_do_not_touch() -> None:
-    rows = [("nothing", 0.0, 0.0), ("a long name of an effect, with its parts", 1e-5, 0.0021), ("large", 0.4, 1.7)]
-    figure = plots.effect_costs(rows, limit=1e-3)
+    errors = {"large": 0.4, "nothing": 0.0, "a long name of an effect, with its parts": 1e-5}
+    figure = plots.error_bars(errors, limit=1e-3, seconds=dict(zip(errors, (1.7, 0.0, 0.0021), strict=True)))
     figure.canvas.draw()
     axes = figure.axes[0]
-    assert [text.get_text() for text in axes.get_yticklabels()] == [name for name, _, _ in rows]
+    assert [text.get_text() for text in axes.get_yticklabels()] == [list(errors)[i] for i in (1, 2, 0)]
     written = {text.get_text(): text.get_window_extent() for text in axes.texts}
     for error, seconds in (("0", "0 s"), ("1.0e-05", "0.0021 s"), ("4.0e-01", "1.7 s"), ("error", "takes")):
         assert axes.get_window_extent().x1 < written[error].x0
         assert written[error].x1 + 5 < written[seconds].x0 and written[seconds].x1 < figure.bbox.x1
     assert list(axes.lines[0].get_xdata()) == [1e-5, 0.4], "an error of 0 has no place on a logarithmic axis"
-    plots.effect_costs([("only", 0.0, 0.0)]).canvas.draw()
+    plots.error_bars({"only": 0.0}, None, {"only": 0.0}).canvas.draw()
 
 
 def test_no_pyplot_is_loaded() -> None:

@@ -13,7 +13,6 @@ import pytest
 
 from mitsim.capture.plan import PlanRow
 from mitsim.core.errors import MitsimError
-from mitsim.study import images
 from mitsim.study import report as R
 from mitsim.study.metrics import Quality
 
@@ -221,19 +220,19 @@ def test_time_outside_all_stages_is_not_hidden() -> None:
 
 def test_patterns_are_cut_to_a_corner_where_pixels_can_be_seen() -> None:
     pattern = np.indices((128, 128)).sum(axis=0) % 7 == 0
-    corner = images.PATTERN_CORNER
-    assert images.pattern_uri(pattern) == images.pattern_uri(pattern[:corner, :corner])
-    assert images.pattern_uri(pattern) != images.pattern_uri(pattern[1 : corner + 1, :corner])
+    corner = R._PATTERN_CORNER
+    assert R._pattern(pattern) == R._pattern(pattern[:corner, :corner])
+    assert R._pattern(pattern) != R._pattern(pattern[1 : corner + 1, :corner])
 
 
 def test_display_clips_but_the_numbers_do_not() -> None:
     bright = np.full((8, 8), 7.0)
-    assert images.reflectance_uri(bright) == images.reflectance_uri(np.ones((8, 8)))
-    assert images.reflectance_uri(bright) != images.reflectance_uri(np.full((8, 8), 0.99))
+    assert R._reflectance(bright) == R._reflectance(np.ones((8, 8)))
+    assert R._reflectance(bright) != R._reflectance(np.full((8, 8), 0.99))
 
 
 def test_signed_patterns_show_minus_one_black() -> None:
-    assert images.pattern_uri(np.array([[1.0, 0.0, -1.0]])) == images.pattern_uri(np.array([[1.0, 0.5, 0.0]]))
+    assert R._pattern(np.array([[1.0, 0.0, -1.0]])) == R._pattern(np.array([[1.0, 0.5, 0.0]]))
 
 
 def test_a_loss_is_called_a_loss() -> None:
