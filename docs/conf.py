@@ -4,6 +4,7 @@ The repository's root is the source folder, so that links lead to the same place
 and no notebook is run: a test does that.
 """
 
+import ast
 import base64
 import inspect
 import json
@@ -92,7 +93,14 @@ def gallery() -> str:
     return "\n\n".join(blocks)
 
 
-myst_substitutions = {"face": face(), "gallery": gallery()}
+def plugins() -> str:
+    """Markdown that shows the manuals of mitsim's own Mitsuba plugins as they stand in their modules."""
+    sources = [ROOT / "mitsim" / "transport" / f"{name}.py" for name in ("lensless", "grating", "aperture")]
+    manuals = [ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) for path in sources]
+    return "\n\n".join(f"```text\n{manual}\n```" for manual in manuals)
+
+
+myst_substitutions = {"face": face(), "gallery": gallery(), "plugins": plugins()}
 
 
 def add_contents(_: Sphinx, page: str, source: list[str]) -> None:

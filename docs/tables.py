@@ -15,12 +15,16 @@ from typing import Any
 from pydantic import BaseModel
 
 from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunManifest, ShotFile
+from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import ProjectorModel
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.rig.sensor import SensorModel
 
 FORMATS = Path(__file__).with_name("formats.md")
-MODELS = (SensorModel, ProjectorModel, SessionRecipe, RunManifest, Digital, Patterns, ShotFile, CalibrationManifest)
+MODELS = (
+    *(CameraGeometry, SensorModel, ProjectorModel, SessionRecipe),
+    *(RunManifest, Digital, Patterns, ShotFile, CalibrationManifest),
+)
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 
 

@@ -133,7 +133,7 @@ def test_the_commands_of_a_page_run_in_their_order(page: str, tmp_path: Path) ->
         options = {option for parameter in command.params for option in parameter.opts}
         coarse = ["--accuracy", ACCURACY] if "--accuracy" in options - set(example.arguments) else []
         done = subprocess.run(
-            [sys.executable, "-c", "from mitsim.cli import main; main()", *example.arguments, *coarse],
+            [sys.executable, "-m", "mitsim", *example.arguments, *coarse],
             cwd=tmp_path,
             capture_output=True,
             text=True,
@@ -148,7 +148,7 @@ def test_the_commands_of_a_page_run_in_their_order(page: str, tmp_path: Path) ->
     re.findall(r'^\| (\d) \|.*\| `mitsim ([^`]+)`: "([^"]+)" \|$', text_of("README.md"), flags=re.M),
 )
 def test_the_exit_statuses_of_readme(status: str, line: str, sentence: str, tmp_path: Path) -> None:
-    program = [sys.executable, "-c", "from mitsim.cli import main; main()", *shlex.split(line)]
+    program = [sys.executable, "-m", "mitsim", *shlex.split(line)]
     done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == int(status)
     assert sentence in " ".join(done.stderr.split())
