@@ -245,7 +245,6 @@ def test_a_home_that_takes_no_kernels(shell: Callable[..., Any], lab: Any, tmp_p
 # ---- numbers ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(strict=True, raises=ArithmeticError, reason="capture.light.collect takes a power of error / goal")
 @pytest.mark.parametrize("fraction", ["1e-300", "1e-323"])
 def test_a_part_of_the_noise_that_nothing_reaches(refused: Callable[..., str], lab: Any, fraction: str) -> None:
     line = refused("capture", *lab.rig, "-o", "new", "--patterns", "dots:4", "--noise-fraction", fraction)

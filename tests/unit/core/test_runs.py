@@ -131,7 +131,7 @@ def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
     ):
         pass
     with (
-        pytest.raises(MitsimError, match=r"resume: .* another configuration \(seed differ\)"),
+        pytest.raises(MitsimError, match=r"resume=True: .* another configuration \(seed differ\)"),
         claimed(run, RunHead.of({**CONFIGURATION, "seed": 4}), resume=True),
     ):
         pass
