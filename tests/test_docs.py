@@ -41,12 +41,7 @@ ELSEWHERE = {"--check", "--strict"}
 NO_MODULES = {"mitsim.key"}
 """Names in the docs that only look like modules: metadata of OpenEXR files."""
 
-MODULES_PENDING = {
-    "mitsim/capture/run.py",
-    "mitsim/optics/frames.py",
-    "mitsim/scene/guard/check.py",
-    "mitsim/study/compare.py",
-}
+MODULES_PENDING = {"mitsim/study/compare.py"}
 """Modules that still mention a design page."""
 
 ACCURACY = "0.02"
