@@ -40,7 +40,7 @@ app = typer.Typer(
 )
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_OPTIONS = {"lam": "lambda", "parameters": "D"}
+_OPTIONS = {"lam": "lambda"}
 """Options that are not called like the argument."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
 
@@ -65,7 +65,9 @@ Resume = Annotated[bool, typer.Option("--resume", help="go on where an interrupt
 MaxSeconds = Annotated[float, typer.Option("--max-seconds", help="refuse work that would take longer")]
 MaxMemory = Annotated[
     float | None,
-    typer.Option("--max-memory", help="refuse work that would take more; all that is free if not given", metavar="GIB"),
+    typer.Option(
+        "--max-memory", help="refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
+    ),
 ]
 DAY = 86400.0
 """Work that would take longer is a mistake, unless it is asked for."""
@@ -102,7 +104,10 @@ def _spoken(error: MitsimError) -> str:
     if isinstance(error, ArgumentError):
         option = _OPTIONS.get(error.argument, error.argument).replace("_", "-")
         text = f"--{option}{text.removeprefix(error.argument)}"
-    return re.sub(r"\b(\w+)=True\b", lambda match: "--" + match[1].replace("_", "-"), text)
+    text = re.sub(r"^parameter (?=\w+=)", "-D ", text)
+    return re.sub(
+        r"(?<!-)\b(\w+(?==True)|max_seconds|max_memory)(=True)?", lambda m: "--" + m[1].replace("_", "-"), text
+    )
 
 
 def _usage(error: Any) -> str:

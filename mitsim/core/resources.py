@@ -8,7 +8,7 @@ from pathlib import Path
 
 import psutil
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 
 _CGROUPS = (
     (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactive_file"),
@@ -29,9 +29,9 @@ class Limits:
 
     def __post_init__(self) -> None:
         if not self.seconds > 0:
-            raise MitsimError(f"max_seconds {self.seconds:g}: give a number above 0")
+            raise ArgumentError("max_seconds", f"{self.seconds:g}: give a number above 0")
         if self.memory_bytes is not None and not self.memory_bytes > 0:
-            raise MitsimError(f"max_memory {self.memory_bytes / 2**30:g}: give a number of GiB above 0")
+            raise ArgumentError("max_memory", f"{self.memory_bytes / 2**30:g}: give a number of GiB above 0")
 
 
 @dataclass(frozen=True)

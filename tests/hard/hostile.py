@@ -288,14 +288,16 @@ def _parameters() -> list[Case]:
         Case(
             "define of markup", GOOD, ("name='reflectance'", "pairs"), defines=(("albedo", '"/><path value="/tmp"/>'),)
         ),
-        Case("define of a dollar", GOOD, ("-D albedo", "without $"), line=False, defines=(("albedo", "$albedo"),)),
-        Case("define of a line break", GOOD, ("-D albedo",), line=False, defines=(("albedo", "1\n2"),)),
+        Case(
+            "define of a dollar", GOOD, ("parameter albedo", "without $"), line=False, defines=(("albedo", "$albedo"),)
+        ),
+        Case("define of a line break", GOOD, ("parameter albedo",), line=False, defines=(("albedo", "1\n2"),)),
         Case("define of a reflectance", GOOD, ("reflectance: got 7", "'$albedo'"), defines=(("albedo", "7"),)),
-        Case("define of nothing known", GOOD, ("-D nope=1", "albedo"), line=False, defines=(("nope", "1"),)),
+        Case("define of nothing known", GOOD, ("parameter nope=1", "albedo"), line=False, defines=(("nope", "1"),)),
         Case(
             "define of a keyword",
             put('<default name="filename" value="1"/>'),
-            ("-D filename",),
+            ("parameter filename",),
             line=False,
             defines=(("filename", "0"),),
         ),

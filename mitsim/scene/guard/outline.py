@@ -98,14 +98,14 @@ class Outline:
         for name, value in defines.items():
             if "$" in value or "\\" in value or not value.isprintable():
                 raise MitsimError(
-                    f"-D {cut(name)}={cut(value)!r}: give a plain value without $, backslash or line breaks"
+                    f"parameter {cut(name)}={cut(value)!r}: give a plain value without $, backslash or line breaks"
                 )
         self._read(files.scene(path), path.parent, ())
         for name in defines:
             if name not in self._defaults or name in ("config", "filename"):  # Mitsuba's own arguments
                 known = ", ".join(sorted(self._defaults)) or "none"
                 place = f"{path} has no <default name={cut(name)!r}>"
-                raise MitsimError(f"-D {cut(name)}={cut(defines[name])}: {place}; it knows {known}")
+                raise MitsimError(f"parameter {cut(name)}={cut(defines[name])}: {place}; it knows {known}")
 
     def tag(self, node: mi.parser.SceneNode, name: str = "") -> Tag:
         """The tag of the object ``node``, or that of its property ``name``."""
