@@ -37,12 +37,7 @@ class Comparison:
     well; *equal frame* gives every frame the exposure of uniform light; *equal total* shares that exposure among the
     family's frames.
 
-    Attributes
-    ----------
-    light
-        of the scene, by projector pixel.
-    factors
-        of the camera.
+    ``light`` is the scene's, by projector pixel, ``factors`` the camera's.
     """
 
     light: Light
@@ -132,12 +127,8 @@ def accumulate(
 
     Parameters
     ----------
-    exposer
-        the camera and its exposure.
-    family, expected
-        patterns, and their frames without noise.
-    models
-        that the frames are to be solved with.
+    exposer, family, expected, models
+        the camera and its exposure, patterns, their frames without noise, and what these are to be solved with.
     """
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
