@@ -82,6 +82,10 @@ class Comparison:
         return self.light.merged()
 
     @cached_property
+    def _ideal(self) -> IdealCamera:
+        return IdealCamera(self.light.bench, self.light.bench.geometry.mask)
+
+    @cached_property
     def _uniform(self) -> ExpectedFrames:
         return self._merged.frames(self.light.bench.family("uniform").lighting, self.light.seed)
 
@@ -94,10 +98,9 @@ class Comparison:
 
     def _idealised(self, family: PatternFamily) -> Recovery:
         """The paper's model of the same scene, with noise of its own."""
-        bench, flux = self.light.bench, float(self.light.board_flux.mean())
-        camera = IdealCamera(bench, bench.geometry.mask)
+        camera, flux = self._ideal, float(self.light.board_flux.mean())
         expected = camera.frames(family, self.light.truth * flux)
-        exposer = Exposer(bench, peak_time(bench, expected), self.light.seed + 1)
+        exposer = Exposer(camera.bench, peak_time(camera.bench, expected), self.light.seed + 1)
         model = prepare(*camera.calibrated(flux), family.left, family.right, centre=camera.centre)
         return self._recovery(exposer, family, expected, model)
 

@@ -172,7 +172,9 @@ def _page(evidence: _Evidence) -> ReportData:
             BudgetRow("Sensor noise", shots.manifest.sensor_noise, "shot and read noise of the frames, closed form"),
             BudgetRow("Calibration", session["phi_error"], "error of the factors from noise in the calibration frames"),
             BudgetRow(
-                "Separable model", session["noise_free_residual"], "what noise-free board frames leave beside it"
+                "Separable model",
+                session["noise_free_residual"],
+                "what noise-free board frames leave beside Phi_L X Phi_R^T",
             ),
         ),
         accuracy=light.plan.accuracy,
