@@ -156,7 +156,8 @@ def demo(
 
     request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
     with _job(quiet or as_json) as job:
-        bench = _open(scene, variant, camera, projector, define, outside)
+        with job.clock.stage("open scene"):
+            bench = _open(scene, variant, camera, projector, define, outside)
         result = run_demo(bench, output, request, job)
     return _finish(as_json, result.payload(), result.lines(), result.warnings)
 

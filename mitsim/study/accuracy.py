@@ -149,15 +149,12 @@ class AccuracyFindings:
 def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
     """Error against time.
 
+    MitsimError for patterns that do not fit, or a scene without light.
+
     Parameters
     ----------
     bench, request, job
         the scene, patterns and seed (accuracies are the study's own), and who is told how far the work is.
-
-    Raises
-    ------
-    MitsimError
-        for patterns that do not fit, or a scene without light.
     """
     stand = Stand(bench, bench.family(request.patterns, request.seed), request.seed, job, min(ACCURACIES))
     plans = {accuracy: stand.plan(accuracy) for accuracy in ACCURACIES}

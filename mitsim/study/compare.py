@@ -37,12 +37,7 @@ class Comparison:
     well; *equal frame* gives every frame the exposure of uniform light; *equal total* shares that exposure among the
     family's frames.
 
-    Attributes
-    ----------
-    light
-        of the scene, by projector pixel.
-    factors
-        of the camera.
+    ``light`` is the scene's, by projector pixel, ``factors`` the camera's.
     """
 
     light: Light
@@ -87,6 +82,10 @@ class Comparison:
         return self.light.merged()
 
     @cached_property
+    def _ideal(self) -> IdealCamera:
+        return IdealCamera(self.light.bench, self.light.bench.geometry.mask)
+
+    @cached_property
     def _uniform(self) -> ExpectedFrames:
         return self._merged.frames(self.light.bench.family("uniform").lighting, self.light.seed)
 
@@ -99,10 +98,9 @@ class Comparison:
 
     def _idealised(self, family: PatternFamily) -> Recovery:
         """The paper's model of the same scene, with noise of its own."""
-        bench, flux = self.light.bench, float(self.light.board_flux.mean())
-        camera = IdealCamera(bench, bench.geometry.mask)
+        camera, flux = self._ideal, float(self.light.board_flux.mean())
         expected = camera.frames(family, self.light.truth * flux)
-        exposer = Exposer(bench, peak_time(bench, expected), self.light.seed + 1)
+        exposer = Exposer(camera.bench, peak_time(camera.bench, expected), self.light.seed + 1)
         model = prepare(*camera.calibrated(flux), family.left, family.right, centre=camera.centre)
         return self._recovery(exposer, family, expected, model)
 
@@ -132,12 +130,8 @@ def accumulate(
 
     Parameters
     ----------
-    exposer
-        the camera and its exposure.
-    family, expected
-        patterns, and their frames without noise.
-    models
-        that the frames are to be solved with.
+    exposer, family, expected, models
+        the camera and its exposure, patterns, their frames without noise, and what these are to be solved with.
     """
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():

@@ -68,23 +68,15 @@ class DemoResult:
 def demo(bench: Bench, output: Path | str, request: Request | None = None, job: Job | None = None) -> DemoResult:
     """Plan, capture, calibrate and reconstruct a scene under several pattern families, and write report.html.
 
+    MitsimError for patterns that do not fit, a camera without a full well, a scene without light, an output that cannot
+    be written or holds something else, or work beyond the job's limits.
+
     Parameters
     ----------
-    bench
-        the scene with its camera and projector.
-    output
-        new or empty folder, or one with an earlier demo alone, which is replaced.
+    bench, output, job
+        the scene; a new or empty folder, or one with an earlier demo alone, which is replaced; clock and limits.
     request
-        the main family, its accuracy and seed; the families that it is compared with are those of the paper that fit
-        the projector.
-    job
-        clock, progress and limits.
-
-    Raises
-    ------
-    MitsimError
-        for patterns that do not fit, a camera without a full well, a scene without light, an output that cannot be
-        written or holds something else, or work beyond the job's limits.
+        the main family, its accuracy and seed; it is compared with those of the paper that fit the projector.
     """
     request, job = request or Request.of(), job or Job()
     Exposure().check(bench)
@@ -180,7 +172,9 @@ def _page(evidence: _Evidence) -> ReportData:
             BudgetRow("Sensor noise", shots.manifest.sensor_noise, "shot and read noise of the frames, closed form"),
             BudgetRow("Calibration", session["phi_error"], "error of the factors from noise in the calibration frames"),
             BudgetRow(
-                "Separable model", session["noise_free_residual"], "what noise-free board frames leave beside it"
+                "Separable model",
+                session["noise_free_residual"],
+                "what noise-free board frames leave beside Phi_L X Phi_R^T",
             ),
         ),
         accuracy=light.plan.accuracy,

@@ -153,15 +153,12 @@ class DiffractionFindings:
 def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
     """Shadows, and reconstructions under the patterns asked for and under uniform light.
 
+    MitsimError for patterns that do not fit, a camera without a full well, or a scene without light.
+
     Parameters
     ----------
     bench, request, job
         the scene, patterns, seed and accuracy (diffraction is on, whatever it is worth), progress and limits.
-
-    Raises
-    ------
-    MitsimError
-        for patterns that do not fit, a camera without a full well, or a scene without light.
     """
     Exposure().check(bench)
     request = request.changed(effects={**request.effects, "diffraction": True})

@@ -91,10 +91,8 @@ def error_bars(
 
     Parameters
     ----------
-    errors
-        by name, >= 0; one of 0 has no dot.
-    limit
-        accuracy asked for.
+    errors, limit
+        by name, >= 0 (one of 0 has no dot), and the accuracy asked for.
     seconds
         what each takes, a second column; the errors are then those of leaving it out.
     """
@@ -143,10 +141,9 @@ def pareto(series: Mapping[str, Sequence[Point]], noise: float | None = None, ap
 
     Parameters
     ----------
-    series, apart
-        points (seconds, error) by name, and the names of those that are no steps of one thing, and are not joined.
-    noise
-        relative error that the sensor's noise makes anyway, a horizontal line.
+    series, noise, apart
+        points (seconds, error) by name; the sensor's relative noise, a horizontal line; names of series that are no
+        steps of one thing, and are not joined.
     """
     figure, axes = _figure(0.55 * _WIDTH)
     for index, (name, points) in enumerate(series.items()):

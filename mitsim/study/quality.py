@@ -39,21 +39,16 @@ def reconstruct(
 ) -> Judged:
     """Recover the image of a run with a calibration; writes image.exr, image.png and result.json.
 
+    MitsimError for folders that do not fit, an unknown method or lambda, or an output that cannot be written.
+
     Parameters
     ----------
-    run, calibration
-        RUN and CAL folders.
-    output
-        folder for the image: new or empty, or with an earlier image of the same inputs.
+    run, calibration, output
+        RUN and CAL folders, and one for the image: new or empty, or with an earlier image of the same inputs.
     lam, method
         as for :func:`mitsim.reconstruct.reconstruction.reconstruct`.
     overwrite
         whether an earlier image of other inputs may be replaced.
-
-    Raises
-    ------
-    MitsimError
-        for folders that do not fit each other, an unknown method or lambda, or an output that cannot be written.
     """
     started = time.perf_counter()
     shots, factors = load_run(run), load_calibration(calibration)

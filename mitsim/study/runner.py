@@ -68,6 +68,8 @@ def run_study(
 ) -> StudyResult:
     """Measure, and write NAME.json and the figures to a folder.
 
+    MitsimError for an output that cannot be written or holds something else, and for what the study itself refuses.
+
     Parameters
     ----------
     name, measure
@@ -76,11 +78,6 @@ def run_study(
         what is studied: the scene, patterns and seed; clock, progress and limits.
     output
         new or empty folder, or one with an earlier study of that name, which is replaced.
-
-    Raises
-    ------
-    MitsimError
-        for an output that cannot be written or holds something else, and for what the study itself refuses.
     """
     request = request or Request.of()
     with study_folder(output, name, ("*.png",)) as folder:
@@ -98,17 +95,14 @@ def run_study(
 def study_folder(output: Path | str, name: str, parts: Sequence[str]) -> Iterator[Path]:
     """The folder of a study, held while the context lasts.
 
+    MitsimError when the folder holds anything else, or cannot be written.
+
     Parameters
     ----------
     output
         new or empty, or with an earlier study of that name alone; nothing of it is removed.
     name, parts
         of the study, whose NAME.json says ``"kind": NAME``, and of what else it writes, with wildcards.
-
-    Raises
-    ------
-    MitsimError
-        when the folder holds anything else, or cannot be written.
     """
     place, head, names = Path(output), None, (f"{name}.json", ".*", *parts)
     if (place / names[0]).is_file():

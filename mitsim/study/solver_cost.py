@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from itertools import product
 from typing import Any, Literal
 
@@ -41,7 +42,9 @@ from mitsim.rig.mask import mls_mask
 from mitsim.study.metrics import relative_error
 
 Precision = Literal["float64", "float32 frames", "float32 products"]
+Form = tuple[Method, Structure, Precision]
 Timed = list[tuple[float, FloatArray]]
+"""Seconds and image, for every lambda."""
 PRECISIONS: tuple[Precision, ...] = ("float64", "float32 frames", "float32 products")
 METHODS: tuple[Method, ...] = ("svd", "gram")
 LAYOUTS: tuple[Structure, ...] = ("block", "full")
@@ -96,7 +99,7 @@ class Problem:
         """(n, k) pattern columns of both sides."""
         return dots(len(self.image), self.k)
 
-    @property
+    @cached_property
     def largest_power(self) -> float:
         """Largest squared singular value of the whole model, what lambda_rel is relative to; both sides are equal."""
         return max(float(np.linalg.norm(self.factor[:, i :: self.k], 2)) for i in range(self.k)) ** 4
@@ -136,34 +139,26 @@ def time_solver(
 ) -> tuple[SolverRow, ...]:
     """Error and seconds of every form at every lambda of LAMBDAS.
 
+    MitsimError for a model too ill-conditioned for the judge to reach its own precision.
+
     Parameters
     ----------
     seed, progress
         of the image, and who is told how far the work is.
     problem, repeats
         None: the paper's geometry; rounds, of which the fastest counts.
-
-    Raises
-    ------
-    MitsimError
-        for a model too ill-conditioned for the judge to reach its own precision.
     """
     with single_threaded_blas():
         problem = problem or make_problem(paper_factor(), _DOTS, seed)
-        progress("solver", 0.05)
-        scale = problem.largest_power
-        judge = Judge(problem)
-        answers = []
+        judge, answers = Judge(problem), []
         for index, relative in enumerate(LAMBDAS):
-            answers.append(judge.image(relative * scale))
-            progress("solver", 0.05 + 0.35 * (index + 1) / len(LAMBDAS))
-        single = problem.frames.astype(np.float32)
-        forms = list(product(METHODS, LAYOUTS, PRECISIONS))
-        measured: dict[tuple[Method, Structure, Precision], list[Timed]] = {form: [] for form in forms}
+            answers.append(judge.image(relative * problem.largest_power))
+            progress("solver", 0.4 * (index + 1) / len(LAMBDAS))
+        measured: dict[Form, list[Timed]] = {form: [] for form in product(METHODS, LAYOUTS, PRECISIONS)}
+        forms = list(measured)
         # Round by round rather than form by form, so that a busy moment does not fall on one form alone.
         for index, (_, form) in enumerate(product(range(repeats), forms)):
-            frames = problem.frames if form[2] == "float64" else single
-            measured[form].append(_reconstruct(problem, frames, *form, scale))
+            measured[form].append(_reconstruct(problem, form))
             progress("solver", 0.4 + 0.6 * (index + 1) / (repeats * len(forms)))
     return tuple(
         SolverRow(
@@ -181,15 +176,10 @@ def time_solver(
     )
 
 
-def _reconstruct(
-    problem: Problem,
-    frames: npt.NDArray[Any],
-    method: Method,
-    layout: Structure,
-    precision: Precision,
-    scale: float,
-) -> Timed:
-    """(seconds, image) for every lambda: they share the factorisation and the sums, and each is charged with both."""
+def _reconstruct(problem: Problem, form: Form) -> Timed:
+    """Lambdas share the factorisation and the sums, and each is charged with both."""
+    method, layout, precision = form
+    frames = problem.frames if precision == "float64" else problem.frames.astype(np.float32)
     patterns, add = problem.patterns, _add_single if precision == "float32 products" else _add
     started = time.perf_counter()
     prepared = prepare(problem.factor, problem.factor, patterns, patterns, method=method, structure=layout)
@@ -198,7 +188,7 @@ def _reconstruct(
     timed = []
     for relative in LAMBDAS:
         started = time.perf_counter()
-        image = solve(relative * scale)
+        image = solve(relative * problem.largest_power)
         timed.append((shared + time.perf_counter() - started, image))
     return timed
 

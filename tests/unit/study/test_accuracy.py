@@ -13,7 +13,6 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.light import Sampling, make_plan, trace_light
 from mitsim.capture.request import Request
-from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.study import accuracy, find_study, plots
 from mitsim.study.accuracy import AccuracyFindings
@@ -196,8 +195,3 @@ def test_reformed_light_is_that_of_a_plan_without_the_effect(bench: Bench) -> No
         strict=True,
     ):
         assert np.array_equal(ours.irradiance, theirs.irradiance)
-
-
-def test_another_name_is_refused_with_the_studies() -> None:
-    with pytest.raises(MitsimError, match=r"'weather'.*accuracy, diffraction"):
-        find_study("weather")

@@ -1,0 +1,88 @@
+"""What all studies share: one folder each, which holds nothing else, and a JSON that says what it is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from matplotlib.figure import Figure
+
+from mitsim.capture.request import Request
+from mitsim.core.errors import MitsimError
+from mitsim.study import STUDIES, find_study, plots
+from mitsim.study.runner import StudyResult, run_study, study_folder
+
+BENCH: Any = SimpleNamespace(loaded=SimpleNamespace(path=Path("scene.xml")))
+
+
+@dataclass(frozen=True)
+class Toy:
+    """Findings of a study that measures nothing."""
+
+    value: float
+
+    def payload(self) -> dict[str, Any]:
+        return {"rows": [self.value]}
+
+    def lines(self) -> list[str]:
+        return [f"It is {self.value:g}."]
+
+    def figures(self) -> dict[str, Figure]:
+        return {"toy.png": plots.seconds_by_stage({"a": self.value})}
+
+
+def run(folder: Path, value: float = 1.0, name: str = "toy") -> StudyResult:
+    return run_study(name, lambda bench, request, job: Toy(value), BENCH, folder, Request.of(seed=4))
+
+
+def test_a_study_is_its_measure_and_the_runner_does_the_rest(tmp_path: Path) -> None:
+    result = run(tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["toy.json", "toy.png"]
+    written = json.loads((tmp_path / "out" / "toy.json").read_text())
+    payload = {"rows": [1.0], "scene": "scene.xml", "patterns": "dots:7", "output": str(tmp_path / "out")}
+    assert result.payload() == payload and payload.items() <= written.items()
+    assert written["kind"] == "toy" and written["seed"] == 4 and "mitsim" in written["versions"]
+    assert result.lines()[0] == "It is 1." and str(tmp_path / "out") in result.lines()[1]
+
+
+def test_a_study_replaces_an_earlier_one_of_its_name_alone(tmp_path: Path) -> None:
+    run(tmp_path / "out")
+    run(tmp_path / "out", 2.0)
+    assert json.loads((tmp_path / "out" / "toy.json").read_text())["rows"] == [2.0]
+    with pytest.raises(MitsimError, match="holds files already"):
+        run(tmp_path / "out", name="other")
+    (tmp_path / "out" / "letter.txt").write_text("keep me")
+    with pytest.raises(MitsimError, match="holds files already"):
+        run(tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "toy.json").read_text())["rows"] == [2.0]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"kind": "recipe"}', '{"rows": []}'])
+def test_a_json_of_something_else_is_no_earlier_study(tmp_path: Path, text: str) -> None:
+    (tmp_path / "toy.json").write_text(text)
+    with pytest.raises(MitsimError, match=r"toy\.json|holds files"), study_folder(tmp_path, "toy", ("*.png",)):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["toy.json"]
+
+
+def test_a_study_that_fails_leaves_no_new_folder(tmp_path: Path) -> None:
+    def broken(bench: Any, request: Any, job: Any) -> Toy:
+        raise MitsimError("no light")
+
+    with pytest.raises(MitsimError, match="no light"):
+        run_study("toy", broken, BENCH, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_study_can_be_found(name: str) -> None:
+    assert callable(find_study(name))
+
+
+def test_another_name_is_refused_with_the_studies() -> None:
+    with pytest.raises(MitsimError, match=r"'weather'.*accuracy, diffraction"):
+        find_study("weather")
