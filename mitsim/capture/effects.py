@@ -182,6 +182,12 @@ def _diffraction(bench: Bench) -> str:
     )
 
 
+def _lens(bench: Bench) -> str:
+    lens, far = bench.source, bench.geometry.scene_distance
+    spot = 2 * lens.aperture * abs(far - lens.focus) / lens.focus  # similar triangles
+    return f"a lens of radius {lens.aperture:g} mm, sharp at {lens.focus:g} mm: spots of {spot:.3g} mm at {far:g} mm"
+
+
 EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "interreflection",
@@ -226,6 +232,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
         "aperture",
         {"projector.aperture": 0.0},
         absent="the projector is a pinhole: sharp at all distances",
+        note=_lens,
         retraced=_always(DIRECT, FOLLOWED),
         first_look=True,
         in_truth=True,

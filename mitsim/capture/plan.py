@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.capture.effects import EFFECTS, Effect, names
 from mitsim.capture.evidence import GROUPS, Effort, Evidence, Settings
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.pictures import table
 
 if TYPE_CHECKING:
@@ -96,6 +96,13 @@ class Plan:
     request: Request | None = None
     cost: Cost | None = None
 
+    def row(self, name: str) -> PlanRow:
+        """What is said of the effect or discretisation called ``name``; MitsimError when there is none."""
+        rows = {row.name: row for row in self.effects}
+        if name not in rows:
+            raise MitsimError(f"plan: no row {name!r}; there are {', '.join(rows)}")
+        return rows[name]
+
     def block(self) -> dict[str, Any]:
         """The plan as JSON holds it."""
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
@@ -114,17 +121,25 @@ class Plan:
             **{f"predicted_{what}_bytes": count for what, count in cost.items()},
         }
 
+    def __repr__(self) -> str:
+        states = ", ".join(f"{row.name} {row.state}" for row in self.effects if row.state != "off")
+        return f"Plan(accuracy {self.accuracy:g}: {states})"
+
     def _repr_html_(self) -> str:
         cells = [
             (row.name, row.state, row.reason, _shown(row.error_if_off), f"{row.seconds:.2f}") for row in self.effects
         ]
-        facts = [f"Predicted: {self.predicted_seconds:.2f} s, systematic error {self.systematic_error:.1e}"]
-        headings = ("effect", "state", "reason", "error if off", "seconds")
-        return table(f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.warnings))
+        facts = (
+            "Error if off: relative rms change of the frames without the effect.",
+            f"Predicted: {self.predicted_seconds:.2f} s. "
+            f"What is left out or made coarse adds up to {self.systematic_error:.1e}.",
+        )
+        headings = ("effect", "state", "reason", "error if off", "time [s]")
+        return table(f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.warnings), numbers=2)
 
 
 def _shown(error: float | None) -> str:
-    return "-" if error is None else f"{error:.1e}"
+    return "-" if error is None else f"{error:.1e}" if error else "0"
 
 
 @dataclass(frozen=True)

@@ -78,11 +78,17 @@ class Rendered:
         write_frame(path, channels, {"unit": "W/m^2", **facts, **versions()})
         return Path(path)
 
-    def _repr_html_(self) -> str:
-        from mitsim.core.pictures import card, scaled
+    def __repr__(self) -> str:
+        rows, columns = self.mean.shape[:2]
+        return f"Rendered({rows} x {columns}: {self.facts['estimator']}, relative noise {self.mc_error:.1e})"
 
-        fact = f"mean {self.mean.mean():.3e} W/m^2, relative noise {self.mc_error:.1e}"
-        return card(f"Rendered, {self.facts['estimator']}", {"irradiance": scaled(self.mean.mean(axis=2))}, (fact,))
+    def _repr_html_(self) -> str:
+        from mitsim.core.pictures import card, scaled, span
+
+        grey = self.mean.mean(axis=2)
+        facts = f"mean {grey.mean():.3g} W/m^2, relative noise {self.mc_error:.1e}"
+        pictures = {f"irradiance\n{span(grey, 'W/m^2')}": scaled(grey)}
+        return card(f"Rendered: {self.facts['estimator']}", pictures, (facts, *self.warnings))
 
 
 def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) -> tuple[FloatArray, FloatArray]:

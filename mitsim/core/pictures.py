@@ -10,8 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-_LARGEST_INLINE = 256
+_LARGEST_INLINE = 128
 """Pixels a side that a notebook shows: the pictures of one object then stay below 100 kB."""
+_SHORT_CELL = 20
+"""A table's cells of fewer letters are not broken into lines: names and numbers."""
+_SHOWN_HEIGHT = 144
+"""Height of a notebook's pictures [screen pixels]: five stand side by side."""
 
 
 def png(values: npt.ArrayLike, largest: int | None = None) -> bytes:
@@ -34,25 +38,34 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
     values
         (rows, columns), 0 black, 1 white.
     largest
-        pixels a side beyond which every second (third, ...) value is shown.
+        pixels a side beyond which every picture pixel is the mean of 2 x 2 (3 x 3, ...).
     smallest
         pixels a side that there are at least: each value then takes a square of them.
     """
-    # Imported here: matplotlib takes a third of a second, and most work shows nothing.
-    from matplotlib import image
+    # Imported here: most work shows nothing.
+    from PIL import Image
 
     shown = np.asarray(values, dtype=np.float64)
-    step = -(-max(shown.shape) // largest) if largest else 1
-    shown = shown[::step, ::step]
     copies = -(-smallest // max(shown.shape))
+    grey = np.rint(255 * np.clip(np.kron(shown, np.ones((copies, copies))), 0, 1))
+    picture = Image.fromarray(grey.astype(np.uint8))
+    if largest:
+        picture = picture.reduce(max(1, -(-max(picture.size) // largest)))
     buffer = io.BytesIO()
-    image.imsave(buffer, np.kron(shown, np.ones((copies, copies))), cmap="gray", vmin=0, vmax=1, format="png")
+    picture.save(buffer, format="png", optimize=True)
     return buffer.getvalue()
 
 
 def data_uri(picture: bytes) -> str:
     """A PNG ``picture`` as the address that holds it, for a page that refers to nothing outside itself."""
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
+
+
+def span(values: npt.ArrayLike, unit: str) -> str:
+    """The range of numbers ``values``, with their ``unit``, for the caption of a picture of them :func:`scaled`."""
+    ends = np.min(values), np.max(values)
+    low, high = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in ends)
+    return f"{low} to {high} {unit}"
 
 
 def scaled(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -76,16 +89,17 @@ def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]
     """
     sources = {caption: data_uri(png(values, _LARGEST_INLINE)) for caption, values in pictures.items()}
     figures = "".join(
-        '<figure style="display:inline-block;margin:0 8px 4px 0">'
-        f'<img style="height:144px" src="{source}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        '<figure style="display:inline-block;vertical-align:top;margin:4px 12px 4px 0">'
+        f'<img style="height:{_SHOWN_HEIGHT}px;image-rendering:pixelated" src="{source}">'
+        f'<figcaption style="font-size:85%;white-space:pre-line">{html.escape(caption)}</figcaption></figure>'
         for caption, source in sources.items()
     )
-    lines = "".join(f"<div>{html.escape(fact)}</div>" for fact in facts)
-    return f"<div><b>{html.escape(title)}</b></div>{figures}{lines}"
+    return _titled(title, f"<div>{figures}</div>", facts)
 
 
-def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], facts: Iterable[str] = ()) -> str:
+def table(
+    title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], facts: Iterable[str] = (), numbers: int = 0
+) -> str:
     """HTML of a table in a notebook.
 
     Parameters
@@ -96,11 +110,25 @@ def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], fa
         of cells.
     facts
         lines below it.
+    numbers
+        how many of the last columns hold numbers.
     """
-    head = "".join(f"<th style='text-align:left'>{html.escape(heading)}</th>" for heading in headings)
-    body = "".join(
-        "<tr>" + "".join(f"<td style='text-align:left'>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-        for row in rows
-    )
+
+    def wrap(cell: str) -> str:
+        return ";white-space:nowrap" if len(cell) < _SHORT_CELL else ""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        sides = ["left"] * (len(cells) - numbers) + ["right"] * numbers
+        return "".join(
+            f'<{tag} style="padding:2px 10px 2px 0;text-align:{side};vertical-align:top{wrap(cell)}">'
+            f"{html.escape(cell)}</{tag}>"
+            for cell, side in zip(cells, sides, strict=True)
+        )
+
+    body = "".join(f"<tr>{line(row, 'td')}</tr>" for row in rows)
+    return _titled(title, f"<table><tr>{line(headings, 'th')}</tr>{body}</table>", facts)
+
+
+def _titled(title: str, body: str, facts: Iterable[str]) -> str:
     lines = "".join(f"<div>{html.escape(fact)}</div>" for fact in facts)
-    return f"<div><b>{html.escape(title)}</b></div><table><tr>{head}</tr>{body}</table>{lines}"
+    return f"<div><b>{html.escape(title)}</b></div>{body}{lines}"

@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, Value, checksum, read_frame, write_frame
 from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, read_manifest, write_manifest
 from mitsim.core.output import output_folder, sweep
-from mitsim.core.pictures import card, scaled
+from mitsim.core.pictures import card, scaled, span
 
 TRUTH = "truth.exr"
 Channels = Mapping[str, Channel]
@@ -179,17 +179,29 @@ class Capture:
                 run.finish(self.manifest)
         return run.path
 
+    def __repr__(self) -> str:
+        return f"Capture({self._family}: {self._size}, {self.folder or 'in memory'})"
+
     def _repr_html_(self) -> str:
-        shots = self.manifest.patterns.captures
-        frames = {
-            f"shot {i}: ({shot.row}, {shot.column})": scaled(self._channel(shot.file, "DN"))
-            for i, shot in enumerate(shots[:_SHOWN])
+        shots = self.manifest.patterns.captures[:_SHOWN]
+        frames = [self._channel(shot.file, "DN") for shot in shots]
+        pictures = {
+            f"shot {i}, pattern ({shot.row}, {shot.column})\n{span(frame, 'DN')}": scaled(frame)
+            for i, (shot, frame) in enumerate(zip(shots, frames, strict=True))
         }
-        rows, columns = next(iter(frames.values())).shape
-        truth = {} if self.truth is None else {"truth": self.truth}
-        family = self.manifest.patterns.family or "patterns"
-        facts = f"{len(shots)} shots of {rows} x {columns} pixels, exposure {self.exposure_s:.3g} s; {self.name}"
-        return card(f"Capture: {family}", {**frames, **truth}, (facts, *self.warnings))
+        truth = {} if self.truth is None else {"truth\nreflectance 0 to 1": self.truth}
+        facts = f"{self._size}, exposure {self.exposure_s:.3g} s a shot; {self.folder or 'in memory'}"
+        return card(f"Capture: {self._family}", {**pictures, **truth}, (facts, *self.warnings))
+
+    @property
+    def _family(self) -> str:
+        return self.manifest.patterns.family or "patterns"
+
+    @property
+    def _size(self) -> str:
+        shots = self.manifest.patterns.captures
+        rows, columns = self._channel(shots[0].file, "DN").shape
+        return f"{len(shots)} shots of {rows} x {columns} pixels"
 
     def _read(self, name: str) -> tuple[Channels, Metadata]:
         if self.folder is None:

@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError, cut
 from mitsim.core.framefile import checksum, read_frame, write_frame
 from mitsim.core.manifests import CalibrationManifest, read_manifest, write_manifest
 from mitsim.core.output import output_folder
-from mitsim.core.pictures import card, scaled
+from mitsim.core.pictures import card, scaled, span
 from mitsim.core.runs import Capture, finite_channel, verify
 from mitsim.reconstruct.accumulator import centred_columns
 from mitsim.reconstruct.calibration import Estimate, squared_condition
@@ -178,8 +178,17 @@ class Factors:
             (int(np.prod(shape)), rows * columns), matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64)
         )
 
+    def __repr__(self) -> str:
+        shapes = ", ".join(f"{name} {side.shape[0]} x {side.shape[1]}" for name, side in self._sides())
+        return f"Factors({shapes}: {self.status.verdict.value}, {self.name})"
+
     def _repr_html_(self) -> str:
-        pictures = {f"{name} {side.shape[0]} x {side.shape[1]}": scaled(side) for name, side in self._sides()}
+        pictures = {
+            f"{name}: {side.shape[0]} sensor x {side.shape[1]} projector pixels\n{span(side, 'sqrt(e-/s)')}": scaled(
+                side
+            )
+            for name, side in self._sides()
+        }
         return card(f"Factors: {self.status.verdict.value}", pictures, (str(self.status), *self.warnings))
 
     def _sides(self) -> tuple[tuple[str, FloatArray], ...]:

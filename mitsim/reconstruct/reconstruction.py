@@ -111,9 +111,14 @@ class Reconstruction:
         write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
         return folder
 
+    def __repr__(self) -> str:
+        rows, columns = self.image.shape
+        return f"Reconstruction({rows} x {columns}: {self.status.verdict.value}, residual {self.residual:.1e})"
+
     def _repr_html_(self) -> str:
-        facts = f"lambda {self.lam:.3g}, residual {self.residual:.1e}"
-        return card(f"Reconstruction: {self.status.verdict.value}", {"": self.image}, (str(self.status), facts))
+        facts = f"lambda {self.lam:.3g}, residual {self.residual:.1e} of the frames"
+        pictures = {"reflectance 0 to 1": self.image}
+        return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), facts))
 
 
 def reconstruct(

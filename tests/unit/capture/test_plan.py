@@ -95,6 +95,20 @@ def test_rows_carry_the_measured_errors() -> None:
     assert found["diffraction"].reason.startswith("Fresnel number 3.2; ")
 
 
+def test_a_row_is_found_by_its_name() -> None:
+    found = plan()
+    assert all(found.row(row.name) is row for row in found.effects)
+    with pytest.raises(MitsimError, match=r"plan: no row 'lens'; there are anchors, layers, .*aperture"):
+        found.row("lens")
+
+
+def test_it_shows_itself() -> None:
+    found = plan()
+    shown = found._repr_html_()
+    assert all(row.name in shown for row in found.effects) and "0.0e+00" not in shown
+    assert repr(found).startswith("Plan(accuracy 0.001: anchors approximate") and "ambient" not in repr(found)
+
+
 def test_a_plan_is_json_with_the_promised_keys() -> None:
     block = json.loads(json.dumps(asdict(replace(plan(), settings=replace(plan().settings, effects=())))))
     assert {"effects", "accuracy", "predicted_seconds", "settings", "warnings"} <= set(block)

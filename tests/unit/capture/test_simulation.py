@@ -94,6 +94,11 @@ def test_neutral_parts(bench: Bench) -> None:
     assert set(off.tracers()) == {"direct"}
 
 
+def test_a_plan_says_how_large_the_spots_of_a_lens_are(bench: Bench) -> None:
+    """A cone of radius 3 mm that ends at 300 mm has grown again by 400 mm to a third of it."""
+    assert EFFECTS["aperture"].note(bench) == "a lens of radius 3 mm, sharp at 300 mm: spots of 2 mm at 400 mm"
+
+
 @pytest.mark.parametrize("effect", [name for name in EFFECTS if name != "speckle"])
 def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
     on, off = simulation(bench, effect), simulation(bench)

@@ -116,7 +116,8 @@ def test_it_shows_itself(tmp_path: Path) -> None:
     for shots in (recorded(RunMemory()), on_disk(tmp_path / "run")):
         text = shots._repr_html_()
         assert text.count("data:image/png;base64,") == 5 and "hadamard:2" in text and "8 shots of 5 x 5" in text
-        assert "too dark" in text
+        assert "too dark" in text and "pattern (" in text and " DN" in text
+    assert repr(recorded(RunMemory())) == "Capture(hadamard:2: 8 shots of 5 x 5 pixels, in memory)"
 
 
 def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:

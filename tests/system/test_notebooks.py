@@ -1,0 +1,97 @@
+"""The notebooks: their code speaks the face as it is, what is stored in them is fit for anybody, and all cells run."""
+
+import ast
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mitsim
+
+NOTEBOOKS = sorted(Path(__file__).parents[2].joinpath("docs/notebooks").glob("*.ipynb"))
+SLOW = "first_capture"
+"""Calibrates a shipped camera of 512 x 512 pixels, which takes half a minute."""
+LARGEST = 400_000
+"""Bytes of a notebook with its outputs."""
+FIT = {("stream", "stdout"), ("display_data", ""), ("execute_result", "")}
+"""Outputs that may come: neither warnings on stderr nor errors."""
+every = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def code(notebook: dict[str, Any]) -> list[dict[str, Any]]:
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def read(path: Path) -> dict[str, Any]:
+    notebook: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return notebook
+
+
+def kinds(cell: dict[str, Any]) -> list[tuple[str, ...]]:
+    """What came out of a cell, without what it says; neighbouring texts count as one."""
+    found: list[tuple[str, ...]] = []
+    for output in cell["outputs"]:
+        kind = output["output_type"], output.get("name", ""), *sorted(output.get("data", {}))
+        if kind[0] != "stream" or found[-1:] != [kind]:
+            found.append(kind)
+    return found
+
+
+def words(cell: dict[str, Any]) -> str:
+    """All text that came out of a cell, without pictures."""
+    texts = []
+    for output in cell["outputs"]:
+        texts += [output.get("text", "")]
+        texts += [text for kind, text in output.get("data", {}).items() if kind.startswith("text/")]
+    return re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", "\n".join("".join(text) for text in texts))
+
+
+def test_there_are_three() -> None:
+    assert [path.stem for path in NOTEBOOKS] == ["first_capture", "my_own_camera", "sweep_a_material"]
+
+
+@every
+def test_every_name_is_one_of_the_face(path: Path) -> None:
+    used = {
+        node.attr
+        for cell in code(read(path))
+        for node in ast.walk(ast.parse("".join(cell["source"])))
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "ms"
+    }
+    assert used and used <= set(mitsim.__all__)
+
+
+@every
+def test_what_is_stored_is_fit_for_anybody(path: Path) -> None:
+    cells = code(read(path))
+    assert path.stat().st_size < LARGEST
+    assert [cell["execution_count"] for cell in cells] == [*range(1, len(cells) + 1)]
+    for cell in cells:
+        assert not re.search(r"/(tmp|work|home|root|Users)\b| object at 0x|[Ww]arning", words(cell))
+        assert {kind[:2] for kind in kinds(cell)} <= FIT
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, marks=[pytest.mark.slow] * (path.stem == SLOW), id=path.stem) for path in NOTEBOOKS]
+)
+def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From top to bottom in an empty folder, by this Python, without the user's settings; the same kinds come out."""
+    import nbformat
+    from jupyter_client.kernelspec import KernelSpecManager
+    from jupyter_client.manager import AsyncKernelManager
+    from nbclient import NotebookClient
+
+    for name in ("IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR", "MPLCONFIGDIR"):
+        (tmp_path / name).mkdir()
+        monkeypatch.setenv(name, str(tmp_path / name))
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    # Without folders of kernels only that of this Python is known.
+    kernel = AsyncKernelManager(kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, km=kernel, timeout=600, resources={"metadata": {"path": str(empty)}}).execute()
+    for cell, stored in zip(code(notebook), code(read(path)), strict=True):
+        assert kinds(cell) == kinds(stored), cell["source"]
