@@ -489,7 +489,7 @@ def _print_plan(plan: Plan) -> None:
 def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
     """Print the result; exit status 1 when there are warnings."""
     if as_json:
-        from mitsim.core.manifest import plain
+        from mitsim.core.jsonfile import plain
 
         print(json.dumps(plain(payload), allow_nan=False))
     else:

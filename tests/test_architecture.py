@@ -138,7 +138,7 @@ def test_the_rules_catch_a_planted_violation(module: str, source: str) -> None:
         ("mitsim.transport.direct", "import mitsuba\nfrom mitsim.optics import shadow"),
         ("mitsim.core.environment", "import mitsuba"),
         ("mitsim.sensor.chain", "from . import model\nfrom ..core import units"),
-        ("mitsim.core.manifest", "import mitsim"),
+        ("mitsim.core.jsonfile", "import mitsim"),
         ("mitsim.reconstruct.factors", "from mitsim.rig.patterns import PatternFamily"),
         ("mitsim.cli", "def f():\n    from mitsim.study.demo import demo"),
         ("mitsim", "if TYPE_CHECKING:\n    from mitsim.capture.bench import Bench"),

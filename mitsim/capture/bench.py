@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
     from mitsim.rig.recipe import SessionRecipe
     from mitsim.scene.load import LoadedScene
-    from mitsim.transport.source import Projector
+    from mitsim.transport.projector import ProjectorOptics
 
 _PITCH_TOLERANCE = 1e-3
 """Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
@@ -217,12 +217,12 @@ class Bench:
         return self.loaded.pixels.n
 
     @property
-    def source(self) -> Projector:
-        """The projector as the tracer wants it."""
-        from mitsim.transport.source import Projector
+    def projector_optics(self) -> ProjectorOptics:
+        """The projector as the tracers want it."""
+        from mitsim.transport.projector import ProjectorOptics
 
         grid, model = self.loaded.pixels, self.projector
-        return Projector(
+        return ProjectorOptics(
             self.loaded.projector,
             grid.n,
             grid.first_row,
@@ -242,9 +242,9 @@ class Bench:
     def glint(self) -> Glint:
         """Light of the projector that mirrors alone bring to the sensor."""
         from mitsim.capture.glint import Glint
-        from mitsim.transport.beams import trace_beams
+        from mitsim.transport.glint import trace_glint
 
-        return Glint(trace_beams(self.loaded.scene, self.loaded.camera, self.source))
+        return Glint(trace_glint(self.loaded.scene, self.loaded.camera, self.projector_optics))
 
     @property
     def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifest import plain, read_json, write_json
+from mitsim.core.jsonfile import plain, read_json, write_json
 from mitsim.core.manifests import MANIFEST
 from mitsim.core.output import output_folder, sweep, whole_file
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsim.capture.bench import Bench
-    from mitsim.transport.source import Projector
+    from mitsim.transport.projector import ProjectorOptics
 
 DIRECT, FOLLOWED = "direct", "followed"
 """Light of one surface from the projector, and all that is followed over more or from the camera: what is traced."""
@@ -54,7 +54,7 @@ class Physics:
     """
 
     geometry: CameraGeometry
-    projector: Projector
+    projector: ProjectorOptics
     spectrum: Spectrum | None
     black_level: float
     speckle: float
@@ -67,7 +67,7 @@ class Physics:
         """Everything that ``bench`` has."""
         return cls(
             geometry=bench.geometry,
-            projector=bench.source,
+            projector=bench.projector_optics,
             spectrum=bench.spectrum,
             black_level=bench.projector.black_level,
             speckle=bench.projector.speckle_contrast,
@@ -183,7 +183,7 @@ def _diffraction(bench: Bench) -> str:
 
 
 def _lens(bench: Bench) -> str:
-    lens, far = bench.source, bench.geometry.scene_distance
+    lens, far = bench.projector_optics, bench.geometry.scene_distance
     spot = 2 * lens.aperture * abs(far - lens.focus) / lens.focus  # similar triangles
     return f"a lens of radius {lens.aperture:g} mm, sharp at {lens.focus:g} mm: spots of {spot:.3g} mm at {far:g} mm"
 

@@ -99,7 +99,7 @@ class Exposer:
         A signed pattern is a difference of two frames.
         """
         positive: FloatArray | None = None
-        for shots in in_chunks(zip(family.captures, expected, strict=True)):
+        for shots in in_chunks(zip(family.shots, expected, strict=True)):
             rates = in_threads(lambda item: self._measured(item[1], *item[0].names), shots)
             for (shot, _), rate in zip(shots, rates, strict=True):
                 if shot.sign == 1:

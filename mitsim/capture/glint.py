@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from mitsim.core.arrays import Labels
-from mitsim.optics.beams import Beams, beam_frames
 from mitsim.optics.frames import ClassFrames
-from mitsim.optics.samplers import SeparableTerm, geometric_terms, wave_samplers
+from mitsim.optics.glint import Beams, glint_frames
+from mitsim.optics.samplers import SeparableTerm, geometric_samplers, wave_samplers
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
 
@@ -46,12 +46,12 @@ class Glint:
         return self._frames[key]
 
     def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
-        return beam_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
+        return glint_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
 
     def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SeparableTerm]:
         """The mask for a virtual source at the beams' mean depth and direction."""
         if spectrum is None:
-            return geometric_terms(geometry)
+            return geometric_samplers(geometry)
         near = float(np.mean(self.beams.inverse_depth))
         depth = 1 / near if near > 0 else math.inf
         tau = np.average(self.beams.tangent.mean(axis=(1, 2)), axis=0, weights=self.beams.delivered)

@@ -21,7 +21,7 @@ from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames, relative_error
+from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import load_recipe
 
@@ -246,7 +246,7 @@ def trace_light(
             reached=False,
         )
         expected = light.frames(checked, seed)
-        error = relative_error(expected)
+        error = monte_carlo_error(expected)
         target = sampling.target(expected) if sampling.target else plan.sampling_target
         progress("transport", min(1.0, (target / error) ** 2) if error > 0 else 1.0)
         if error <= target or light.paths >= _MOST_PATHS:

@@ -28,8 +28,7 @@ from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.runs import Capture, RunFolder, RunMemory, claimed, frame_name
 from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.rig.patterns import Capture as Shot
-from mitsim.rig.patterns import PatternFamily
+from mitsim.rig.patterns import PatternFamily, Shot
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import Digital
 
@@ -124,7 +123,7 @@ def capture(
     job = job or Job()
     request.timing.check(bench)
     family = bench.family(request.patterns, request.seed)
-    patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.captures))])
+    patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     lighting = family.lighting
     on_disk = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if output and resume else 0
     place = Path(output) if output else None
@@ -243,7 +242,7 @@ class _Shooting:
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
         """Expose and record in chunks, one thread a processor; stages are timed on the wall clock."""
-        chunks = in_chunks(enumerate(zip(self.family.captures, expected, strict=True)))
+        chunks = in_chunks(enumerate(zip(self.family.shots, expected, strict=True)))
         while True:
             with job.clock.stage("optics"):
                 chunk = next(chunks, None)

@@ -23,9 +23,9 @@ from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Spectrum
-from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.direct import DirectTracer
+from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
 
@@ -60,7 +60,7 @@ class Stage:
     ``file`` takes deposits, labels and the number of samples.
     """
 
-    tracer: DirectTracer | IndirectTracer | CameraTracer
+    tracer: DirectTracer | IndirectTracer | FromCameraTracer
     predicted: float
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
@@ -172,13 +172,13 @@ class Simulation:
         return IndirectTracer(loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry)
 
     @cached_property
-    def from_camera(self) -> CameraTracer | None:
+    def from_camera(self) -> FromCameraTracer | None:
         """Follows all other light from the sensor's centre; none where there is none."""
         loaded, physics = self.bench.loaded, self.physics
         if not (physics.lamps or physics.mirrors or (physics.interreflection and loaded.glossy)):
             return None
         paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
-        return CameraTracer(loaded.scene, loaded.camera, physics.projector, self.aim, paths, physics.geometry)
+        return FromCameraTracer(loaded.scene, loaded.camera, physics.projector, self.aim, paths, physics.geometry)
 
     def follow(self, seed: int, samples: int) -> Deposits:
         """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``, to be filed."""
@@ -222,7 +222,7 @@ class Simulation:
         deposits, labels, samples
             as for :meth:`Tray.file`.
         """
-        indirect = deposits.order == INDIRECT
+        indirect = deposits.kind == INDIRECT
         fine = self.fine.file(deposits.where(~indirect), labels, samples)
         return self._light(fine=fine, smooth=self.smooth.file(deposits.where(indirect), labels, samples))
 
@@ -250,8 +250,8 @@ class Simulation:
 
         ``deposits`` are those of :attr:`direct` in so many ``samples``.
         """
-        value = deposits.value * (deposits.order == DIRECT) / samples
-        return np.asarray(np.bincount(deposits.source, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
+        value = deposits.value * (deposits.kind == DIRECT) / samples
+        return np.asarray(np.bincount(deposits.pixel, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
     def glint_frames(self, labels: Labels) -> ClassFrames | None:
         """Frames of the projector's glint by class in ``labels`` (n^2,); None without such light.

@@ -21,7 +21,7 @@ import OpenEXR
 
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import read_header
-from mitsim.core.manifest import parse_json
+from mitsim.core.jsonfile import parse_json
 from mitsim.core.output import whole_file
 from mitsim.core.plainfile import check_plain
 

@@ -28,7 +28,7 @@ from pydantic import (
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import LARGEST, Positive, validated
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.manifest import plain, read_json, write_json
+from mitsim.core.jsonfile import plain, read_json, write_json
 
 MANIFEST = "manifest.json"
 FORMAT = 1
@@ -109,7 +109,7 @@ class _Family(Protocol):
     @property
     def right(self) -> npt.NDArray[np.int8]: ...
     @property
-    def captures(self) -> Sequence[Any]: ...
+    def shots(self) -> Sequence[Any]: ...
 
 
 class Patterns(_Part):
@@ -131,7 +131,7 @@ class Patterns(_Part):
         """
         shots = [
             {"file": file, "row": shot.row, "column": shot.column, "sign": shot.sign}
-            for file, shot in zip(files, family.captures, strict=True)
+            for file, shot in zip(files, family.shots, strict=True)
         ]
         matrices = {"P_L": family.left.tolist(), "P_R": family.right.tolist()}
         return validated(

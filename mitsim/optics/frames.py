@@ -346,7 +346,7 @@ def _mix(weights: FloatArray, basis: FloatArray) -> FloatArray:
     return mixed.reshape(len(weights), *basis.shape[1:])
 
 
-def relative_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
+def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
     """Monte Carlo part of ||a - b|| / ||b|| over all pixels of all ``frames``."""
     variance = energy = 0.0
     for frame in frames:

@@ -2,7 +2,7 @@
 
 A term is ``(weight, row sampler, column sampler)``. A sampler takes arrays of centres s and widths w (mm, index
 coordinates in the mask plane) and of tan-angles t, and gives the mean over each [s - w/2, s + w/2] of a mask profile
-for light that comes under t. :func:`geometric_terms` makes them for a thin mask's geometric shadow, where t does not
+for light that comes under t. :func:`geometric_samplers` makes them for a thin mask's geometric shadow, where t does not
 matter; profiles of thick masks and wave-optical ones fit as well.
 """
 
@@ -83,7 +83,7 @@ def wave_samplers(
     return terms
 
 
-def geometric_terms(geometry: CameraGeometry) -> list[SeparableTerm]:
+def geometric_samplers(geometry: CameraGeometry) -> list[SeparableTerm]:
     """The geometric shadow of the mask of ``geometry``, as samplers."""
     mask = geometry.build_mask()
     return [

@@ -13,7 +13,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
-from mitsim.core.manifest import read_json, write_json
+from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.pictures import card, png
 from mitsim.core.resources import Cost, Limits

@@ -25,7 +25,7 @@ _MOST_DIGITS = 9
 
 
 @dataclass(frozen=True)
-class Capture:
+class Shot:
     """One projected frame: pattern (row, column), whole (sign 0) or the positive or negative half of a +-1 pattern."""
 
     row: int
@@ -90,14 +90,14 @@ class PatternFamily:
         return bool((self.left < 0).any() or (self.right < 0).any())
 
     @property
-    def captures(self) -> tuple[Capture, ...]:
+    def shots(self) -> tuple[Shot, ...]:
         """Every frame to project, row-major over (i, j); a positive half is followed by its negative half."""
         signs = (1, -1) if self.signed else (0,)
         return tuple(
-            Capture(i, j, sign) for i in range(self.left.shape[1]) for j in range(self.right.shape[1]) for sign in signs
+            Shot(i, j, sign) for i in range(self.left.shape[1]) for j in range(self.right.shape[1]) for sign in signs
         )
 
-    def light(self, shot: Capture) -> FloatArray:
+    def light(self, shot: Shot) -> FloatArray:
         """(n, n) fraction 0..1 of full power that each projector pixel emits in one ``shot``."""
         pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
         return np.asarray(pattern if shot.sign == 0 else (1 + shot.sign * pattern) / 2)
@@ -112,7 +112,7 @@ class PatternFamily:
         # Numbered by first appearance, so that shifting dots have one class a shot, in the same order.
         by_appearance = np.argsort(first)
         first, labels = first[by_appearance], np.argsort(by_appearance)[sorted_label.ravel()]
-        i, j, sign = np.array([(shot.row, shot.column, shot.sign) for shot in self.captures]).T
+        i, j, sign = np.array([(shot.row, shot.column, shot.sign) for shot in self.shots]).T
         sign = sign[:, None]
         pattern = self.left[first // self.n][:, i].T * self.right[first % self.n][:, j].T.astype(np.float64)
         return Lighting(labels, np.where(sign == 0, pattern, (1 + sign * pattern) / 2))

@@ -210,7 +210,7 @@ class _Judge:
 
     def reference(self) -> Iterator[Measured]:
         """The reference, against light with the effects that it has."""
-        stand, shots = self.stand, self.stand.family.captures
+        stand, shots = self.stand, self.stand.family.shots
         index, bench = len(shots) // 2, stand.bench
         lighting = stand.family.lighting.shots([index])
         answer, _ = stacked(self.of_reference().frames(lighting, self.facts.seed))

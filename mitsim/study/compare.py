@@ -51,7 +51,7 @@ class Comparison:
         expected = self._merged.frames(family.lighting, seed)
         factors, sides = self.factors, (family.left, family.right)
         model = prepare(factors.left, factors.right, *sides, centre=factors.manifest.centre)
-        shots = family.captures
+        shots = family.shots
         times = dict(
             zip(CONVENTIONS, (peak_time(bench, expected), self._uniform_s, self._uniform_s / len(shots)), strict=True)
         )
@@ -73,7 +73,7 @@ class Comparison:
 
     def white(self) -> Digital:
         """The noisy frame of uniform light at equal peak [DN]."""
-        (shot,), (frame,) = self.light.bench.family("uniform").captures, self._uniform
+        (shot,), (frame,) = self.light.bench.family("uniform").shots, self._uniform
         exposer = self._exposer(self._uniform_s)
         return exposer.digital(exposer.lit(frame, *shot.names), *shot.names)
 

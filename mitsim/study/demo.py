@@ -20,7 +20,7 @@ from mitsim.capture.run import trace_request
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, read_frame
 from mitsim.core.job import Clock, Job
-from mitsim.core.manifest import write_json
+from mitsim.core.jsonfile import write_json
 from mitsim.core.runs import Capture, frame_name
 from mitsim.core.versions import versions
 from mitsim.reconstruct.factors import Factors

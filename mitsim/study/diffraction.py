@@ -239,7 +239,7 @@ class _Trials:
                 light=light,
                 patterns=family.name,
                 factors=factors,
-                captures=len(family.captures),
+                captures=len(family.shots),
                 psnr_db=quality.psnr_db,
                 psnr_best_db=max(quality.psnr_db, best),
                 ssim=quality.ssim,

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from mitsim.capture.bench import Bench
 from mitsim.capture.request import Request
 from mitsim.core.job import Job
-from mitsim.core.manifest import read_json, write_json
+from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, sweep, whole_file
 from mitsim.core.versions import versions
 

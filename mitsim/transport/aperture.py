@@ -51,8 +51,8 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.transport.coordinates import RIGID, rigidity_error
+from mitsim.transport.projector import CanvasMap
 from mitsim.transport.registering import register_once
-from mitsim.transport.source import CanvasMap
 
 PLUGIN = "mitsim_projector"
 

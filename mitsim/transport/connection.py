@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.transport.source import Projector
+from mitsim.transport.projector import ProjectorOptics
 
 
 @dataclass
@@ -44,7 +44,7 @@ class LensHit:
 class ProjectorConnector:
     """Connections to one ``projector``; prepared once."""
 
-    def __init__(self, projector: Projector) -> None:
+    def __init__(self, projector: ProjectorOptics) -> None:
         self.projector, self.emitter = projector, projector.emitter
         if not projector.ideal:
             self._to_world = self.emitter.world_transform()

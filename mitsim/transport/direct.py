@@ -16,9 +16,9 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.coordinates import x_y
 from mitsim.transport.histogram import DIRECT, Deposits
 from mitsim.transport.paths import Tracer
+from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
-from mitsim.transport.source import Projector, ProjectorRays
 
 IntArray = npt.NDArray[np.int64]
 
@@ -30,7 +30,7 @@ class DirectTracer(Tracer):
         self,
         scene: mi.Scene,
         camera: mi.Sensor,
-        projector: Projector,
+        projector: ProjectorOptics,
         anchors: int,
         geometry: CameraGeometry | None = None,
         spread: bool = False,

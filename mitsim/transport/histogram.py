@@ -62,7 +62,7 @@ class Deposits:
 
     Attributes
     ----------
-    source
+    pixel
         (m,) projector pixel 0..n^2-1 (row-major), or n^2 for ambient light.
     anchor_row, anchor_column
         (m,) anchor that the path started from.
@@ -72,18 +72,18 @@ class Deposits:
         (m,) 1/z [1/mm] of the point that the light is seen at.
     value
         (m,) irradiance [W m^-2].
-    order
+    kind
         (m,) :data:`DIRECT` or :data:`INDIRECT` light of the projector, or :data:`AMBIENT` light.
     """
 
-    source: IntArray
+    pixel: IntArray
     anchor_row: IntArray
     anchor_column: IntArray
     row: FloatArray
     column: FloatArray
     inverse_depth: FloatArray
     value: FloatArray
-    order: npt.NDArray[np.int16]
+    kind: npt.NDArray[np.int16]
 
     @classmethod
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
@@ -120,14 +120,14 @@ class Deposits:
 
         none = np.zeros(lit.size, np.int64)
         return cls(
-            source=lit_ones(seen.pixel, np.int64),
+            pixel=lit_ones(seen.pixel, np.int64),
             anchor_row=none if anchors is None else lit_ones(anchors[0], np.int64),
             anchor_column=none if anchors is None else lit_ones(anchors[1], np.int64),
             row=lit_ones(seen.row, np.float64),
             column=lit_ones(seen.column, np.float64),
             inverse_depth=lit_ones(seen.inverse_depth, np.float64),
             value=lit_ones(light, np.float64),
-            order=np.full(lit.size, kind, dtype=np.int16),
+            kind=np.full(lit.size, kind, dtype=np.int16),
         )
 
     @classmethod
@@ -138,7 +138,7 @@ class Deposits:
 
     def averaged(self, weights: FloatArray) -> Deposits:
         """Light of one anchor: the mean over all of them, with ``weights`` (anchors,) along rows and columns."""
-        first = np.zeros_like(self.source)
+        first = np.zeros_like(self.pixel)
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
         return replace(self, anchor_row=first, anchor_column=first, value=value)
 
@@ -193,7 +193,7 @@ class Bundle:
         width = self.anchors * self.cells[1]
         plane = self.anchors * self.cells[0] * width
         count = int(labels.max()) + 1
-        row = np.append(labels, count)[deposits.source]
+        row = np.append(labels, count)[deposits.pixel]
         line = deposits.anchor_row * self.cells[0] + self.grid.rows.cell(deposits.row)
         place = line * width + deposits.anchor_column * self.cells[1] + self.grid.columns.cell(deposits.column)
         layers = self._layers(deposits.inverse_depth)

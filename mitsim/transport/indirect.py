@@ -5,7 +5,7 @@ At each surface after the first the light that a path carries is connected to th
 Of the connections of a path one is handed out, drawn in proportion to its light, and it carries the light of all.
 
 Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side
-(:mod:`mitsim.transport.camera_side`) finds the light instead. :func:`mitsim.transport.paths.camera_part` divides it.
+(:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.paths.camera_part` divides it.
 
 Light that only mirrors have turned before the last surface (a caustic) is direct light; the camera's side has no part
 in it. Paths end at random (Russian roulette) with a probability that keeps the estimate unbiased.
@@ -19,9 +19,9 @@ import mitsuba as mi
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
+from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
-from mitsim.transport.source import Projector, ProjectorRays
 
 
 class IndirectTracer(Tracer):
@@ -31,7 +31,7 @@ class IndirectTracer(Tracer):
         self,
         scene: mi.Scene,
         camera: mi.Sensor,
-        projector: Projector,
+        projector: ProjectorOptics,
         mirrors: bool,
         interreflection: bool,
         geometry: CameraGeometry | None = None,

@@ -20,9 +20,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import check_finite
 from mitsim.transport.paths import launches
+from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, streams
-from mitsim.transport.source import Projector, ProjectorRays
 
 _SHARP = 100.0
 """Density [1/sr] of a turn above which its lobe counts as sharp, as a GGX lobe of roughness 0.03 does.
@@ -44,7 +44,7 @@ class SharpLight:
 
 
 def sharp_light(
-    scene: mi.Scene, camera: mi.Sensor, projector: Projector, geometry: CameraGeometry, seed: int, samples: int
+    scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry, seed: int, samples: int
 ) -> SharpLight:
     """Direct light over lobes too sharp for connections.
 
@@ -79,7 +79,9 @@ def sharp_light(
 class _Lobes:
     """Rays of the projector that a sharp lobe of the first surface sends to the sensor."""
 
-    def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: Projector, geometry: CameraGeometry) -> None:
+    def __init__(
+        self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry
+    ) -> None:
         self.scene, self.camera, self.geometry = scene, camera, geometry
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
 

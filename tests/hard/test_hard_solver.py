@@ -417,7 +417,7 @@ def test_total_variation_is_at_its_minimum() -> None:
 
 def test_the_report_s_numbers_are_json() -> None:
     """An infinite condition becomes null, as JSON has no infinity; the status still says inf."""
-    from mitsim.core.manifest import plain
+    from mitsim.core.jsonfile import plain
 
     prepared = prepare(np.eye(3, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
     solution = prepared.solve(summed(prepared, {(0, 0): np.ones((3, 5))}), 0.1)

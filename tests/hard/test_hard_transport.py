@@ -60,7 +60,7 @@ def matt(albedo: float) -> str:
 def seen_alone(bench: Bench, seeds: int, samples: int, anchors: int = 1, pixels: np.ndarray | None = None):
     """(seeds, anchors, anchors) direct irradiance of the unmasked sensor at each anchor."""
     loaded = bench.loaded
-    tracer = DirectTracer(loaded.scene, loaded.camera, bench.source, anchors, pixels=pixels)
+    tracer = DirectTracer(loaded.scene, loaded.camera, bench.projector_optics, anchors, pixels=pixels)
     totals = np.zeros((seeds, anchors, anchors))
     for seed in range(seeds):
         found = tracer.trace(seed, 0, samples)
@@ -118,7 +118,7 @@ def lobe(alpha: float, row: float = 0.0, column: float = 0.0) -> float:
 
 def sharp(bench: Bench, seed: int) -> SharpLight:
     loaded = bench.loaded
-    return sharp_light(loaded.scene, loaded.camera, bench.source, bench.geometry, seed, 2**21 // N**2)
+    return sharp_light(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, seed, 2**21 // N**2)
 
 
 def test_the_lobe_becomes_the_mirror() -> None:
@@ -301,7 +301,10 @@ def test_a_plane_that_reaches_beside_and_behind_the_camera(
     """A wall from z = -500 to 500 through the plane z = 0: what lies before the camera shines, nothing else."""
     centre, normal = np.array([x, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
     bench = plane(centre, normal, half=500.0, fov=60)
-    found = [DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.source, 1).trace(s, 0, 256) for s in range(8)]
+    found = [
+        DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 1).trace(s, 0, 256)
+        for s in range(8)
+    ]
     totals = np.array([one.value.sum() / 256 for one in found])
     # Quadrature over z alone sees the lit part: smaller square about it.
     if x == -300.0:
@@ -358,7 +361,7 @@ def test_no_light_leaks_through_a_gap(measured: Recorder, small_scene: Callable[
     """
     card = plate(f'<scale x="{CARD}" y="{CARD}"/><translate z="{Z - gap}"/>', matt(0.0))
     bench = open_bench(small_scene(extra=card))
-    tracer = DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.source, 1)
+    tracer = DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 1)
     found = [tracer.trace(seed, 0, 1024) for seed in range(8)]
     (x, dx), (y, dy) = gauss(-60, 60), gauss(-60, 60)
     whole = 0.5 * SCALE / Z**4 * dx @ (1 + (x[:, None] / Z) ** 2 + (y / Z) ** 2) ** -2.0 @ dy
@@ -452,7 +455,7 @@ def furnace(write: Callable[..., Path], albedo: float) -> IndirectTracer:
         f'<boolean name="flip_normals" value="true"/>{matt(albedo)}</shape>'
     )
     bench = open_bench(write("furnace", mask="open", extra=sphere, sheet_z=3000))
-    return IndirectTracer(bench.loaded.scene, bench.loaded.camera, bench.source, False, True)
+    return IndirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, False, True)
 
 
 @pytest.mark.parametrize(
@@ -495,10 +498,12 @@ def test_one_pixel_is_captured(small_scene: Callable[..., Path], tmp_path: Path)
 @given(row=st.integers(0, N - 1), column=st.integers(0, N - 1))
 def test_one_lit_pixel_of_many(white: Bench, row: int, column: int) -> None:
     """Its own light and no other: albedo scale / Z^2 times the integral of the falloff over the pixel."""
-    found = DirectTracer(white.loaded.scene, white.loaded.camera, white.source, 1).trace(row * N + column, 0, 64)
+    found = DirectTracer(white.loaded.scene, white.loaded.camera, white.projector_optics, 1).trace(
+        row * N + column, 0, 64
+    )
     (x, dx), (y, dy) = (gauss(-0.15 + at * PIXEL, -0.15 + (at + 1) * PIXEL) for at in (column, row))
     expected = 0.5 * SCALE / Z**2 * dx @ (1 + x[:, None] ** 2 + y**2) ** -2.0 @ dy
-    mine = found.where(found.source == row * N + column)
+    mine = found.where(found.pixel == row * N + column)
     # 64 stratified points; over a pixel the falloff changes by 1 %.
     assert mine.value.sum() / 64 == pytest.approx(expected, rel=5e-4)
 

@@ -140,13 +140,13 @@ class _Look:
         """Direct and other light of pixels that the captures show, and of lamps."""
         direct = simulation.direct.trace(integer(seed, "direct"), 0, self.effort.direct)
         other = simulation.follow(integer(seed, "other"), self.effort.other)
-        return direct.where(self.shown[direct.source]), other.where(self.shown[other.source])
+        return direct.where(self.shown[direct.pixel]), other.where(self.shown[other.pixel])
 
     def _filed(self, simulation: Simulation, deposits: tuple[Deposits, Deposits]) -> FiledLight:
         """What of the deposits a simulation has."""
         direct, other = deposits
         if not simulation.physics.lamps:
-            other = other.where(other.order != AMBIENT)
+            other = other.where(other.kind != AMBIENT)
         light = simulation.file_direct(direct, self.labels, self.effort.direct)
         return light + simulation.file_followed(other, self.labels, self.effort.other)
 
@@ -168,7 +168,7 @@ class _Look:
         """(captures, pixels, pixels) frames of direct light, the same points connected to every anchor."""
         tracer = simulation.anchored or simulation.direct
         found = tracer.trace(integer(seed, "anchors"), 0, _ANCHOR_SAMPLES)
-        found = found.where(self.shown[found.source])
+        found = found.where(self.shown[found.pixel])
         return self._of_classes(simulation.coarse.optics, simulation.coarse.file(found, self.labels, _ANCHOR_SAMPLES))
 
     def _all_lit(self, simulation: Simulation, seed: int) -> np.ndarray:

@@ -179,7 +179,9 @@ def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.n
 
     register()
     with projected(bench, shown):
-        parts = aperture_scene_parts(bench.loaded.projector, bench.source.aperture, bench.source.focus)
+        parts = aperture_scene_parts(
+            bench.loaded.projector, bench.projector_optics.aperture, bench.projector_optics.focus
+        )
     shapes = {f"shape{i}": shape for i, shape in enumerate(bench.loaded.scene.shapes())}
     integrator = {"type": "path", "max_depth": 2}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "camera": bench.loaded.camera, **shapes, **parts})
@@ -207,7 +209,7 @@ def test_defocused_dots_agree(shared_scene: SmallScene) -> None:
     """A diffuse sheet 200 mm behind the sharp plane: each dot (7.5 mm) is blurred by a disk of 10 mm radius."""
     bench = with_lens(open_bench(shared_scene("blurred")), 10.0, 200.0)
     family = bench.family("dots:7")
-    shown = family.light(family.captures[17])
+    shown = family.light(family.shots[17])
     pair = lens_pair(bench, shown, 1024)
     agrees(pair)
     sharp = frame_of(with_lens(bench, 10.0, 400.0), pair.plan, shown)[0]

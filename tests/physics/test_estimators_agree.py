@@ -123,7 +123,7 @@ def frame_of(bench: Bench, plan: Plan, shown: np.ndarray) -> tuple[np.ndarray, n
 def pair_of(bench: Bench, patterns: str, index: int, accuracy: float, spp: int, on: tuple[str, ...] = ()) -> Pair:
     """Both estimators' frame of one capture; effects ``on`` are forced, the rest is the plan's choice."""
     family = bench.family(patterns)
-    shown = family.light(family.captures[index])
+    shown = family.light(family.shots[index])
     forced = {"diffraction": False, "black-level": False, **dict.fromkeys(on, True)}
     plan = make_plan(bench, classes_of(shown), accuracy, seed=11, switches=forced)
     frame, groups, light = frame_of(bench, plan, shown)

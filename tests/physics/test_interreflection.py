@@ -62,7 +62,7 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
     family = bench.family(f"dots:{K}", 0)
     integrators = [mi.load_dict({"type": "path", "max_depth": depth}) for depth in (2, -1)]
     found = []
-    for index, capture in enumerate(family.captures):
+    for index, capture in enumerate(family.shots):
         with projected(bench, family.light(capture)):
             one, total = (
                 np.array(

@@ -16,13 +16,13 @@ import pytest
 from scipy.signal import max_len_seq
 
 from mitsim.capture.light import Sampling, make_plan, trace_light
-from mitsim.optics.beams import SpecularFrames, beam_frames
-from mitsim.optics.samplers import geometric_terms
+from mitsim.optics.glint import GlintFrames, glint_frames
+from mitsim.optics.samplers import geometric_samplers
 from mitsim.rig.patterns import Lighting, parse_patterns
 from mitsim.transport.aperture import aperture_scene_parts, register
-from mitsim.transport.beams import trace_beams
-from mitsim.transport.mirrors import MirrorTracer
-from mitsim.transport.source import Projector
+from mitsim.transport.glint import trace_glint
+from mitsim.transport.glint_rays import GlintRays
+from mitsim.transport.projector import ProjectorOptics
 from tests.physics.test_diffraction import by_point_source
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -81,12 +81,12 @@ class Rig:
             }
         )
 
-    def frames(self, scene, labels: np.ndarray) -> SpecularFrames:
+    def frames(self, scene, labels: np.ndarray) -> GlintFrames:
         camera = scene.sensors()[0]
         columns = 2 * N if self.shifted else N
-        projector = Projector(scene.emitters()[0], N, 0, columns - N, (N, columns))
-        beams = trace_beams(scene, camera, projector)
-        return beam_frames(beams, camera.geometry, geometric_terms(camera.geometry), labels)
+        projector = ProjectorOptics(scene.emitters()[0], N, 0, columns - N, (N, columns))
+        beams = trace_glint(scene, camera, projector)
+        return glint_frames(beams, camera.geometry, geometric_samplers(camera.geometry), labels)
 
     def mirrored(self, *mirrors: tuple[Vector, np.ndarray]) -> "Rig":
         """The virtual projector behind plane mirrors (point, unit normal), met in this order."""
@@ -318,7 +318,7 @@ def test_rays_are_better_than_float32(variant: str) -> None:
     ball_shape = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": {"type": "conductor"}}
     for shape, off in ((mirror((0, 0, 400), BACK, 120), 1e-6), (ball_shape, 4e-4)):
         scene = rig.scene(shape=shape)
-        tracer = MirrorTracer(scene, scene.sensors()[0], Projector(scene.emitters()[0], N, 0, N, (N, 2 * N)), 1)
+        tracer = GlintRays(scene, scene.sensors()[0], ProjectorOptics(scene.emitters()[0], N, 0, N, (N, 2 * N)), 1)
         found = tracer.follow(points)
         assert found.ray.tolist() == list(range(500))
         direction = tracer.rays.directions(points)

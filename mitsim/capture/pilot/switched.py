@@ -76,7 +76,7 @@ class SwitchedEffects:
             followed = self._follow(simulation)
         elif effect.kind:
             left_out = _KINDS[effect.kind]
-            followed = tuple(deposits.where(deposits.order != left_out) for deposits in self.followed)
+            followed = tuple(deposits.where(deposits.kind != left_out) for deposits in self.followed)
         else:
             followed = self.followed
         return self._form(simulation, direct, followed)

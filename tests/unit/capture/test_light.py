@@ -14,7 +14,7 @@ from mitsim.capture.evidence import GROUPS
 from mitsim.capture.light import Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan, SceneFacts
 from mitsim.core.errors import MitsimError
-from mitsim.optics.frames import ExpectedFrames, relative_error
+from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.rig.patterns import Lighting, parse_patterns
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -69,7 +69,7 @@ def test_a_target_stops_the_sampling(bench: Bench, plan: Plan, family: Lighting)
 
     def target(frames: ExpectedFrames) -> float:
         assert len(frames) == 8
-        asked.append(relative_error(frames))
+        asked.append(monte_carlo_error(frames))
         return math.inf if len(asked) == 1 else 0.0
 
     found = trace_light(bench, replace(plan, sampling_target=1e-9), family, 3, Sampling(target=target))
@@ -90,7 +90,7 @@ def test_merged_light_has_the_same_frames(bench: Bench, plan: Plan, family: Ligh
     light = trace_light(bench, plan, family, 3)
     merged = light.merged()
     assert np.allclose(stacked(merged.frames(family, 0)), stacked(light.frames(family, 0)), rtol=1e-9)
-    assert relative_error(merged.frames(family, 0)) == 0 < relative_error(light.frames(family, 0))
+    assert monte_carlo_error(merged.frames(family, 0)) == 0 < monte_carlo_error(light.frames(family, 0))
 
 
 def test_flux_is_what_each_pixel_casts_on_the_sensor(bench: Bench, plan: Plan) -> None:

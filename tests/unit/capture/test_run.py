@@ -92,7 +92,7 @@ def test_the_manifests_patterns_are_the_family(captured: Capture) -> None:
     assert block["family"] == "dots:3" and block["n"] == N
     assert np.array_equal(block["P_L"], family.left) and np.array_equal(block["P_R"], family.right)
     assert [entry["file"] for entry in block["captures"]] == FILES
-    for entry, shown in zip(block["captures"], family.captures, strict=True):
+    for entry, shown in zip(block["captures"], family.shots, strict=True):
         assert (entry["row"], entry["column"], entry["sign"]) == (shown.row, shown.column, 0)
         _, metadata = read_frame(captured.folder / entry["file"])
         assert (metadata["row"], metadata["column"], metadata["sign"]) == (shown.row, shown.column, 0)
@@ -280,7 +280,7 @@ def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> No
     exposer = Exposer(bench, 0.01, seed=3)
     measured = {(i, j): y for y, i, j in exposer.measurements(family, expected)}
     assert set(measured) == {(0, 0), (0, 1), (1, 0), (1, 1)}
-    frames = dict(zip(((c.row, c.column, c.sign) for c in family.captures), expected, strict=True))
+    frames = dict(zip(((c.row, c.column, c.sign) for c in family.shots), expected, strict=True))
     for (i, j), rate in measured.items():
         halves = [exposer.electrons(frames[i, j, sign]) for sign in (1, -1)]
         noise = np.hypot(*(exposer.sensor_noise(half) for half in halves)) / 0.01

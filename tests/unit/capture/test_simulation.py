@@ -147,7 +147,7 @@ def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
     labels = np.zeros(N * N, dtype=np.int64)
     found = made.follow(1, 64)
     light = made.file_followed(found, labels, 64)
-    kinds = {order: found.value[found.order == order].sum() / 64 for order in (0, 2)}
+    kinds = {kind: found.value[found.kind == kind].sum() / 64 for kind in (0, 2)}
     assert light.fine[[1]].sum() == pytest.approx(kinds[0], rel=0.02) and not light.fine[[0]].nnz
     assert light.smooth.sum() == pytest.approx(kinds[2], rel=0.02) and not light.coarse.nnz
 
@@ -167,9 +167,9 @@ def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
 def test_flux_counts_each_pixels_direct_light(bench: Bench) -> None:
     made = simulation(bench)
     found = made.direct.trace(1, 0, 2)
-    assert made.flux(found, 2) == pytest.approx(np.bincount(found.source, found.value, N * N) / 2)
-    ambient = replace(found, source=np.full_like(found.source, N * N), order=0 * found.order)
-    indirect = replace(found, order=0 * found.order + 2)
+    assert made.flux(found, 2) == pytest.approx(np.bincount(found.pixel, found.value, N * N) / 2)
+    ambient = replace(found, pixel=np.full_like(found.pixel, N * N), kind=0 * found.kind)
+    indirect = replace(found, kind=0 * found.kind + 2)
     assert (
         not made.flux(indirect, 2).any() and not made.flux(ambient, 2).any() and not made.flux(Deposits.none(), 1).any()
     )

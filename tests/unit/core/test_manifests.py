@@ -12,7 +12,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifest import read_json, write_json
+from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.manifests import (
     MOST_PIXELS,
     MOST_SHOTS,

@@ -24,7 +24,7 @@ def recorded(to: RunFolder | RunMemory, patterns: str = "hadamard:2") -> Capture
     rng = np.random.default_rng(8)
     to.begin()
     to.write_truth(rng.random((N, N)), 0.99)
-    for index, shot in enumerate(family.captures):
+    for index, shot in enumerate(family.shots):
         electrons = rng.random((PIXELS, PIXELS), dtype=np.float32) * 1000
         dn = rng.poisson(electrons).astype(np.uint32)
         metadata = {"row": shot.row, "column": shot.column, "sign": shot.sign, "exposure_s": 0.02, "seed": 3}
@@ -37,7 +37,7 @@ def recorded(to: RunFolder | RunMemory, patterns: str = "hadamard:2") -> Capture
             configuration_sha256=head.configuration_sha256,
             camera={"name": "bench", "well": float("inf")},
             digital=Digital(exposure_s=0.02, gain_dn_per_e=0.5, black_level_dn=40.0, dark_current_e_per_s=6.0),
-            patterns=Patterns.of(family, [frame_name(index) for index in range(len(family.captures))]),
+            patterns=Patterns.of(family, [frame_name(index) for index in range(len(family.shots))]),
             plan={"effects": []},
             warnings=("too dark",),
         )

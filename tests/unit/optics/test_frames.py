@@ -17,7 +17,7 @@ from mitsim.optics.frames import (
     ExpectedFrames,
     Filed,
     FrameOptics,
-    relative_error,
+    monte_carlo_error,
 )
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
@@ -288,7 +288,7 @@ def test_the_predicted_variance_is_the_actual_one(groups: int) -> None:
         actual.append(sum(np.square(f.irradiance - e).sum() for f, e in zip(found, exact, strict=True)))
         predicted.append(sum(f.variance * f.irradiance.size for f in found))
         energy = sum(np.square(f.irradiance).sum() for f in found)
-        assert relative_error(found) == pytest.approx(np.sqrt(predicted[-1] / energy), rel=1e-12)
+        assert monte_carlo_error(found) == pytest.approx(np.sqrt(predicted[-1] / energy), rel=1e-12)
     ratio = np.sum(actual) / np.sum(predicted)
     residual = np.array(actual) - ratio * np.array(predicted)
     deviation = residual.std(ddof=1) / np.sqrt(SEEDS) / np.mean(predicted)
@@ -413,4 +413,4 @@ def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
 def test_one_group_has_no_variance_to_tell() -> None:
     frames = expected_frames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
     assert all(frame.variance == 0 and frame.irradiance.any() for frame in frames)
-    assert relative_error(frames) == 0
+    assert monte_carlo_error(frames) == 0

@@ -35,12 +35,12 @@ def shots(factors: Factors) -> Capture:
     """Noisy frames of a scene under 2 x 2 Hadamard patterns, as pairs."""
     family, rng, memory = parse_patterns("hadamard:2", N), np.random.default_rng(2), RunMemory()
     scene = rng.random((N, N))
-    for index, shot in enumerate(family.captures):
+    for index, shot in enumerate(family.shots):
         electrons = 1e4 * factors.left @ (family.light(shot) * scene) @ factors.right.T
         memory.write_frame(index, {"DN": rng.poisson(electrons).astype(np.uint32)}, {"row": shot.row})
     memory.write_truth(scene, 0.99)
     head = RunHead.of({"seed": 2})
-    files = [frame_name(index) for index in range(len(family.captures))]
+    files = [frame_name(index) for index in range(len(family.shots))]
     return memory.finish(
         RunManifest(
             configuration=head.configuration,

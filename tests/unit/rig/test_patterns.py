@@ -26,7 +26,7 @@ FAMILIES = [
 def test_captures_add_up_to_the_patterns_that_the_solver_is_told(name: str, n: int) -> None:
     family = parse_patterns(name, n)
     measured: dict[tuple[int, int], np.ndarray] = {}
-    for capture in family.captures:
+    for capture in family.shots:
         light = family.light(capture)
         assert light.shape == (n, n)
         assert np.isin(light, (0, 1)).all(), "a projector shows no other light than these families use"
@@ -43,8 +43,8 @@ def test_number_of_captures(name: str) -> None:
     k = int(name.partition(":")[2] or 1)
     # hadamard:1 is all ones, so it needs no second half.
     halves = 2 if name.startswith("hadamard") and k > 1 else 1
-    assert len(family.captures) == halves * k**2
-    assert len({capture.names for capture in family.captures}) == halves * k**2, "streams would be shared"
+    assert len(family.shots) == halves * k**2
+    assert len({capture.names for capture in family.shots}) == halves * k**2, "streams would be shared"
 
 
 @pytest.mark.parametrize("n", [16, 23])
@@ -52,9 +52,9 @@ def test_number_of_captures(name: str) -> None:
 def test_classes_weigh_every_pixel_as_light_does(name: str, n: int) -> None:
     family = parse_patterns(name, n)
     labels, weights = family.lighting.labels, family.lighting.weights
-    assert labels.shape == (n * n,) and weights.shape[0] == len(family.captures)
+    assert labels.shape == (n * n,) and weights.shape[0] == len(family.shots)
     assert np.array_equal(np.unique(labels), np.arange(weights.shape[1])), "a class without pixels"
-    for capture, row in zip(family.captures, weights, strict=True):
+    for capture, row in zip(family.shots, weights, strict=True):
         assert np.array_equal(row[labels], family.light(capture).ravel())
 
 
@@ -63,7 +63,7 @@ def test_classes_weigh_every_pixel_as_light_does(name: str, n: int) -> None:
 def test_dots_light_every_pixel_exactly_once(n: int, data: st.DataObject) -> None:
     k = data.draw(st.integers(1, n))
     family = parse_patterns(f"dots:{k}", n)
-    assert np.array_equal(sum(family.light(capture) for capture in family.captures), np.ones((n, n)))
+    assert np.array_equal(sum(family.light(capture) for capture in family.shots), np.ones((n, n)))
     labels, weights = family.lighting.labels, family.lighting.weights
     assert weights.shape == (k * k, k * k)
     assert np.array_equal(weights.sum(axis=0), np.ones(k * k)), "each class belongs to one pattern"
@@ -79,7 +79,7 @@ def test_uniform_lighting_is_the_uniform_familys() -> None:
 
 def test_dots_are_the_papers_grid_of_every_kth_pixel() -> None:
     family = parse_patterns("dots:3", 8)
-    lit = family.light(next(c for c in family.captures if (c.row, c.column) == (1, 2)))
+    lit = family.light(next(c for c in family.shots if (c.row, c.column) == (1, 2)))
     assert np.array_equal(np.argwhere(lit), [(r, c) for r in (1, 4, 7) for c in (2, 5)])
 
 
@@ -87,7 +87,7 @@ def test_hadamard_repeats_its_matrix_and_the_halves_complement() -> None:
     family = parse_patterns("hadamard:4", 10)
     assert family.signed
     assert np.array_equal(family.left[4:8], family.left[:4]) and np.array_equal(family.left[8:], family.left[:2])
-    first, second = family.captures[6:8]
+    first, second = family.shots[6:8]
     assert (first.row, first.column) == (second.row, second.column) and (first.sign, second.sign) == (1, -1)
     assert np.array_equal(family.light(first) + family.light(second), np.ones((10, 10)))
 
@@ -113,7 +113,7 @@ def test_random_is_seeded_and_covers_every_pixel() -> None:
     # With k = 2 a quarter of the rows would be dark by chance: the cover must be made, not hoped for.
     family = parse_patterns("random:2", 64, seed=3)
     assert family.left.any(axis=1).all() and family.right.any(axis=1).all()
-    assert sum(family.light(c) for c in family.captures).min() >= 1
+    assert sum(family.light(c) for c in family.shots).min() >= 1
     again, other = parse_patterns("random:2", 64, seed=3), parse_patterns("random:2", 64, seed=4)
     assert np.array_equal(family.left, again.left) and np.array_equal(family.right, again.right)
     assert not np.array_equal(family.left, other.left)

@@ -67,7 +67,7 @@ def test_frames_are_what_the_terms_say(bench: Bench) -> None:
     image, family = np.random.default_rng(6).random((N, N)), bench.family("dots:2")
     lit = image * np.outer(family.left[:, 1], family.right[:, 0])
     expected = sum(left @ lit @ right.T for left, right in camera.terms)
-    index = next(k for k, shown in enumerate(family.captures) if (shown.row, shown.column) == (1, 0))
+    index = next(k for k, shown in enumerate(family.shots) if (shown.row, shown.column) == (1, 0))
     frame = list(camera.frames(family, image))[index]
     assert relative_error(frame.irradiance, expected) < 1e-9
 

@@ -14,8 +14,8 @@ import pytest
 from mitsim.transport import aperture
 from mitsim.transport.aperture import aperture_scene_parts
 from mitsim.transport.connection import Connection, LensHit, ProjectorConnector
+from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.sampling import generator
-from mitsim.transport.source import Projector
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -30,7 +30,9 @@ def emitter(turn: float = 0.0, canvas: np.ndarray | None = None, place: tuple[fl
 
 
 def connector(light: Any = None, n: int = N, first_column: int = N, **lens: float) -> ProjectorConnector:
-    return ProjectorConnector(Projector(light or emitter(), n, 0, first_column, (N, 2 * N), **{"focus": 400.0, **lens}))
+    return ProjectorConnector(
+        ProjectorOptics(light or emitter(), n, 0, first_column, (N, 2 * N), **{"focus": 400.0, **lens})
+    )
 
 
 def at(points: np.ndarray) -> Any:
@@ -237,6 +239,6 @@ def test_a_spot_at_the_windows_edge_loses_half_its_light() -> None:
 
 def test_ideal() -> None:
     light = emitter()
-    assert Projector(light, N, 0, N, (N, 2 * N)).ideal
-    assert not Projector(light, N, 0, N, (N, 2 * N), aperture=1.0).ideal
-    assert not Projector(light, N, 0, N, (N, 2 * N), blur=0.5).ideal
+    assert ProjectorOptics(light, N, 0, N, (N, 2 * N)).ideal
+    assert not ProjectorOptics(light, N, 0, N, (N, 2 * N), aperture=1.0).ideal
+    assert not ProjectorOptics(light, N, 0, N, (N, 2 * N), blur=0.5).ideal

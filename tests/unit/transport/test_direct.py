@@ -26,7 +26,7 @@ SIGMAS = 5.0
 
 def tracer(bench: Bench, anchors: int = 1, geometry: CameraGeometry | None = None, **lens: float) -> DirectTracer:
     loaded = bench.loaded
-    return DirectTracer(loaded.scene, loaded.camera, replace(bench.source, **lens), anchors, geometry)
+    return DirectTracer(loaded.scene, loaded.camera, replace(bench.projector_optics, **lens), anchors, geometry)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def expected(row: float = 0.0, column: float = 0.0, exponent: float = 0.0) -> np
 
 
 def by_pixel(found: Deposits, samples: int) -> np.ndarray:
-    return np.bincount(found.source, found.value, minlength=N * N) / samples
+    return np.bincount(found.pixel, found.value, minlength=N * N) / samples
 
 
 def test_every_pixels_light_is_its_irradiance_at_every_anchor(large: Bench) -> None:
@@ -73,13 +73,13 @@ def test_every_pixels_light_is_its_irradiance_at_every_anchor(large: Bench) -> N
 def test_a_pixel_is_seen_where_it_lights_the_board(white: Bench) -> None:
     """Directions in index coordinates: row r from -0.15 + r 0.3/n on, and evenly over the pixel."""
     found = tracer(white).trace(1, 0, 64)
-    row, column = np.divmod(found.source, N)
+    row, column = np.divmod(found.pixel, N)
     inside = (found.row + 0.15) * N / 0.3 - row, (found.column + 0.15) * N / 0.3 - column
     for place in inside:
         assert place.min() > -1e-4 and place.max() < 1 + 1e-4
         assert np.histogram(place, 8, (0, 1))[0].std() < 0.02 * len(place) / 8
     assert 1 / found.inverse_depth == pytest.approx(np.full(len(found.value), 400.0), rel=1e-6)
-    assert (found.order == DIRECT).all() and not found.anchor_row.any() and not found.anchor_column.any()
+    assert (found.kind == DIRECT).all() and not found.anchor_row.any() and not found.anchor_column.any()
 
 
 def test_all_anchors_see_the_same_points(large: Bench) -> None:
@@ -92,7 +92,7 @@ def test_all_anchors_see_the_same_points(large: Bench) -> None:
 def test_a_spread_sensor_is_the_mean_over_it(large: Bench) -> None:
     """Random points of the sensor, filed as one anchor: the mean of the irradiance over the sensor."""
     loaded = large.loaded
-    spread = DirectTracer(loaded.scene, loaded.camera, large.source, 1, spread=True)
+    spread = DirectTracer(loaded.scene, loaded.camera, large.projector_optics, 1, spread=True)
     totals = np.array([by_pixel(spread.trace(seed, 0, 16), 16).sum() for seed in range(8)])
     node, weight = np.polynomial.legendre.leggauss(4)
     half = large.geometry.half_width
@@ -156,7 +156,7 @@ def test_the_pixels_response(white: Bench) -> None:
 def test_lens_and_spot_keep_a_pixels_light_and_spread_it(white: Bench, lens: dict[str, float]) -> None:
     """Circle of radius a |z - f| / f = 4 mm on the sheet; a normal spot of 0.7 pixels of 7.5 mm. Pixel (8, 8)."""
     found = tracer(white, **lens).trace(1, 0, 4096)
-    mine = found.where(found.source == 8 * N + 8)
+    mine = found.where(found.pixel == 8 * N + 8)
     assert mine.value.sum() / 4096 == pytest.approx(expected()[8 * N + 8], rel=2e-3)
     spread = 4.0**2 / 4 if "aperture" in lens else (0.7 * 7.5) ** 2
     for place in (mine.row, mine.column):
@@ -167,7 +167,7 @@ def test_lens_and_spot_keep_a_pixels_light_and_spread_it(white: Bench, lens: dic
 def test_a_sharp_lens_is_the_pinhole(white: Bench) -> None:
     pinhole, lens = (tracer(white, **kind).trace(1, 0, 4) for kind in ({}, {"aperture": 4.0, "focus": 400.0}))
     assert by_pixel(lens, 4) == pytest.approx(by_pixel(pinhole, 4), rel=1e-3)
-    row, column = np.divmod(lens.source, N)
+    row, column = np.divmod(lens.pixel, N)
     assert ((lens.row + 0.15) * N / 0.3 - row).min() > -1e-3 and ((lens.column + 0.15) * N / 0.3 - column).max() < 1.001
 
 
@@ -182,7 +182,7 @@ def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(paths, "_LANES_PER_LAUNCH", 300)
     launches = trace.trace(1, 0, 4)
     for parts in (pieces, launches):
-        assert np.array_equal(parts.source, whole.source) and np.allclose(parts.row, whole.row, atol=1e-6)
+        assert np.array_equal(parts.pixel, whole.pixel) and np.allclose(parts.row, whole.row, atol=1e-6)
         assert np.allclose(parts.value, whole.value, rtol=1e-5)
 
 
@@ -198,10 +198,10 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
 
 def test_chosen_pixels_are_traced_as_among_all(white: Bench) -> None:
     loaded, chosen = white.loaded, np.array([3, 17, 250])
-    some = DirectTracer(loaded.scene, loaded.camera, white.source, 1, pixels=chosen)
+    some = DirectTracer(loaded.scene, loaded.camera, white.projector_optics, 1, pixels=chosen)
     assert some.lanes == 3
     mine, whole = some.trace(5, 0, 4), tracer(white).trace(5, 0, 4)
-    expected = whole.where(np.isin(whole.source, chosen))
-    assert np.array_equal(np.sort(mine.source), np.sort(expected.source)) and len(mine.value) == 12
+    expected = whole.where(np.isin(whole.pixel, chosen))
+    assert np.array_equal(np.sort(mine.pixel), np.sort(expected.pixel)) and len(mine.value) == 12
     for name in ("value", "row", "column"):
         assert np.sort(getattr(mine, name)) == pytest.approx(np.sort(getattr(expected, name)), rel=1e-6)

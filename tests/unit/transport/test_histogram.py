@@ -14,28 +14,28 @@ DEPTHS = (500.0, 300.0, 250.0)
 def deposits(count: int = 400, seed: int = 3, inside: bool = True) -> Deposits:
     """Light from everywhere to everywhere: two anchors a side, all pixels and ambient light."""
     rng = np.random.default_rng(seed)
-    source = rng.integers(0, PIXELS + 1, count)
+    pixel = rng.integers(0, PIXELS + 1, count)
     low, high = ((-0.2, 0.2), (-0.1, 0.2)) if inside else ((-0.4, 0.4), (-0.3, 0.5))
     row, column = rng.uniform(*low, count), rng.uniform(*high, count)
     if not inside:
         row, column = rng.uniform(-0.4, 0.4, count), rng.uniform(-0.3, 0.5, count)
     return Deposits(
-        source=source,
+        pixel=pixel,
         anchor_row=rng.integers(0, 2, count),
         anchor_column=rng.integers(0, 2, count),
         row=row,
         column=column,
         inverse_depth=1 / rng.uniform(240, 520, count),
         value=rng.uniform(0.5, 2, count),
-        order=np.where(source == PIXELS, AMBIENT, DIRECT).astype(np.int16),
+        kind=np.where(pixel == PIXELS, AMBIENT, DIRECT).astype(np.int16),
     )
 
 
 def one(row: float, column: float, **changes: object) -> Deposits:
     """One path of value 1."""
-    values = {"source": 0, "anchor_row": 0, "anchor_column": 0, "row": row, "column": column}
-    values |= {"inverse_depth": 1 / 400, "value": 1.0, "order": 1, **changes}
-    kinds = {"row": float, "column": float, "inverse_depth": float, "value": float, "order": np.int16}
+    values = {"pixel": 0, "anchor_row": 0, "anchor_column": 0, "row": row, "column": column}
+    values |= {"inverse_depth": 1 / 400, "value": 1.0, "kind": 1, **changes}
+    kinds = {"row": float, "column": float, "inverse_depth": float, "value": float, "kind": np.int16}
     return Deposits(**{name: np.array([value], dtype=kinds.get(name, np.int64)) for name, value in values.items()})
 
 
@@ -58,7 +58,7 @@ def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...]) -> 
     made, found = bundle(depths), deposits()
     light = made.file(found, LABELS, samples=4)
     assert light.shape == (4, made.size)
-    lines = np.append(LABELS, 3)[found.source]
+    lines = np.append(LABELS, 3)[found.pixel]
     assert np.asarray(light.sum(axis=1)).ravel() == pytest.approx(np.bincount(lines, found.value) / 4, rel=1e-12)
 
 
@@ -110,9 +110,9 @@ def test_light_from_outside_the_grid_is_dropped() -> None:
 
 def test_ambient_light_has_the_last_row() -> None:
     made = bundle()
-    light = made.file(one(0.0, 0.0, source=PIXELS, order=0), LABELS)
+    light = made.file(one(0.0, 0.0, pixel=PIXELS, kind=0), LABELS)
     assert np.flatnonzero(light.toarray().any(axis=1)).tolist() == [3]
-    by_pixel = made.file(one(0.0, 0.0, source=PIXELS, order=0), np.arange(PIXELS))
+    by_pixel = made.file(one(0.0, 0.0, pixel=PIXELS, kind=0), np.arange(PIXELS))
     assert by_pixel.shape[0] == PIXELS + 1 and by_pixel[[PIXELS]].sum() == pytest.approx(1)
 
 
@@ -127,7 +127,7 @@ def test_parts_join_in_order() -> None:
     first = np.arange(400) < 150
     joined = Deposits.joined([found.where(first), Deposits.none(), found.where(~first)])
     assert all(np.array_equal(getattr(joined, name), getattr(found, name)) for name in vars(found))
-    assert joined.source.dtype == np.int64
+    assert joined.pixel.dtype == np.int64
 
 
 def test_directions_for_the_shadow() -> None:

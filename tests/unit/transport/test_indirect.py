@@ -13,8 +13,8 @@ import pytest
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport import paths
-from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import aligned_grid
+from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits
 from mitsim.transport.indirect import IndirectTracer
 from tests.unit.transport.closed_forms import mean, seen
@@ -36,7 +36,7 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="
 
 def tracer(bench: Bench, mirrors: bool = False, interreflection: bool = True) -> IndirectTracer:
     loaded = bench.loaded
-    return IndirectTracer(loaded.scene, loaded.camera, bench.source, mirrors, interreflection)
+    return IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, mirrors, interreflection)
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +55,11 @@ def test_a_hollow_sphere_is_lit_evenly_by_its_own_light(hollow: Bench) -> None:
     expected = radiance * seen(hollow.geometry.tan_half_fov)
     trace = tracer(hollow)
     found = [trace.trace(seed, 0, 2048) for seed in range(SEEDS)]
-    assert all((one.order == INDIRECT).all() for one in found)
+    assert all((one.kind == INDIRECT).all() for one in found)
     total, error = mean(np.array([one.value.sum() / 2048 for one in found]))
     assert SIGMAS * error < 0.1 * expected
     assert abs(total - expected) < SIGMAS * error
-    light = np.mean([np.bincount(one.source, one.value, minlength=N * N) for one in found], axis=0).reshape(N, N)
+    light = np.mean([np.bincount(one.pixel, one.value, minlength=N * N) for one in found], axis=0).reshape(N, N)
     for part in (light[:8], light[8:], light[:, :8], light[:, 8:]):
         assert part.sum() / 2048 == pytest.approx(expected / 2, rel=0.06)
     # Even over the directions too, whatever pixel the light came from.
@@ -83,7 +83,9 @@ def test_both_sides_together_find_all_light(shared_scene: Callable[..., Path], m
 
     def found(sharp: float) -> tuple[np.ndarray, np.ndarray]:
         monkeypatch.setattr(paths, "_SHARP", sharp)
-        camera = CameraTracer(loaded.scene, loaded.camera, bench.source, grid, Paths(interreflection=True))
+        camera = FromCameraTracer(
+            loaded.scene, loaded.camera, bench.projector_optics, grid, Paths(interreflection=True)
+        )
         sums = [[one.trace(seed, 0, 1024).value.sum() / 1024 for seed in range(16)] for one in (tracer(bench), camera)]
         return np.array(sums[0]), np.array(sums[1])
 
@@ -106,7 +108,7 @@ def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Call
     """
     bench = open_bench(shared_scene("caustic", extra=MIRROR))
     found = tracer(bench, mirrors=True, interreflection=False).trace(2, 0, 64)
-    assert found.value.size > 1000 and (found.order == DIRECT).all()
+    assert found.value.size > 1000 and (found.kind == DIRECT).all()
     places = np.stack([-found.column, -found.row, np.ones(found.value.size)], axis=1) / found.inverse_depth[:, None]
     assert places[:, 2] == pytest.approx(np.full(len(places), 400), rel=1e-5)
     # The way from the image to a lit place goes through the mirror, and through the pixel's part of the image.
@@ -114,7 +116,7 @@ def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Call
     way = (places - image) / (places[:, :1] - image[0])
     mirror = image + 100 * way
     assert np.abs(mirror[:, 1]).max() < 40.01 and np.abs(mirror[:, 2] - 345).max() < 40.01
-    row, column = np.divmod(found.source, N)
+    row, column = np.divmod(found.pixel, N)
     slope_x, slope_y = way[:, 0] / way[:, 2], way[:, 1] / way[:, 2]
     assert np.abs(slope_y - (0.15 - (row + 0.5) / N * 0.3)).max() < 0.1501 / N
     assert np.abs(slope_x - (column + 0.5) / N * 0.3).max() < 0.152 / N

@@ -10,8 +10,8 @@ import pytest
 
 from mitsim.transport.connection import ProjectorConnector
 from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
+from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays
 from mitsim.transport.sampling import generator
-from mitsim.transport.source import PinholeRays, Projector, ProjectorRays
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -19,13 +19,13 @@ N, PLACE = 16, (60.0, -5.0, 2.0)
 
 
 @pytest.fixture
-def projector(variant: str) -> Projector:
+def projector(variant: str) -> ProjectorOptics:
     """A turned one, every texel of another brightness; the window lies off the canvas's centre."""
     canvas = np.random.default_rng(2).uniform(0.2, 1, (N + 4, 2 * (N + 4)))
-    return Projector(stock_projector(N + 4, 111000.0, PLACE, 7.0, canvas), N, 3, 21, canvas.shape)
+    return ProjectorOptics(stock_projector(N + 4, 111000.0, PLACE, 7.0, canvas), N, 3, 21, canvas.shape)
 
 
-def test_rays_areas_and_flux_are_of_one_map(projector: Projector) -> None:
+def test_rays_areas_and_flux_are_of_one_map(projector: ProjectorOptics) -> None:
     pixel = np.arange(N * N)
     lanes, rng = mi.UInt32(pixel), generator(mi.UInt32(1), mi.UInt32(0))
     wavelengths = dr.zeros(mi.Ray3f).wavelengths

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.core import manifest
+from mitsim.core import jsonfile
 from mitsim.core.errors import MitsimError
+from mitsim.core.versions import versions as all_versions
 
 
 def test_json_comes_back(tmp_path: Path) -> None:
@@ -19,8 +20,8 @@ def test_json_comes_back(tmp_path: Path) -> None:
         "worst": np.inf,
         "name": "µm",
     }
-    manifest.write_json(tmp_path / "m.json", written)
-    assert manifest.read_json(tmp_path / "m.json") == {
+    jsonfile.write_json(tmp_path / "m.json", written)
+    assert jsonfile.read_json(tmp_path / "m.json") == {
         "array": [[1.5, 2.0]],
         "count": 2**40,
         "where": "a/b",
@@ -33,34 +34,34 @@ def test_json_comes_back(tmp_path: Path) -> None:
 
 
 def test_what_json_cannot_hold_is_refused_and_the_old_file_stays(tmp_path: Path) -> None:
-    manifest.write_json(tmp_path / "m.json", {"a": 1})
+    jsonfile.write_json(tmp_path / "m.json", {"a": 1})
     with pytest.raises(TypeError, match="object"):
-        manifest.write_json(tmp_path / "m.json", {"a": object()})
-    assert manifest.read_json(tmp_path / "m.json") == {"a": 1}
+        jsonfile.write_json(tmp_path / "m.json", {"a": object()})
+    assert jsonfile.read_json(tmp_path / "m.json") == {"a": 1}
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    manifest.write_json(tmp_path / "m.json", {"a": 1})
+    jsonfile.write_json(tmp_path / "m.json", {"a": 1})
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(MitsimError, match="No space left"):
-        manifest.write_json(tmp_path / "m.json", {"a": 2})
+        jsonfile.write_json(tmp_path / "m.json", {"a": 2})
     assert json.loads((tmp_path / "m.json").read_text()) == {"a": 1}
     assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_reading_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match=r"m\.json: cannot be read"):
-        manifest.read_json(tmp_path / "m.json")
+        jsonfile.read_json(tmp_path / "m.json")
     (tmp_path / "m.json").write_text('{"a": ')
     with pytest.raises(MitsimError, match=r"m\.json: not valid JSON"):
-        manifest.read_json(tmp_path / "m.json")
+        jsonfile.read_json(tmp_path / "m.json")
 
 
 def test_versions_names_what_decides_the_numbers() -> None:
-    versions = manifest.versions()
+    versions = all_versions()
     assert {"mitsim", "mitsuba", "drjit", "numpy", "python"} <= set(versions)
     assert versions["numpy"] == np.__version__

@@ -15,8 +15,8 @@ import pytest
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport import paths
-from mitsim.transport.camera_side import CameraTracer, Paths
 from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import AMBIENT, Deposits
 from tests.unit.transport.closed_forms import mean, seen
 
@@ -43,9 +43,9 @@ def grid(bench: Bench) -> CellGrid:
     return aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
 
 
-def tracer(bench: Bench, **followed: object) -> CameraTracer:
+def tracer(bench: Bench, **followed: object) -> FromCameraTracer:
     loaded = bench.loaded
-    return CameraTracer(loaded.scene, loaded.camera, bench.source, grid(bench), Paths(**followed))
+    return FromCameraTracer(loaded.scene, loaded.camera, bench.projector_optics, grid(bench), Paths(**followed))
 
 
 @pytest.mark.parametrize("interreflection", [False, True])
@@ -58,7 +58,7 @@ def test_an_even_sky(outdoors: Bench, interreflection: bool) -> None:
     expected = 2 * seen(stop) - seen(sheet)
     trace = tracer(outdoors, interreflection=interreflection, emitters=outdoors.loaded.lamps)
     found = [trace.trace(seed, 0, 128) for seed in range(SEEDS)]
-    assert all((one.order == AMBIENT).all() and (one.source == N * N).all() for one in found)
+    assert all((one.kind == AMBIENT).all() and (one.pixel == N * N).all() for one in found)
     total, error = mean(np.array([one.value.sum() / 128 for one in found]))
     assert SIGMAS * error < 0.03 * expected
     assert abs(total - expected) < SIGMAS * error

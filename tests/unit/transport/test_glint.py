@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.beams import beam_frames
-from mitsim.optics.samplers import geometric_terms
-from mitsim.transport.beams import has_specular, trace_beams
-from mitsim.transport.mirrors import MirrorTracer
-from mitsim.transport.source import PinholeRays, Projector
+from mitsim.optics.glint import glint_frames
+from mitsim.optics.samplers import geometric_samplers
+from mitsim.transport.glint import has_mirrors, trace_glint
+from mitsim.transport.glint_rays import GlintRays
+from mitsim.transport.projector import PinholeRays, ProjectorOptics
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE = 8, 111000.0
@@ -40,8 +40,8 @@ def emitter(n: int = N, to_world: "mi.ScalarAffineTransform4f | None" = None) ->
     )
 
 
-def projector(scene: "mi.Scene", n: int = N) -> Projector:
-    return Projector(scene.emitters()[0], n, 1, 2, (n + 3, 2 * n + 1))
+def projector(scene: "mi.Scene", n: int = N) -> ProjectorOptics:
+    return ProjectorOptics(scene.emitters()[0], n, 1, 2, (n + 3, 2 * n + 1))
 
 
 def scene_with(**shapes: dict) -> "mi.Scene":
@@ -58,15 +58,15 @@ def plane(x: float, z: float, bsdf: dict, half: float = 60.0, toward: float = -1
 
 def flux(scene: "mi.Scene", **settings: int) -> float:
     camera = scene.sensors()[0]
-    beams = trace_beams(scene, camera, projector(scene), **settings)
+    beams = trace_glint(scene, camera, projector(scene), **settings)
     geometry = camera.geometry
-    return beam_frames(beams, geometry, geometric_terms(geometry), np.zeros(N * N, np.int64)).flux
+    return glint_frames(beams, geometry, geometric_samplers(geometry), np.zeros(N * N, np.int64)).flux
 
 
 def test_a_ray_meets_the_emitter_at_the_uv_that_it_was_made_for() -> None:
     t = mi.ScalarAffineTransform4f()
     light = emitter(to_world=t.translate([60, -20, 5]).rotate([0.3, 1, 0.2], 25))
-    rays = PinholeRays(Projector(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
+    rays = PinholeRays(ProjectorOptics(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
     points = np.random.default_rng(1).uniform(0, N, (200, 2))
     si = mi.SurfaceInteraction3f()
     si.p = mi.Point3f((rays.origin + 700 * rays.directions(points)).T.astype(np.float32))
@@ -80,7 +80,7 @@ def test_a_ray_meets_the_emitter_at_the_uv_that_it_was_made_for() -> None:
 def test_power_is_the_irradiance_that_mitsuba_renders(variant: str) -> None:
     """A board at 400 mm seen by a pinhole camera: L = E reflectance / pi."""
     light = emitter(to_world=mi.ScalarAffineTransform4f())
-    rays = PinholeRays(Projector(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
+    rays = PinholeRays(ProjectorOptics(light, N, 1, 2, (N + 3, 2 * N + 1)), [None])
     expected = np.pi * SCALE * np.linspace(0.5, 1, N)
     assert rays.power[:, 0].reshape(N, N) == pytest.approx(np.repeat(expected[:, None], N, axis=1), rel=1e-6)
     side = 2 * np.tan(np.radians(15)) / (2 * N + 1)
@@ -100,7 +100,7 @@ def test_power_is_the_irradiance_that_mitsuba_renders(variant: str) -> None:
 
 
 def test_what_counts_as_a_mirror(variant: str) -> None:
-    assert not has_specular(scene_with())
+    assert not has_mirrors(scene_with())
     for bsdf, answer in (
         ({"type": "diffuse"}, False),
         ({"type": "roughconductor", "alpha": 0.05}, False),
@@ -111,15 +111,15 @@ def test_what_counts_as_a_mirror(variant: str) -> None:
         ({"type": "thindielectric"}, True),
         ({"type": "blendbsdf", "weight": 0.3, "a": {"type": "diffuse"}, "b": CONDUCTOR}, True),
     ):
-        assert has_specular(scene_with(sheet=plane(0, 400, bsdf))) is answer, bsdf
+        assert has_mirrors(scene_with(sheet=plane(0, 400, bsdf))) is answer, bsdf
 
 
 def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
     scene = scene_with(sheet=plane(0, 400, {"type": "diffuse"}))
-    beams = trace_beams(scene, scene.sensors()[0], projector(scene))
+    beams = trace_glint(scene, scene.sensors()[0], projector(scene))
     assert len(beams) == 0 and beams.unresolved == 0
     with pytest.raises(MitsimError, match="max_depth of glints is 0"):
-        trace_beams(scene, scene.sensors()[0], projector(scene), max_depth=0)
+        trace_glint(scene, scene.sensors()[0], projector(scene), max_depth=0)
 
 
 def fresnel(cosine: float, eta: float) -> float:
@@ -160,9 +160,9 @@ def test_light_through_a_pane_before_the_mirror(variant: str) -> None:
     passed = 1 - 2 * GLASS / (1 + GLASS)
     mirror = scene_with(sheet=plane(0, 400, CONDUCTOR))
     scene = scene_with(sheet=plane(0, 400, CONDUCTOR), pane=plane(0, 300, {**pane}, 60))
-    tracer = MirrorTracer(scene, scene.sensors()[0], projector(scene), 3)
+    tracer = GlintRays(scene, scene.sensors()[0], projector(scene), 3)
     found = tracer.follow(np.array([[4.5, 7.3]]))
-    expected = MirrorTracer(mirror, mirror.sensors()[0], projector(mirror), 3).follow(np.array([[4.5, 7.3]]))
+    expected = GlintRays(mirror, mirror.sensors()[0], projector(mirror), 3).follow(np.array([[4.5, 7.3]]))
     straight = np.argmin(np.abs(found.sensor - expected.sensor).sum(axis=1))
     assert len(found.ray) == 2 and len(set(found.chain.tolist())) == 2
     assert found.throughput[straight] == pytest.approx(passed**2, rel=1e-2)
@@ -176,7 +176,7 @@ def test_a_slab_of_glass_shifts_the_ray_by_snells_law(variant: str) -> None:
         "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
     }
     scene = scene_with(sheet=plane(0, 400, CONDUCTOR), slab=slab)
-    tracer = MirrorTracer(scene, scene.sensors()[0], projector(scene), 5)
+    tracer = GlintRays(scene, scene.sensors()[0], projector(scene), 5)
     point = np.array([[4.5, 7.3]])
     found = tracer.follow(point)
     x, y, z = tracer.rays.directions(point)[0]
@@ -207,7 +207,7 @@ def test_max_depth_counts_mirrors(variant: str) -> None:
 def test_a_rim_is_followed_down_and_its_rest_reported(variant: str) -> None:
     """Half the sensor sees a mirror's edge; what is not resolved is a small part, and the rest is right to that."""
     whole, half = scene_with(sheet=plane(0, 400, CONDUCTOR)), scene_with(sheet=plane(70, 400, CONDUCTOR, 60))
-    beams = trace_beams(half, half.sensors()[0], projector(half))
+    beams = trace_glint(half, half.sensors()[0], projector(half))
     assert 0 < beams.unresolved < 0.02 * flux(whole)
     assert flux(half) + beams.unresolved / 2 == pytest.approx(flux(whole) / 2, rel=5e-3)
 
@@ -219,8 +219,10 @@ def test_a_painted_mirror_is_divided_where_its_paint_ends(variant: str) -> None:
     whole = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
     assert flux(scene) == pytest.approx(0.5 * whole, rel=5e-3)
     camera = scene.sensors()[0]
-    beams = trace_beams(scene, camera, projector(scene))
-    frame = beam_frames(beams, camera.geometry, geometric_terms(camera.geometry), np.zeros(N * N, np.int64)).irradiance
+    beams = trace_glint(scene, camera, projector(scene))
+    frame = glint_frames(
+        beams, camera.geometry, geometric_samplers(camera.geometry), np.zeros(N * N, np.int64)
+    ).irradiance
     rows = np.sort(frame[0].mean(axis=1))
     assert rows[30] == pytest.approx(rows[0], rel=1e-2) and rows[33] == pytest.approx(9 * rows[0], rel=1e-2)
 

@@ -5,7 +5,7 @@ what it casts on the plane at unit distance, pi x scale x texture. A ray of a pi
 ``phi = pi scale texture a / N``, a being the pixel's area on that plane: the same through every point of a lens. Every
 pixel has its own rays, so light is never attributed to a pixel by chance.
 
-The map is written once (:class:`CanvasMap`, and :class:`Projector` for the window) and used in two kinds of
+The map is written once (:class:`CanvasMap`, and :class:`ProjectorOptics` for the window) and used in two kinds of
 numbers: the renderer's float32, a lane each (:class:`ProjectorRays`), and the host's float64 (:class:`PinholeRays`).
 """
 
@@ -35,7 +35,7 @@ _PROBE_STEP = 1e-2
 
 
 @dataclass(frozen=True)
-class Projector:
+class ProjectorOptics:
     """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas.
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
@@ -133,7 +133,7 @@ class ProjectorRays:
     Prepared once; numbers are opaque, so one compiled kernel serves all projectors of a kind.
     """
 
-    def __init__(self, projector: Projector) -> None:
+    def __init__(self, projector: ProjectorOptics) -> None:
         self.projector, self._map = projector, CanvasMap.of(projector.emitter)
 
     def sample(self, pixel: mi.UInt32, jitter: mi.Point2f, rng: mi.PCG32, wavelengths: mi.Color0f) -> mi.Ray3f:
@@ -210,7 +210,7 @@ class PinholeRays:
         (n * n, channels) irradiance on that plane that each pixel casts, by colour channel or wavelength [W m^-2].
     """
 
-    def __init__(self, projector: Projector, wavelengths: Sequence[mi.Color0f | None]) -> None:
+    def __init__(self, projector: ProjectorOptics, wavelengths: Sequence[mi.Color0f | None]) -> None:
         """Of a ``projector``; ``wavelengths`` are sets at which spectra are taken, from :func:`wavelength_sets`."""
         self._projector, n = projector, projector.n
         self._map = CanvasMap.of(projector.emitter)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.beams import Beams, beam_frames
-from mitsim.optics.samplers import ProfileSampler, geometric_terms
+from mitsim.optics.glint import Beams, glint_frames
+from mitsim.optics.samplers import ProfileSampler, geometric_samplers
 from mitsim.rig.camera import CameraGeometry
 
 PITCH = 0.05
@@ -35,7 +35,7 @@ def turned(angle: float, side: float) -> np.ndarray:
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4, np.pi / 2, 2.5])
 def test_a_beam_on_the_sensor_keeps_its_flux(angle: float) -> None:
-    found = beam_frames(beams(turned(angle, 0.4)), geometry(), geometric_terms(geometry()), LABELS)
+    found = glint_frames(beams(turned(angle, 0.4)), geometry(), geometric_samplers(geometry()), LABELS)
     assert found.flux == pytest.approx(2.0, rel=1e-12)
     assert found.irradiance.sum() * PITCH**2 == pytest.approx(2.0, rel=1e-12)
     assert (found.classes.tolist(), found.lit_pixels.tolist(), found.unresolved) == ([1], [4], 0.25)
@@ -43,7 +43,7 @@ def test_a_beam_on_the_sensor_keeps_its_flux(angle: float) -> None:
 
 def test_a_beam_aligned_with_the_pixels_covers_parts_of_them_exactly() -> None:
     low, high = (-0.13, 0.02), (0.21, 0.377)
-    frame = beam_frames(beams(square(low, high)), geometry(), geometric_terms(geometry()), LABELS).irradiance[0]
+    frame = glint_frames(beams(square(low, high)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
     edges = geometry().pixel_edges
     cover = [
         np.maximum(np.minimum(edges[1:], b) - np.maximum(edges[:-1], a), 0) / PITCH
@@ -54,17 +54,17 @@ def test_a_beam_aligned_with_the_pixels_covers_parts_of_them_exactly() -> None:
 
 
 def test_a_turned_beam_lights_its_inside_evenly() -> None:
-    frame = beam_frames(beams(turned(0.3, 0.5)), geometry(), geometric_terms(geometry()), LABELS).irradiance[0]
+    frame = glint_frames(beams(turned(0.3, 0.5)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
     assert frame[6:10, 6:10] == pytest.approx(2.0 / 0.25, rel=2e-3)
     assert not frame[0].any() and not frame[:, 0].any()
 
 
 def test_light_beside_the_sensor_is_not_counted() -> None:
     half = beams(square((-0.1, 0.3), (0.1, 0.5)))  # the sensor ends at 0.4
-    found = beam_frames(half, geometry(), geometric_terms(geometry()), LABELS)
+    found = glint_frames(half, geometry(), geometric_samplers(geometry()), LABELS)
     assert found.flux == pytest.approx(1.0, rel=1e-12)
     outside = beams(square((-0.1, 0.41), (0.1, 0.5)))
-    found = beam_frames(outside, geometry(), geometric_terms(geometry()), LABELS)
+    found = glint_frames(outside, geometry(), geometric_samplers(geometry()), LABELS)
     assert (found.flux, len(found.classes), found.irradiance.shape) == (0, 0, (0, 16, 16))
 
 
@@ -72,19 +72,19 @@ def test_the_field_stop_and_a_response_weigh_directions() -> None:
     corners = square((-0.2, -0.2), (0.2, 0.2))
     tangent = np.zeros((1, 2, 2, 2))
     tangent[..., 0] = [[0.0, 0.0], [1.0, 1.0]]  # 0 on the first row, 1 on the last
-    args = geometry(), geometric_terms(geometry()), LABELS
-    stop = beam_frames(beams(corners, tangent=tangent), *args, boxes_per_pixel=64).flux
+    args = geometry(), geometric_samplers(geometry()), LABELS
+    stop = glint_frames(beams(corners, tangent=tangent), *args, boxes_per_pixel=64).flux
     assert stop == pytest.approx(2 * np.tan(np.radians(30)), rel=2e-3)
     # cos^2 theta is 1 / (1 + t^2), of mean pi / 4 over t from 0 to 1.
     wide = geometry(fov=120, angular_exponent=2.0)
-    answered = beam_frames(beams(corners, tangent=tangent), wide, geometric_terms(wide), LABELS, 64)
+    answered = glint_frames(beams(corners, tangent=tangent), wide, geometric_samplers(wide), LABELS, 64)
     assert answered.flux == pytest.approx(2 * np.pi / 4, rel=1e-5)
 
 
 def test_throughput_dims_where_it_is_low() -> None:
     throughput = np.array([[[0.0, 0.0], [1.0, 1.0]]])
     lit = beams(square((-0.2, -0.2), (0.2, 0.2)), throughput=throughput)
-    found = beam_frames(lit, geometry(), geometric_terms(geometry()), LABELS)
+    found = glint_frames(lit, geometry(), geometric_samplers(geometry()), LABELS)
     assert found.flux == pytest.approx(1.0, rel=1e-12) and lit.delivered == pytest.approx([1.0])
     rows = found.irradiance[0].sum(axis=1)
     assert rows[11] / rows[4] == pytest.approx(15, rel=1e-6)
@@ -99,7 +99,7 @@ def test_the_mask_is_magnified_as_from_the_virtual_source(depth: float) -> None:
     camera = geometry("separable")
     lit = beams(square((-0.41, -0.41), (0.41, 0.41)), depth=depth)
     assert 1 / lit.inverse_depth == pytest.approx(np.full((1, 2), depth))
-    frame = beam_frames(lit, camera, geometric_terms(camera), LABELS).irradiance[0]
+    frame = glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
     mask = camera.build_mask()
     fine = (np.arange(16 * 4000) + 0.5) / 4000 * PITCH - 0.4
     s = fine * (1 - camera.mask_distance / depth)
@@ -111,18 +111,18 @@ def test_the_mask_is_magnified_as_from_the_virtual_source(depth: float) -> None:
 def test_flatcam_terms_add_up() -> None:
     camera = geometry("flatcam")
     lit = beams(square((-0.4, -0.4), (0.4, 0.4)), depth=1e9)
-    frame = beam_frames(lit, camera, geometric_terms(camera), LABELS).irradiance[0]
+    frame = glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
     fine = (np.arange(16 * 40) + 0.5) / 40 * PITCH - 0.4
     mask = camera.build_mask().transmission(fine[:, None], fine).reshape(16, 40, 16, 40).mean(axis=(1, 3))
     assert np.abs(frame - 2 / 0.64 * mask).max() < 0.05 * frame.max()
-    assert beam_frames(lit, camera, [], LABELS).irradiance.sum() == 0
+    assert glint_frames(lit, camera, [], LABELS).irradiance.sum() == 0
 
 
 def test_an_active_side_takes_the_mean_over_the_pixels_middle() -> None:
     """A quarter of the area is active, so a quarter of the light counts; the mask is seen by that quarter alone."""
     camera = geometry("separable", pixel_fill_factor=0.25)
     lit = beams(square((-0.4, -0.4), (0.4, 0.4)), depth=1e9)
-    frame = 4 * beam_frames(lit, camera, geometric_terms(camera), LABELS).irradiance[0]
+    frame = 4 * glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
     mask = camera.build_mask()
     sampler, middle = ProfileSampler(mask.bits, mask.feature_mm), (np.arange(16) - 7.5) * PITCH
     profile = sampler(middle, np.full(16, PITCH / 2), np.zeros(16))
@@ -134,17 +134,17 @@ def test_a_sampler_is_told_the_tangent() -> None:
     lit = beams(square((-0.1, -0.1), (0.1, 0.1)), tangent=np.full((1, 2, 2, 2), 0.25))
     plain = ProfileSampler(np.ones(500), 1.0)
     terms = [(2.0, plain, lambda s, width, tangent: tangent)]
-    found = beam_frames(lit, camera, terms, LABELS)
+    found = glint_frames(lit, camera, terms, LABELS)
     assert found.irradiance.sum() * PITCH**2 == pytest.approx(2.0 * 2.0 * 0.25)
 
 
 def test_classes_are_told_apart_and_add_up() -> None:
     first, second = beams(square((-0.2, -0.2), (0.2, 0.2)), 4), beams(square((0.0, 0.0), (0.3, 0.3)), 8, 5.0)
     both = Beams(*(np.concatenate([getattr(b, name) for b in (first, second)]) for name in ORDER), 0.5)
-    found = beam_frames(both, geometry(), geometric_terms(geometry()), LABELS)
+    found = glint_frames(both, geometry(), geometric_samplers(geometry()), LABELS)
     assert found.classes.tolist() == [1, 2] and found.lit_pixels.tolist() == [4, 8]
     assert found.irradiance.sum(axis=(1, 2)) * PITCH**2 == pytest.approx([2.0, 5.0])
-    one = beam_frames(both, geometry(), geometric_terms(geometry()), np.zeros(9, np.int64))
+    one = glint_frames(both, geometry(), geometric_samplers(geometry()), np.zeros(9, np.int64))
     assert np.allclose(one.irradiance[0], found.irradiance.sum(axis=0))
 
 
@@ -170,4 +170,4 @@ def test_a_profile_sampler_takes_means() -> None:
 def test_bad_arguments_are_refused(change: dict[str, object], message: str) -> None:
     arguments = {"labels": LABELS, **change}
     with pytest.raises(MitsimError, match=message):
-        beam_frames(beams(turned(0, 0.4)), geometry(), geometric_terms(geometry()), **arguments)
+        glint_frames(beams(turned(0, 0.4)), geometry(), geometric_samplers(geometry()), **arguments)

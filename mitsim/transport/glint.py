@@ -1,9 +1,9 @@
 """Glint: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors alone.
 
 A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
-projector instead (:mod:`mitsim.transport.mirrors`). Rays go through a grid of points of each projector pixel. Four
+projector instead (:mod:`mitsim.transport.glint_rays`). Rays go through a grid of points of each projector pixel. Four
 neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided
-until the map from the projector's window to the sensor is bilinear over each. :mod:`mitsim.optics.beams` turns beams
+until the map from the projector's window to the sensor is bilinear over each. :mod:`mitsim.optics.glint` turns beams
 into frames.
 
 Flux: the stock projector's irradiance on the plane at unit distance is pi x scale x texture, the same everywhere on it,
@@ -20,10 +20,10 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.optics.beams import Beams
+from mitsim.optics.glint import Beams
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.mirrors import Crossings, IntArray, Mask, MirrorTracer, delta_bsdfs
-from mitsim.transport.source import Projector
+from mitsim.transport.glint_rays import Crossings, GlintRays, IntArray, Mask, delta_bsdfs
+from mitsim.transport.projector import ProjectorOptics
 
 _UNIT = 2**10
 """Lattice points a projector pixel's side, the finest division: a pixel of 1000 sensor pixels still ends at one."""
@@ -44,12 +44,12 @@ _MARGIN = 0.02
 """Sine by which the field stop is widened when squares are left out: 1 degree, more than a square's rays curve."""
 
 
-def has_specular(scene: mi.Scene) -> bool:
+def has_mirrors(scene: mi.Scene) -> bool:
     """Whether some surface of the ``scene`` reflects or refracts like a perfect mirror or lens."""
     return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
 
 
-def trace_beams(scene: mi.Scene, camera: mi.Sensor, projector: Projector, max_depth: int = 16) -> Beams:
+def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
     """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
 
     A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
@@ -70,9 +70,9 @@ def trace_beams(scene: mi.Scene, camera: mi.Sensor, projector: Projector, max_de
     """
     if max_depth < 1:
         raise MitsimError(f"max_depth of glints is {max_depth}; give at least 1")
-    if not has_specular(scene):
+    if not has_mirrors(scene):
         return _joined([], 0.0)
-    tracer = MirrorTracer(scene, camera, projector, max_depth)
+    tracer = GlintRays(scene, camera, projector, max_depth)
     n, geometry = projector.n, camera.geometry
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
     line = np.arange(0, n * _UNIT + 1, step)
@@ -123,7 +123,7 @@ def _nodes(crossings: Crossings, chain: np.uint64, count: int) -> _Nodes:
 
 
 def _refine(
-    tracer: MirrorTracer, chain: np.uint64, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
+    tracer: GlintRays, chain: np.uint64, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], float]:
     """Beams of one chain inside squares of the lattice (first row and column, ``size``), and the flux not resolved."""
     parts: list[Beams] = []
@@ -154,7 +154,7 @@ def _refine(
     return parts, unresolved
 
 
-def _trace_squares(tracer: MirrorTracer, chain: np.uint64, row: IntArray, column: IntArray, half: int) -> _Nodes:
+def _trace_squares(tracer: GlintRays, chain: np.uint64, row: IntArray, column: IntArray, half: int) -> _Nodes:
     """Nodes (q, 3, 3) at corners, edge middles and centre of squares; shared points are traced once."""
     step = half * np.arange(3)
     rows, columns = np.broadcast_arrays(row[:, None, None] + step[:, None], column[:, None, None] + step)
@@ -211,7 +211,7 @@ def _departure(values: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(values - flat, axis=-1).max(axis=(1, 2)))
 
 
-def _fluxes(tracer: MirrorTracer, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
+def _fluxes(tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
     """(q,) flux into squares of the lattice [W m^-2 mm^2]."""
     power = tracer.rays.power.mean(axis=1)[_pixel(row, column, n)]
     return np.asarray(power * tracer.rays.area * (size / _UNIT) ** 2)

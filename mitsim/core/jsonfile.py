@@ -12,9 +12,6 @@ import numpy as np
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.output import whole_file
 from mitsim.core.plainfile import read_text
-from mitsim.core.versions import DECIDING, versions
-
-__all__ = ["DECIDING", "parse_json", "plain", "read_json", "versions", "write_json"]
 
 _MOST_BYTES = 32 << 20
 """A little more than the largest manifest that a capture writes: 65536 shots of 4096 x 256 patterns make 29 MB."""

@@ -74,7 +74,7 @@ class Beams:
 
 
 @dataclass(frozen=True, eq=False)
-class SpecularFrames(ClassFrames):
+class GlintFrames(ClassFrames):
     """Irradiance by mirrors, one frame for each class of projector pixels that reaches the sensor.
 
     Attributes
@@ -92,19 +92,19 @@ class SpecularFrames(ClassFrames):
     unresolved: float
 
 
-def beam_frames(
+def glint_frames(
     beams: Beams,
     geometry: CameraGeometry,
     terms: Sequence[SeparableTerm],
     labels: IntArray,
     boxes_per_pixel: int = 2,
-) -> SpecularFrames:
+) -> GlintFrames:
     """Frames of the classes that mirrors bring to the sensor; memory is one frame for each of them.
 
     Parameters
     ----------
     beams
-        from ``mitsim.transport.beams.trace_beams``.
+        from ``mitsim.transport.glint.trace_glint``.
     geometry
         the camera; irradiance is the mean over a pixel's active square, times the fill factor and the response.
     terms
@@ -134,7 +134,7 @@ def beam_frames(
         lit[pixels] = True
     used = np.isin(classes, labels[lit])
     area = (geometry.pixel_pitch * active_side) ** 2
-    return SpecularFrames(
+    return GlintFrames(
         classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved
     )
 

@@ -30,9 +30,9 @@ from mitsim.transport.connection import ProjectorConnector
 from mitsim.transport.coordinates import x_y
 from mitsim.transport.histogram import Deposits, Sightings
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
+from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
-from mitsim.transport.source import Projector
 
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
@@ -51,14 +51,14 @@ class Paths:
     emitters: tuple[mi.Emitter, ...] = ()
 
 
-class CameraTracer(Tracer):
+class FromCameraTracer(Tracer):
     """From-camera light of a scene, at the sensor's centre."""
 
     def __init__(
         self,
         scene: mi.Scene,
         camera: mi.Sensor,
-        projector: Projector,
+        projector: ProjectorOptics,
         grid: CellGrid,
         paths: Paths,
         geometry: CameraGeometry | None = None,
@@ -97,7 +97,7 @@ class _Walk(Walk):
         *("rng", "inverse_depth", "came_from", "came_pdf", "kept"),
     )
 
-    def __init__(self, tracer: CameraTracer, seed: int, sample: mi.UInt32, cell: mi.UInt32) -> None:
+    def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, cell: mi.UInt32) -> None:
         super().__init__(tracer.scene, tracer.paths.mirrors, tracer.paths.interreflection)
         self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
         self.connector = tracer.connector
@@ -195,7 +195,7 @@ class _Walk(Walk):
     def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a projector's lens that the path has run into.
 
-        Over mirrors alone it is the beams' (:mod:`mitsim.transport.beams`); over one other surface, unless that is
+        Over mirrors alone it is the beams' (:mod:`mitsim.transport.glint`); over one other surface, unless that is
         seen in a mirror, it is the projector's side's.
         """
         active = self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))

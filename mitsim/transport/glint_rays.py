@@ -19,7 +19,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.coordinates import rows_columns, turn_and_origin
 from mitsim.transport.host import channels, per_lane, vectors
-from mitsim.transport.source import PinholeRays, Projector, wavelength_sets
+from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 
 IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
@@ -92,14 +92,14 @@ class _Rays:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
-class MirrorTracer:
+class GlintRays:
     """Follows rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
 
     At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends
     there: that light is found from the camera.
     """
 
-    def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: Projector, max_depth: int) -> None:
+    def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int) -> None:
         """What is followed.
 
         Parameters
