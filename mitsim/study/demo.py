@@ -154,7 +154,8 @@ def _page(evidence: _Evidence) -> ReportData:
     light, shots, factors = evidence.light, evidence.shots, evidence.factors
     bench, session = light.bench, factors.manifest.result
     headline, detail = verdict(evidence.families[evidence.main], evidence.families["uniform"])
-    unexplained = f"Beyond the sensor's noise, {session['unexplained_residual']:.1e} of them is left."
+    unexplained = session["unexplained_residual"]  # JSON has no infinity: None
+    beyond = "" if unexplained is None else f" Beyond the sensor's noise, {unexplained:.1e} of them is left."
     return ReportData(
         title=f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
         verdict=headline,
@@ -163,7 +164,7 @@ def _page(evidence: _Evidence) -> ReportData:
         scene=scene_line(bench.loaded.path),
         families=tuple(evidence.families.values()),
         exposure=f"equal peak: each family's brightest pixel fills {100 * Exposure().fraction:.0f} % of the full well",
-        calibration={**session, "status": f"{factors.status} {unexplained}"},
+        calibration={**session, "status": f"{factors.status}{beyond}"},
         budget=(
             BudgetRow("Monte Carlo", shots.manifest.mc_error, "rendering noise of the expected frames, from 8 groups"),
             BudgetRow(

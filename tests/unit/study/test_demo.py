@@ -1,6 +1,7 @@
 """The demo on a bench of one's own, and the line that a report shows for a scene."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,13 @@ import numpy as np
 import pytest
 
 from mitsim.capture import light, run
-from mitsim.capture.bench import open_bench
+from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.request import Request
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import load_run
-from mitsim.reconstruct.factors import load_calibration
+from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.study.compare import label
 from mitsim.study.demo import demo, scene_line
@@ -59,9 +60,20 @@ def test_the_scene_is_traced_once_and_a_speckled_projector_shows_in_every_family
         return light.trace_light(*arguments, **options)
 
     monkeypatch.setattr(run, "trace_light", counted)
+    calibrate = Bench.calibrate
+
+    def without_figures(*arguments: Any, **options: Any) -> Factors:
+        """As of a camera that can hardly be calibrated: what is not finite is None in JSON."""
+        factors = calibrate(*arguments, **options)
+        unknown = dict.fromkeys(("unexplained_residual", "condition", "phi_error"))
+        manifest = factors.manifest.model_copy(update={"result": {**factors.manifest.result, **unknown}})
+        return replace(factors, manifest=manifest)
+
+    monkeypatch.setattr(Bench, "calibrate", without_figures)
     job = Job()
     result = demo(bench, tmp_path / "demo", Request.of(patterns="dots:2", accuracy=2e-2, seed=3), job)
     assert len(traced) == 1
+    assert "<b>\N{EN DASH}</b>" in (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
     assert tuple(result.psnr) == ("uniform", "dots:4", "dots:5", "dots:2", "hadamard:8")
     assert result.gain_db == result.psnr["dots:2"] - result.psnr["uniform"]
     shots = load_run(tmp_path / "demo" / "run")
@@ -82,6 +94,9 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
     bench = open_bench(shared_scene("refused", n=16), variant)
     with pytest.raises(MitsimError, match="dots:17"):
         demo(bench, earlier, Request.of(patterns="dots:17"))
+    bottomless = replace(bench, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf}))
+    with pytest.raises(MitsimError, match="no full well to fill"):
+        demo(bottomless, earlier, Request.of(patterns="dots:2"))
     assert (earlier / "report.html").read_text() == "yesterday's"
 
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.request import Request
+from mitsim.core.errors import MitsimError
 from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
@@ -140,6 +142,13 @@ def test_separability_of_each_light(study: diffraction.DiffractionFindings) -> N
     for mask in ("separable", "flatcam"):
         assert 0 < rows[mask, "one line"].factor < 0.5, "the sign of a pair of factors is free"
         assert rows[mask, "one line"].scene_pixel < rows[mask, "one line"].point_source, "a pixel blurs what differs"
+
+
+def test_a_camera_without_a_full_well_is_refused_before_any_light_is_traced(bench: Bench, tmp_path: Path) -> None:
+    bottomless = replace(bench, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf}))
+    with pytest.raises(MitsimError, match="no full well to fill"):
+        find_study("diffraction")(bottomless, tmp_path / "out", None, None)
+    assert not (tmp_path / "out").exists()
 
 
 def test_files_and_report(result: StudyResult, study: diffraction.DiffractionFindings) -> None:
