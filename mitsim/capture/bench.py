@@ -17,6 +17,7 @@ from mitsim.core.framefile import checksum
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.rig.projector import ProjectorModel, Spectrum
+from mitsim.rig.rig import Rig
 from mitsim.rig.sensor import SensorModel, load_sensor
 
 if TYPE_CHECKING:
@@ -45,22 +46,18 @@ class Bench:
     ----------
     loaded
         the scene.
-    sensor, projector
-        the devices' models.
+    rig
+        camera, sensor and projector, as pure data.
     variant
         of Mitsuba.
     defines
         parameters that the scene was loaded with.
-    camera_file
-        where the camera's electronics stand.
     """
 
     loaded: LoadedScene
-    sensor: SensorModel
-    projector: ProjectorModel
+    rig: Rig
     variant: str
     defines: dict[str, str]
-    camera_file: str
 
     def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
         """What will be simulated, why, and what it costs, by a short look at the scene.
@@ -208,8 +205,17 @@ class Bench:
     @property
     def geometry(self) -> CameraGeometry:
         """The camera's geometry, as the scene states it."""
-        geometry: CameraGeometry = self.loaded.camera.geometry
-        return geometry
+        return self.rig.camera
+
+    @property
+    def sensor(self) -> SensorModel:
+        """The camera's electronics."""
+        return self.rig.sensor
+
+    @property
+    def projector(self) -> ProjectorModel:
+        """The projector's light and lens."""
+        return self.rig.projector
 
     @property
     def n(self) -> int:
@@ -367,7 +373,8 @@ def open_bench(
             f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
             "use the camera of that scene, or change pixel_pitch, or binning"
         )
-    return Bench(loaded, sensor, light, variant, defines, str(sensor_path))
+    rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
+    return Bench(loaded, rig, variant, defines)
 
 
 def _text(value: object) -> str:

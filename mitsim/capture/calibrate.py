@@ -54,7 +54,7 @@ def calibrate(
         as there.
     """
     recipe, job = recipe or load_recipe(), job or Job()
-    Exposure(None, recipe.exposure_fraction).check(bench)
+    Exposure(None, recipe.exposure_fraction).check(bench.rig)
     session = Session(bench, recipe, seed)
     configuration = {
         **bench.provenance(),

@@ -10,7 +10,6 @@ from typing import TypeVar
 import numpy as np
 from scipy import special
 
-from mitsim.capture.bench import Bench
 from mitsim.capture.request import Exposure
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
@@ -18,6 +17,7 @@ from mitsim.core.seeds import stream
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.optics.speckle import speckled
 from mitsim.rig.patterns import PatternFamily
+from mitsim.rig.rig import Rig
 from mitsim.sensor.chain import (
     Digital,
     add_dark_current,
@@ -36,12 +36,12 @@ FRAMES_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Exposer:
-    """A bench's camera at one exposure time; every frame's noise has streams of its own, found by its names.
+    """A rig's camera at one exposure time; every frame's noise has streams of its own, found by its names.
 
     ``speckle`` is the contrast of laser speckle in the frames; 0 without.
     """
 
-    bench: Bench
+    rig: Rig
     exposure_s: float
     seed: int
     speckle: float = 0.0
@@ -49,7 +49,7 @@ class Exposer:
     def electrons(self, frame: Frame) -> FloatArray:
         """Expected photoelectrons (pixels, pixels) of ``frame``, without dark current."""
         return electrons_from_irradiance(
-            frame.irradiance, self.exposure_s, self.bench.sensor, self.bench.projector.effective_wavelength_nm
+            frame.irradiance, self.exposure_s, self.rig.sensor, self.rig.projector.effective_wavelength_nm
         )
 
     def lit(self, frame: Frame, *names: str | int) -> FloatArray:
@@ -59,24 +59,24 @@ class Exposer:
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
         """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""
         shot, read = (stream(self.seed, noise, *names) for noise in ("shot", "read"))
-        return expose(electrons, self.exposure_s, self.bench.sensor, shot, read)
+        return expose(electrons, self.exposure_s, self.rig.sensor, shot, read)
 
     def rate(self, digital: Digital) -> FloatArray:
         """What a user of frames computes of ``digital`` numbers: photoelectrons a second, dark current taken off."""
-        sensor = self.bench.sensor
+        sensor = self.rig.sensor
         return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
 
     def rendering_noise(self, frame: Frame) -> float:
         """Root mean square Monte Carlo error of ``frame`` [electrons]."""
         unit = electrons_from_irradiance(
-            1.0, self.exposure_s, self.bench.sensor, self.bench.projector.effective_wavelength_nm
+            1.0, self.exposure_s, self.rig.sensor, self.rig.projector.effective_wavelength_nm
         )
         return float(np.sqrt(frame.variance) * unit)
 
     def sensor_noise(self, electrons: FloatArray) -> float:
         """Root mean square noise of the sensor on expected ``electrons``, from its closed form [electrons]."""
-        _, variance = frame_moments(electrons, self.exposure_s, self.bench.sensor)
-        return float(np.sqrt(variance.mean()) / self.bench.sensor.gain_dn_per_e)
+        _, variance = frame_moments(electrons, self.exposure_s, self.rig.sensor)
+        return float(np.sqrt(variance.mean()) / self.rig.sensor.gain_dn_per_e)
 
     def saturated(self, digital: Digital, electrons: FloatArray) -> bool:
         """Whether any pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end.
@@ -84,7 +84,7 @@ class Exposer:
         A reading at the full well counts where the light can have filled it: with a chance of 1e-3 in the whole frame.
         Elsewhere it is read noise.
         """
-        sensor = self.bench.sensor
+        sensor = self.rig.sensor
         well, brightest = sensor.superpixel_full_well_e, float(digital.max())
         if sensor.largest_dn is not None and brightest >= sensor.largest_dn:
             return True
@@ -126,13 +126,13 @@ class NoiseTarget:
 
     Attributes
     ----------
-    bench, exposure
-        the camera, and how its exposure time is found.
+    rig, exposure
+        the devices, and how its exposure time is found.
     fraction
         part of the noise.
     """
 
-    bench: Bench
+    rig: Rig
     exposure: Exposure
     fraction: float
 
@@ -141,7 +141,7 @@ class NoiseTarget:
         peak = peak_irradiance(expected)
         if peak <= 0:
             return np.inf
-        exposer = Exposer(self.bench, self.exposure.choose(self.bench, peak), 0)
+        exposer = Exposer(self.rig, self.exposure.choose(self.rig, peak), 0)
         noise = energy = 0.0
         for frame in expected:
             electrons = exposer.electrons(frame)

@@ -16,7 +16,7 @@ from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 from mitsim.sensor.chain import exposure_for_peak
 
 if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench
+    from mitsim.rig.rig import Rig
 
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
@@ -39,20 +39,20 @@ class Exposure:
                 "exposure_fraction", f"{self.fraction:g}: give a part of the full well, {least:g} to {most:g}"
             )
 
-    def check(self, bench: Bench) -> None:
-        """MitsimError when the time is to follow from a full well that the camera of ``bench`` does not have."""
-        if self.seconds is None and not np.isfinite(bench.sensor.full_well_e):
+    def check(self, rig: Rig) -> None:
+        """MitsimError when the time is to follow from a full well that the camera of ``rig`` does not have."""
+        if self.seconds is None and not np.isfinite(rig.sensor.full_well_e):
             raise MitsimError(
-                f"camera {bench.camera_file}: full_well_e is inf, so there is no full well to fill; "
+                f"camera {rig.camera_file}: full_well_e is inf, so there is no full well to fill; "
                 "give a finite one, or an exposure in seconds"
             )
 
-    def choose(self, bench: Bench, peak_irradiance: float) -> float:
-        """Exposure time [s] on ``bench`` for frames whose brightest expected pixel has ``peak_irradiance`` [W m^-2]."""
+    def choose(self, rig: Rig, peak_irradiance: float) -> float:
+        """Exposure time [s] of ``rig`` for frames whose brightest expected pixel has ``peak_irradiance`` [W m^-2]."""
         if self.seconds is not None:
             return self.seconds
-        wavelength = bench.projector.effective_wavelength_nm
-        return exposure_for_peak(peak_irradiance, self.fraction, bench.sensor, wavelength)
+        wavelength = rig.projector.effective_wavelength_nm
+        return exposure_for_peak(peak_irradiance, self.fraction, rig.sensor, wavelength)
 
 
 class Request(BaseModel):

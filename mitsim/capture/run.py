@@ -121,7 +121,7 @@ def capture(
         as there.
     """
     job = job or Job()
-    request.timing.check(bench)
+    request.timing.check(bench.rig)
     family = bench.family(request.patterns, request.seed)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     lighting = family.lighting
@@ -144,8 +144,8 @@ def capture(
         with job.clock.stage("optics"):
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
             totals = _Totals.of(expected)
-        exposure_s = request.timing.choose(bench, totals.peak)
-        exposer = Exposer(bench, exposure_s, request.seed, light.simulation.physics.speckle)
+        exposure_s = request.timing.choose(bench.rig, totals.peak)
+        exposer = Exposer(bench.rig, exposure_s, request.seed, light.simulation.physics.speckle)
         digital = digital_scale(bench, exposure_s)
         recorder.begin()
         recorder.write_truth(truth, load_recipe().board_reflectance)
@@ -187,7 +187,7 @@ def _recorder(output: Path | None, head: RunHead, resume: bool) -> Iterator[RunF
 
 def _sampling(bench: Bench, request: Request) -> Sampling:
     fraction = request.noise_fraction
-    return Sampling(by_pixel=False, target=NoiseTarget(bench, request.timing, fraction) if fraction else None)
+    return Sampling(by_pixel=False, target=NoiseTarget(bench.rig, request.timing, fraction) if fraction else None)
 
 
 @dataclass(frozen=True)

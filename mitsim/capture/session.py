@@ -105,7 +105,7 @@ class Session:
         with job.clock.stage("optics"):
             white = next(iter(light.frames(Lighting.uniform(self.bench.n), self.seed)))
             exposure = Exposure(None, self.recipe.exposure_fraction)
-            exposure_s = exposure.choose(self.bench, float(white.irradiance.max()))
+            exposure_s = exposure.choose(self.bench.rig, float(white.irradiance.max()))
         return LitSession(self, light, white, exposure_s, light.simulation.physics.speckle)
 
 
@@ -191,7 +191,7 @@ class LitSession:
     @property
     def _second(self) -> Exposer:
         """An exposure of one second, whose electrons are rates."""
-        return Exposer(self.session.bench, 1.0, self.session.seed)
+        return Exposer(self.session.bench.rig, 1.0, self.session.seed)
 
     def _expected(self, side: str, weights: FloatArray) -> ExpectedFrames:
         n = self.session.bench.n
@@ -202,7 +202,7 @@ class LitSession:
     def _exposed(self, side: str, job: Job, first: int) -> Iterator[Response]:
         """Electrons a second that a user computes from each noisy frame that responses from ``first`` on need."""
         session = self.session
-        exposer = Exposer(session.bench, self.exposure_s, session.seed, self.speckle)
+        exposer = Exposer(session.bench.rig, self.exposure_s, session.seed, self.speckle)
         # Frames that are not needed are formed all the same: how many are mixed at once shows in their last bits.
         needed = range(2 * first if session.pairs else first + 1, len(session.weights))
         numbered = (

@@ -235,7 +235,7 @@ class _Judge:
         """Relative noise of the sensor at equal peak; None for a camera without a full well."""
         if not np.isfinite(self.stand.bench.sensor.full_well_e):
             return None
-        return NoiseTarget(self.stand.bench, Exposure(), 1.0)(self.expected)
+        return NoiseTarget(self.stand.bench.rig, Exposure(), 1.0)(self.expected)
 
 
 def _effects(stand: Stand, plan: Plan) -> Iterator[EffectCost]:

@@ -94,13 +94,13 @@ class Comparison:
         return peak_time(self.light.bench, self._uniform)
 
     def _exposer(self, seconds: float) -> Exposer:
-        return Exposer(self.light.bench, seconds, self.light.seed, self.light.simulation.physics.speckle)
+        return Exposer(self.light.bench.rig, seconds, self.light.seed, self.light.simulation.physics.speckle)
 
     def _idealised(self, family: PatternFamily) -> Recovery:
         """The paper's model of the same scene, with noise of its own."""
         camera, flux = self._ideal, float(self.light.board_flux.mean())
         expected = camera.frames(family, self.light.truth * flux)
-        exposer = Exposer(camera.bench, peak_time(camera.bench, expected), self.light.seed + 1)
+        exposer = Exposer(camera.bench.rig, peak_time(camera.bench, expected), self.light.seed + 1)
         model = prepare(*camera.calibrated(flux), family.left, family.right, centre=camera.centre)
         return self._recovery(exposer, family, expected, model)
 
@@ -120,7 +120,7 @@ def label(name: str) -> str:
 def peak_time(bench: Bench, expected: ExpectedFrames) -> float:
     """Exposure time [s] on ``bench`` at equal peak: the brightest pixel of the ``expected`` frames fills the default
     part of the full well."""
-    return Exposure().choose(bench, peak_irradiance(expected))
+    return Exposure().choose(bench.rig, peak_irradiance(expected))
 
 
 def accumulate(

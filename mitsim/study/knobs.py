@@ -122,7 +122,7 @@ def _lights(bench: Bench) -> Iterator[tuple[str, Bench]]:
     }
     for name, (wavelengths, parts) in choices.items():
         changes = {"wavelengths_nm": wavelengths, "radiant_shares": parts}
-        yield name, replace(bench, projector=model.model_copy(update=changes))
+        yield name, replace(bench, rig=replace(bench.rig, projector=model.model_copy(update=changes)))
 
 
 def _tracing(settings: Settings, evidence: Evidence) -> float:

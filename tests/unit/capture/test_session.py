@@ -297,12 +297,14 @@ def test_only_the_same_session_is_resumed(
         ({"seed": 5}, "seed differ"),
         ({"accuracy": 1e-2, "recipe": recipe("uniform")}, "accuracy, recipe differ"),
     ):
-        with pytest.raises(MitsimError, match=rf"resume: .*cal holds a session of another configuration \({words}\)"):
+        with pytest.raises(
+            MitsimError, match=rf"resume=True: .*cal holds a session of another configuration \({words}\)"
+        ):
             calibrate(bench, **{"recipe": recipe("pair"), "output": tmp_path / "cal", "resume": True, **change})
     with pytest.raises(MitsimError, match="holds files already"):
         calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal")
     (tmp_path / "cal" / "manifest.json").write_text('{"kind": "capture"}')
-    with pytest.raises(MitsimError, match=r"resume: .* is not that of a calibration"):
+    with pytest.raises(MitsimError, match=r"resume=True: .* is not that of a calibration"):
         calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal", resume=True)
 
 

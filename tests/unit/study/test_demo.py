@@ -94,7 +94,7 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
     bench = open_bench(shared_scene("refused", n=16), variant)
     with pytest.raises(MitsimError, match="dots:17"):
         demo(bench, earlier, Request.of(patterns="dots:17"))
-    bottomless = replace(bench, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf}))
+    bottomless = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf})))
     with pytest.raises(MitsimError, match="no full well to fill"):
         demo(bottomless, earlier, Request.of(patterns="dots:2"))
     assert (earlier / "report.html").read_text() == "yesterday's"
