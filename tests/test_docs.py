@@ -262,7 +262,7 @@ def test_the_first_screen_says_what_shows_a_picture_and_two_commands() -> None:
     assert re.match(r"# mitsim\n\nmitsim \w+", opening)
     assert "](docs/images/" in opening
     commands = re.findall(r"^    (\S+ \S+)", opening, flags=re.M)
-    assert len(commands) == 2 and commands[1] == "mitsim demo"
+    assert commands == ["make demo", "make test"]
 
 
 def test_the_citation_names_this_version() -> None:
