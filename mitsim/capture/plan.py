@@ -371,9 +371,8 @@ def _anchors(evidence: Evidence, accuracy: float, cost: _Cost) -> PlanRow:
 def _layers(evidence: Evidence, accuracy: float, cost: _Cost) -> PlanRow:
     errors, layers = evidence.layer_error, len(cost.settings.depths)
     if layers == 1:
-        reason = (
-            f"the light is seen at {evidence.depth:.1f} mm; one layer leaves {errors[1]:.1e} of {accuracy:g} allowed"
-        )
+        left = f"one layer leaves {_shown(errors[1])} of {accuracy:g} allowed"
+        reason = f"the light is seen at {evidence.depth:.1f} mm; {left}"
         return PlanRow("layers", "off", reason, errors[1], 0.0)
     far, near = cost.settings.depths[0], cost.settings.depths[-1]
     reason = f"the light is seen from {near:.0f} to {far:.0f} mm; {layers} layers leave {errors[layers]:.1e}"
@@ -393,7 +392,7 @@ def _row(effect: Effect, accuracy: float, cost: _Cost, facts: SceneFacts, by_use
     if error is None:
         return PlanRow(effect.name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
     said = [facts.notes.get(effect.name, ""), "switched by the user" if by_user else ""]
-    said.append(f"left out, the frames change by {error:.1e}; {accuracy:g} allowed")
+    said.append(f"left out, the frames change by {_shown(error)}; {accuracy:g} allowed")
     return PlanRow(effect.name, state, "; ".join(filter(None, said)), error, cost.of(effect) if on else 0.0)
 
 

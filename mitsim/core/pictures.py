@@ -15,7 +15,7 @@ _LARGEST_INLINE = 128
 _SHORT_CELL = 20
 """A table's cells of fewer letters are not broken into lines: names and numbers."""
 _SHOWN_HEIGHT = 144
-"""Height of a notebook's pictures [screen pixels]: five stand side by side."""
+"""Height of a notebook's pictures [screen pixels]: four stand side by side."""
 
 
 def png(values: npt.ArrayLike, largest: int | None = None) -> bytes:

@@ -27,8 +27,8 @@ from mitsim.core.pictures import card, scaled, span
 TRUTH = "truth.exr"
 Channels = Mapping[str, Channel]
 Metadata = Mapping[str, Value]
-_SHOWN = 4
-"""Frames that a notebook shows: they fill a line."""
+_SHOWN = 3
+"""Frames that a notebook shows: with the truth they fill a line."""
 
 
 def frame_name(index: int) -> str:

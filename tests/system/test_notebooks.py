@@ -11,8 +11,6 @@ import pytest
 import mitsim
 
 NOTEBOOKS = sorted(Path(__file__).parents[2].joinpath("docs/notebooks").glob("*.ipynb"))
-SLOW = "first_capture"
-"""Calibrates a shipped camera of 512 x 512 pixels, which takes half a minute."""
 LARGEST = 400_000
 """Bytes of a notebook with its outputs."""
 FIT = {("stream", "stdout"), ("display_data", ""), ("execute_result", "")}
@@ -73,9 +71,7 @@ def test_what_is_stored_is_fit_for_anybody(path: Path) -> None:
         assert {kind[:2] for kind in kinds(cell)} <= FIT
 
 
-@pytest.mark.parametrize(
-    "path", [pytest.param(path, marks=[pytest.mark.slow] * (path.stem == SLOW), id=path.stem) for path in NOTEBOOKS]
-)
+@every
 def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From top to bottom in an empty folder, by this Python, without the user's settings; the same kinds come out."""
     import nbformat

@@ -103,7 +103,7 @@ def test_a_row_is_found_by_its_name() -> None:
 
 
 def test_it_shows_itself() -> None:
-    found = plan()
+    found = plan(evidence=replace(EVIDENCE, effect_error={**EVIDENCE.effect_error, "ambient": 0.0}))
     shown = found._repr_html_()
     assert all(row.name in shown for row in found.effects) and "0.0e+00" not in shown
     assert repr(found).startswith("Plan(accuracy 0.001: anchors approximate") and "ambient" not in repr(found)

@@ -115,7 +115,7 @@ def test_saving_over_something_is_refused(tmp_path: Path) -> None:
 def test_it_shows_itself(tmp_path: Path) -> None:
     for shots in (recorded(RunMemory()), on_disk(tmp_path / "run")):
         text = shots._repr_html_()
-        assert text.count("data:image/png;base64,") == 5 and "hadamard:2" in text and "8 shots of 5 x 5" in text
+        assert text.count("data:image/png;base64,") == 4 and "hadamard:2" in text and "8 shots of 5 x 5" in text
         assert "too dark" in text and "pattern (" in text and " DN" in text
     assert repr(recorded(RunMemory())) == "Capture(hadamard:2: 8 shots of 5 x 5 pixels, in memory)"
 
