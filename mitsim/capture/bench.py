@@ -59,6 +59,11 @@ class Bench:
     variant: str
     defines: dict[str, str]
 
+    def __repr__(self) -> str:
+        path, pixels = self.loaded.path, self.geometry.pixels
+        rig = f"{self.sensor.name} with {pixels} x {pixels} pixels, {self.projector.name}"
+        return f"Bench({path.parent.name}/{path.name}: {rig})"
+
     def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
         """What will be simulated, why, and what it costs, by a short look at the scene.
 

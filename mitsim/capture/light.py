@@ -99,6 +99,9 @@ class Light:
     sampling_error: float
     reached: bool
 
+    def __repr__(self) -> str:
+        return f"Light({self.paths:.2g} paths, relative error {self.sampling_error:.1e}, of {self.bench!r})"
+
     @property
     def bench(self) -> Bench:
         """Where it shines."""

@@ -27,6 +27,7 @@ def test_a_camera_of_another_pitch_is_refused(small_scene: Callable[..., Path]) 
 def test_identity_and_provenance(small_scene: Callable[..., Path]) -> None:
     path = small_scene()
     bench = open_bench(path, albedo="0.7")
+    assert repr(bench) == "Bench(scenes/small.xml: Sony IMX249, binned 2x2 with 64 x 64 pixels, Sony MP-CL1)"
     identity, provenance = bench.identity(), bench.provenance()
     assert identity["geometry"]["pixels"] == 64 and identity["projector"]["n"] == 16
     assert provenance["defines"] == {"albedo": "0.7"} and provenance["scene"] == str(path)
