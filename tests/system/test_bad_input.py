@@ -187,7 +187,7 @@ def test_a_bad_define(refused: Refused, small_scene: Callable[..., Path], define
         (["--variant", "llvm_ad_grey"], ["llvm_ad_grey", "llvm_ad_mono"]),
         (["--variant", "scalar_rgb"], ["scalar_rgb", "llvm_ad_mono"]),
         (["--resumee"], ["--resumee"]),
-        (["--max-seconds", "0.02"], ["dots:4: would take about", "allowed are 0.02 s", "--max-seconds"]),
+        (["--max-seconds", "1e-4"], ["dots:4: would take about", "allowed are 0.0001 s", "--max-seconds"]),
         (["--max-seconds", "nan"], ["--max-seconds nan", "above 0"]),
         (["--max-memory", "0.1"], ["dots:4: would take about", "of memory", "102 MiB"]),
         (["--max-memory", "0"], ["--max-memory 0", "above 0"]),
