@@ -1,6 +1,9 @@
 """LLVM selection. Tests with a real old library run only where one is installed; nothing here may crash."""
 
 import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -151,3 +154,10 @@ def test_the_library_of_this_machine_works() -> None:
     path = llvm.select_llvm()
     assert (llvm.version(path) or llvm.OLDEST) >= llvm.OLDEST
     assert os.environ[llvm.VARIABLE] == str(path)
+
+
+def test_the_set_up_asks_for_a_library_by_a_function_that_is_there() -> None:
+    setup = (Path(__file__).parents[3] / "scripts/setup.sh").read_text(encoding="utf-8")
+    (line,) = re.findall(r"-c '(from mitsim.*?)'", setup)
+    done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
