@@ -58,8 +58,7 @@ def test_demo_from_the_wheel_in_an_empty_folder(wheel: Path, tmp_path: Path) -> 
         [sys.executable, "-c", program], cwd=empty, env=environment, capture_output=True, text=True, check=True
     )
     assert place.stdout.strip() == str(site / "mitsim" / "_shipped" / "scenes")
-    program = "from mitsim.cli import main; main()"
-    command = [sys.executable, "-c", program, "demo", "--accuracy", "0.02", "--json"]
+    command = [sys.executable, "-m", "mitsim", "demo", "--accuracy", "0.02", "--json"]
     done = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["gain_db"] > 8
