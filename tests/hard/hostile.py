@@ -125,6 +125,9 @@ def ball(inside: str) -> str:
     return put(f'<shape type="sphere">{inside}</shape>')
 
 
+_OBJECT_FOR_FILE = '<texture name="filename" type="checkerboard"/>'
+
+
 def skin(kind: str, inside: str = "") -> str:
     """A sphere of one material."""
     return ball(f'<bsdf type="{kind}">{inside}</bsdf>')
@@ -268,6 +271,21 @@ def _not_allowed() -> list[Case]:
             "bitmap without file",
             skin("diffuse", '<texture name="reflectance" type="bitmap"/>'),
             ("filename: got nothing",),
+        ),
+        Case(
+            "object for the file of a bitmap",
+            skin("diffuse", f'<texture name="reflectance" type="bitmap">{_OBJECT_FOR_FILE}</texture>'),
+            ("filename: got no text",),
+        ),
+        Case(
+            "object for the file of a mesh",
+            put(f'<shape type="ply">{_OBJECT_FOR_FILE}</shape>'),
+            ("filename: got no text",),
+        ),
+        Case(
+            "number for the file of a bitmap",
+            skin("diffuse", '<texture name="reflectance" type="bitmap"><float name="filename" value="1"/></texture>'),
+            ("filename",),
         ),
     ]
 

@@ -147,7 +147,7 @@ class _Tree:
         if plugin in ("blackbody", "d65") and limit.high <= 1:
             raise self.outline.tag(node).refusal("type", repr(plugin), f"{name} is no light; give another texture")
         own = {"mesh_attribute": "name", "bitmap": "filename"}.get(plugin, "")
-        for meant in filter(None, (name, Path(str(node.props.get(own, ""))).name)):
+        for meant in filter(None, (name, Path(_text(node, own) or "").name)):
             self.limits[meant] = min(self.limits.get(meant, limit), limit, key=lambda one: one.high)
         for key in limits.TABLES:
             if key in node.props and node.props.type(key) == _Type.ResolvedReference:
@@ -158,9 +158,10 @@ class _Tree:
     def _check_resource(self, node: mi.parser.SceneNode) -> None:
         """The file of a bitmap or mesh."""
         plugin, tag = node.props.plugin_name(), self.outline.tag(node, "filename")
-        name = node.props.get("filename", None)
-        if not isinstance(name, str):
-            raise tag.refusal("filename", "nothing", f"a {plugin} reads one file")
+        name = _text(node, "filename")
+        if name is None:
+            got = "no text" if "filename" in node.props else "nothing"
+            raise tag.refusal("filename", got, f"a {plugin} reads one file")
         path = self.files.resource(tag, name)
         try:
             if plugin in _IMAGES:
@@ -222,6 +223,11 @@ class _Tree:
         spectrum = node.props[name]
         limits.WAVELENGTH.check(self.outline.tag(node, name), name, spectrum.wavelengths)
         return list(spectrum.values)
+
+
+def _text(node: mi.parser.SceneNode, name: str) -> str | None:
+    """A property that is text; None when there is none, or an object in its place, which Mitsuba cannot give out."""
+    return node.props[name] if name in node.props and node.props.type(name) == _Type.String else None
 
 
 def _words(node: mi.parser.SceneNode, name: str) -> list[str]:
