@@ -283,6 +283,15 @@ def _not_allowed() -> list[Case]:
             ("filename: got no text",),
         ),
         Case(
+            "transform without a name in a texture",
+            skin(
+                "diffuse",
+                '<texture name="reflectance" type="checkerboard"><transform name=""><scale x="3"/></transform>'
+                "</texture>",
+            ),
+            ("name: got ''",),
+        ),
+        Case(
             "number for the file of a bitmap",
             skin("diffuse", '<texture name="reflectance" type="bitmap"><float name="filename" value="1"/></texture>'),
             ("filename",),

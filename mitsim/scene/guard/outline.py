@@ -150,6 +150,8 @@ class Outline:
                 raise refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
             tag = Tag(path, parser.CurrentLineNumber, name, attributes)
             texts = {key: self._resolved(tag, text) for key, text in attributes.items()}
+            if texts.get("name") == "" and name != "default":
+                raise tag.refusal("name", "''", "give a name; only objects may go without the attribute")
             if not open_tags:
                 _check_root(tag, above)
             elif name not in ("default", "include") and texts.get("name"):
