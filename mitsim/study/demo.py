@@ -135,7 +135,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
         mc_error=shots.manifest.mc_error or 0.0,
         seconds=job.clock.seconds(),
         report=str(report),
-        warnings=shots.warnings + factors.warnings,
+        warnings=evidence.warnings,
     )
 
 
@@ -148,6 +148,11 @@ class _Evidence:
     factors: Factors
     families: Mapping[str, FamilyResult]
     main: str
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the demo is flagged: those of its frames and factors, and an image that is none."""
+        return self.shots.warnings + self.factors.warnings + _no_image(self.families[self.main])
 
 
 def _page(evidence: _Evidence) -> ReportData:
@@ -187,9 +192,17 @@ def _page(evidence: _Evidence) -> ReportData:
             "PSNR has peak 1 and no gain or offset fit; truth is apparent reflectance relative to the board.",
             "Idealised: the paper's model with its own exact factors and the same sensor noise.",
             "lambda is chosen by an unbiased risk estimate; no result has seen the truth.",
-            *shots.warnings,
-            *factors.warnings,
+            *evidence.warnings,
         ),
+    )
+
+
+def _no_image(family: FamilyResult) -> tuple[str, ...]:
+    if family.rendered is None or family.rendered.quality.is_image:
+        return ()
+    return (
+        f"{family.label}: the rms error is above the whole range of reflectance ({family.rendered.quality.psnr_db:.1f} "
+        "dB), so this is no image of the scene; the solver assumes a flat, matt print",
     )
 
 

@@ -29,6 +29,11 @@ class Quality:
     psnr_db: float
     ssim: float | None
 
+    @property
+    def is_image(self) -> bool:
+        """Whether the rms error is below the whole range of reflectance, 0 dB; a gain over a worse image is none."""
+        return self.psnr_db > 0
+
     @classmethod
     def of(cls, image: Image, truth: Image) -> Quality:
         """That of ``image`` (rows, columns) beside ``truth``; MitsimError as :func:`psnr`."""

@@ -107,7 +107,7 @@ class ReportData:
 
 def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
     """Headline and detail from the rendered results of the ``best`` family and of the ``baseline``: "49 dots beat
-    uniform by 11.0 dB", and both PSNRs.
+    uniform by 11.0 dB", and both PSNRs; "no image" where the ``best`` is none.
 
     MitsimError when one of the two has no rendered result.
     """
@@ -120,6 +120,8 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
     name = baseline.label[:1].lower() + baseline.label[1:]
     beat = f"{best.label} beat {name} by {gain:.1f} dB"
     headline = beat if gain >= 0 else f"{best.label}: {-gain:.1f} dB below {name}"
+    if not best.rendered.quality.is_image:
+        headline = f"{best.label}: no image, {ours:.1f} dB"
     detail = f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors."
     if best.idealised is not None and baseline.idealised is not None:
         ideal = best.idealised.quality.psnr_db - baseline.idealised.quality.psnr_db

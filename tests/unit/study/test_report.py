@@ -14,6 +14,7 @@ import pytest
 from mitsim.capture.plan import PlanRow
 from mitsim.core.errors import MitsimError
 from mitsim.study import report as R
+from mitsim.study.demo import _no_image
 from mitsim.study.metrics import Quality
 
 N = 32
@@ -239,6 +240,17 @@ def test_a_loss_is_called_a_loss() -> None:
     families = example().families
     assert R.verdict(families[0], families[3])[0] == "Uniform: 13.1 dB below 49 dots"
     assert R.verdict(families[0], families[0])[0] == "Uniform: 18.7 dB", "nothing to compare with"
+
+
+@pytest.mark.parametrize(("decibel", "headline"), [(-42.0, "49 dots: no image, -42.0 dB"), (0.1, "49 dots beat b by")])
+def test_a_gain_over_nothing_is_no_gain(decibel: float, headline: str) -> None:
+    """A mirror's demo said that 9 dots beat uniform by 23.3 dB, of images at -42 and -65 dB."""
+    ours, theirs = (
+        R.FamilyResult(name, name, 1, rendered=R.Recovery(np.ones((4, 4)), Quality(value, None)))
+        for name, value in (("49 dots", decibel), ("B", -65.3))
+    )
+    assert R.verdict(ours, theirs)[0].startswith(headline)
+    assert bool(_no_image(ours)) == ("no image" in headline)
 
 
 def test_refuses_what_it_cannot_show() -> None:
