@@ -17,7 +17,6 @@ module level; cosmic-ray 8.7 writes into the checkout and has one test command f
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import multiprocessing
 import os
@@ -117,9 +116,12 @@ class Order:
     """Plugin of the run with a mutant: first the tests that run its line, those of fast files before; then those that
     run its module; others cannot see it."""
 
-    def __init__(self, mutant: Mutant, path: Path) -> None:
+    def __init__(self, mutant: Mutant, paths: list[Path]) -> None:
         self.module, self.line = f"{mutant.module}:", f"{mutant.module}:{mutant.line}"
-        self.seconds, self.lines = json.loads(path.read_text())
+        self.seconds, self.lines = dict[str, float](), dict[str, list[str]]()
+        for notes in (json.loads(path.read_text()) for path in paths):
+            self.seconds |= notes[0]
+            self.lines |= notes[1]
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
         first, then = defaultdict[str, list[Any]](list), []
@@ -143,10 +145,10 @@ def file_of(test: str) -> str:
 
 
 def judged(mutant: Mutant | None, tests: Tests, limit_s: float) -> tuple[str, float]:
-    """Verdict on a ``mutant`` (None: the code as it is) by ``tests``, and the seconds that they took."""
-    notes = _copy.parent / f"{hashlib.sha256(' '.join(tests).encode()).hexdigest()}.json"
+    """Verdict on a ``mutant`` (None: the code as it is, by one file) by ``tests``, and the seconds that they took."""
+    notes = [_copy.parent / f"{test.replace('/', '-')}.json" for test in tests]
     if mutant is None:
-        return _verdict(tests, limit_s, Notes(notes))
+        return _verdict(tests, limit_s, Notes(notes[0]))
     path = _copy / "mitsim" / mutant.module
     source, written = path.read_text(encoding="utf-8"), path.stat()
     path.write_text(mutated(source, mutant.place), encoding="utf-8")
@@ -210,13 +212,15 @@ def main() -> int:
         tempfile.TemporaryDirectory(prefix="mutants-") as parent,
         ProcessPoolExecutor(options.jobs, multiprocessing.get_context("fork"), start, (parent,)) as pool,
     ):
-        sets = list(dict.fromkeys(tests for *_, tests in work))
-        bare = dict(zip(sets, pool.map(judged, [None] * len(sets), sets, [3600] * len(sets)), strict=True))
-        for tests, (verdict, _) in bare.items():
+        files = list(dict.fromkeys(test for *_, tests in work for test in tests))
+        bare = pool.map(judged, [None] * len(files), [(file,) for file in files], [3600] * len(files))
+        usual = {}
+        for file, (verdict, seconds) in zip(files, bare, strict=True):
             if verdict != "survived":
-                print(f"tests fail without a mutant: {' '.join(tests)}")
+                print(f"tests fail without a mutant: {file}")
                 return 2
-        tasks = [(mutant, tests, SLOWER * bare[tests][1] + LATER_S) for _, mutant, tests in work]
+            usual[file] = seconds
+        tasks = [(mutant, tests, SLOWER * sum(map(usual.get, tests)) + LATER_S) for _, mutant, tests in work]
         results = []
         for (room, mutant, _), (verdict, seconds) in zip(work, pool.map(judged, *zip(*tasks)), strict=True):  # noqa: B905
             where = f"mitsim/{mutant.module}:{mutant.line}"

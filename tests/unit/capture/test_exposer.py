@@ -6,7 +6,6 @@ The sensor has no ADC and no full well, so a frame's numbers are its electrons, 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,9 +14,7 @@ import pytest
 
 from mitsim.capture import exposer as exposing
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.session import LitSession, Response
 from mitsim.core.arrays import FloatArray
-from mitsim.core.job import Job
 from mitsim.optics.frames import Frame
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.rig import Rig
@@ -114,54 +111,6 @@ def test_an_unsigned_measurement_is_its_frame() -> None:
     frames = [frame(1e-6)] * 4
     for (rate, *_), shot in zip(camera.measurements(family, frames), family.shots, strict=True):
         assert np.array_equal(rate, camera.rate(camera.digital(camera.electrons(frames[0]), *shot.names)))
-
-
-class Played(LitSession):
-    """A session whose noisy frames are given, the uniform one first where it has one."""
-
-    def _exposed(self, side: str, job: Job, first: int) -> Iterator[Response]:
-        yield from (Response(rate, index) for index, rate in enumerate(RATES, start=1))
-
-
-RATES = [np.array([[value, 7.0]]) for value in (100.0, 60.0, 30.0, 90.0)]
-
-
-def played(pairs: bool) -> LitSession:
-    return Played(SimpleNamespace(pairs=pairs), None, frame(1.0), 1.0, 0.0)  # type: ignore[arg-type]
-
-
-def test_a_calibration_pair_is_the_plain_difference_of_its_two_frames() -> None:
-    """(Planted: the -1 frame weighted 0.999.) So what both frames share is gone, to the last bit."""
-    responses = list(played(pairs=True).noisy("horizontal", Job()))
-    assert [response.rate.tolist() for response in responses] == [[[40.0, 0.0]], [[-60.0, 0.0]]]
-    assert [response.saturated for response in responses] == [1 + 2, 3 + 4]
-
-
-def test_a_calibration_with_a_uniform_shot_takes_it_from_twice_the_other() -> None:
-    """2 Y((1 + P)/2) - Y(1) = Y(P): what a +1 and a -1 pixel share is gone. The uniform shot counts once."""
-    responses = list(played(pairs=False).noisy("horizontal", Job()))
-    assert [response.rate.tolist() for response in responses] == [[[20.0, 7.0]], [[-40.0, 7.0]], [[80.0, 7.0]]]
-    assert [response.saturated for response in responses] == [1 + 2, 3, 4]
-    resumed = list(played(pairs=False).noisy("horizontal", Job(), first=1))
-    assert [response.saturated for response in resumed] == [2, 3, 4], "it was counted before"
-
-
-def test_a_noise_free_response_is_that_of_the_signed_pattern() -> None:
-    """Expected frames hold no noise to hide in: light of the +1 pixels less that of the -1 pixels, exactly."""
-    signs = np.array([[1, 1], [1, -1]])
-    pixels = np.array([[3.0, 5.0], [2.0, 11.0]])  # light that each of two stripes casts on two sensor pixels
-
-    class Expected(LitSession):
-        @property
-        def _second(self) -> Exposer:
-            return SimpleNamespace(electrons=lambda light: light)  # type: ignore[return-value]
-
-        def _expected(self, side: str, weights: FloatArray) -> FloatArray:
-            return weights @ pixels
-
-    lit = Expected(SimpleNamespace(signs=signs), None, frame(1.0), 1.0, 0.0)  # type: ignore[arg-type]
-    assert np.array_equal([response.rate for response in lit.noise_free("vertical")], signs.T @ pixels)
-    assert np.array_equal([response.rate for response in lit.noise_free("vertical", 1)], [[1.0, -6.0]])
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
