@@ -194,8 +194,15 @@ def make_plan(
         root of the pilot's random streams.
     switches
         effects that are switched on or off by name, whatever they are worth.
+
+    Raises
+    ------
+    MitsimError
+        for a scene that the factored estimator cannot render.
     """
     check_accuracy(accuracy)
+    if bench.loaded.unfit.factored is not None:
+        raise bench.loaded.unfit.factored
     evidence = pilot.measure(bench, lighting, accuracy, seed)
     return decide(accuracy, evidence, len(lighting.weights), SceneFacts.of(bench), switches)
 
