@@ -202,7 +202,7 @@ def render(
         plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
-        warnings = plan.warnings
+        warnings = light.warnings
         frame = next(iter(light.frames(uniform, seed)))
         mean = frame.irradiance[..., None]
         error = np.full_like(mean, math.sqrt(frame.variance))
