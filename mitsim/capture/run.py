@@ -163,8 +163,9 @@ def capture(
             sensor_noise=shooting.sensor_noise,
             heaviest_group=totals.heaviest,
             paths=light.paths,
+            lost_light=light.lost,
             seconds=job.clock.seconds(),
-            warnings=light.plan.warnings + tuple(_warnings(light, totals, shooting)),
+            warnings=light.warnings + tuple(_warnings(light, totals, shooting)),
             versions=versions(),
         )
         return recorder.finish(manifest)

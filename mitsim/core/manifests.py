@@ -229,6 +229,9 @@ class RunManifest(RunHead):
         "heavy paths make it",
     )
     paths: int | None = Field(default=None, description="connections and paths traced")
+    lost_light: float | None = Field(
+        default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"
+    )
     seconds: dict[str, float] = Field(default={}, description="by stage")
 
 
