@@ -61,6 +61,7 @@ def test_it_stops_when_asked_and_says_whether_that_was_enough() -> None:
     short = solve_tv(prepared, sums, 0.3, iterations=2, tolerance=1e-9)
     assert not short.ok and short.iterations == 2 and short.status.verdict is Verdict.NOT_CONVERGED
     assert f"after 2 iterations the image still changes by {short.change:.1e}" in str(short.status)
+    assert np.isfinite(solve_tv(prepared, sums, 0.3, iterations=1).change), "one step is one step"
     full = solve_tv(prepared, sums, 0.3, iterations=500, tolerance=1e-4)
     assert full.ok and 2 < full.iterations < 500 and full.change < 1e-4 and full.status.verdict is Verdict.SOLVED
     assert solve_tv(prepared, sums, 0.3, iterations=full.iterations, tolerance=1e-4).ok
