@@ -300,7 +300,7 @@ def reconstruct(
     if result.quality is not None:
         lines.append(str(result.quality))
     lines.append(
-        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition']:.3g}, "
+        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
         f"residual {payload['residual']:.1e}: {payload['output']}"
     )
     return _finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))

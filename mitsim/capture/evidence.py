@@ -35,6 +35,9 @@ class Settings:
     coarse_cells, coarse_layers
         cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
         they have all layers or one.
+    reach
+        largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None: no more
+        than of light at ``depth``.
     """
 
     depth: float
@@ -48,6 +51,7 @@ class Settings:
     from_camera_samples: float = 1.0
     coarse_cells: int = 1
     coarse_layers: bool = False
+    reach: float | None = None
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -117,6 +121,8 @@ class Evidence:
         terms of the shadow, wave-optical over geometric.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
+    reach
+        as :attr:`Settings.reach`.
     """
 
     depth: float
@@ -133,6 +139,7 @@ class Evidence:
     seconds_per_frame: float
     terms: float
     unresolved: float = 0.0
+    reach: float | None = None
 
     def connecting(self, settings: Settings, anchors: int) -> float:
         """Seconds of direct light in the samples of ``settings``, and of its differences between ``anchors`` a side."""

@@ -43,6 +43,9 @@ _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 what direct light brings), direct light's with their 0.8th power or faster."""
 _VIEW_SAMPLES = 64
 """Samples a cell of a picture to look at: below the step of eight bits."""
+_LOST = 0.1
+"""Part of the accuracy that light beyond all cells may have: it falls on one edge of the sensor, so a hundredth of the
+pixels may have it, and their frames are then off by ten times as much."""
 _LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 
@@ -103,6 +106,22 @@ class Light:
 
     def __repr__(self) -> str:
         return f"Light({self.paths:.2g} paths, relative error {self.sampling_error:.1e}, of {self.bench!r})"
+
+    @property
+    def lost(self) -> float:
+        """Part of the light that came from beyond all cells and is in no frame."""
+        return reduce(add, self.groups).lost
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why what is made of it is flagged: by its plan, and for light that is known to be missing."""
+        if self.lost <= _LOST * self.plan.accuracy:
+            return self.plan.warnings
+        return (
+            *self.plan.warnings,
+            f"{self.lost:.1e} of the light comes from beyond the directions that the plan holds, and is in no frame: "
+            "surfaces nearer than its pilot saw, at the edge of the view; widen the projector's window or move them",
+        )
 
     @property
     def bench(self) -> Bench:
@@ -181,8 +200,15 @@ def make_plan(
         root of the pilot's random streams.
     switches
         effects that are switched on or off by name, whatever they are worth.
+
+    Raises
+    ------
+    MitsimError
+        for a scene that the factored estimator cannot render.
     """
     check_accuracy(accuracy)
+    if bench.loaded.unfit.factored is not None:
+        raise bench.loaded.unfit.factored
     evidence = pilot.measure(bench, lighting, accuracy, seed)
     return decide(accuracy, evidence, len(lighting.weights), SceneFacts.of(bench), switches)
 

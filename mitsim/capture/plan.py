@@ -226,6 +226,7 @@ def decide(
         layers=evidence.layers[layers] if layers > 1 else (),
         subdivision=cells,
         effects=on,
+        reach=evidence.reach,
     )
     coarse = _coarse(evidence, settings, accuracy)
     settings = replace(settings, coarse_cells=coarse.cells, coarse_layers=coarse.layers)

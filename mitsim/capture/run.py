@@ -164,8 +164,9 @@ def capture(
             heaviest_group=totals.heaviest,
             truth_error=truth.error,
             paths=light.paths,
+            lost_light=light.lost,
             seconds=job.clock.seconds(),
-            warnings=light.plan.warnings + tuple(_warnings(light, totals, shooting)),
+            warnings=light.warnings + tuple(_warnings(light, totals, shooting)),
             versions=versions(),
         )
         return recorder.finish(manifest)

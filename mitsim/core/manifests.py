@@ -232,6 +232,9 @@ class RunManifest(RunHead):
         default=None, description="standard error of truth.exr, rms over the image; 1 is the board's reflectance"
     )
     paths: int | None = Field(default=None, description="connections and paths traced")
+    lost_light: float | None = Field(
+        default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"
+    )
     seconds: dict[str, float] = Field(default={}, description="by stage")
 
 

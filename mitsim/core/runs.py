@@ -161,6 +161,7 @@ class Capture:
             "sensor_noise",
             "heaviest_group",
             "truth_error",
+            "lost_light",
             "seconds",
             "warnings",
         )

@@ -40,8 +40,12 @@ class Reconstruction:
         (n, n') reflectance, 1 = the calibration's board, neither clipped nor normalised.
     lam
         lambda that was used, in the unit of (Phi_L Phi_R)^2; for ``tv`` the weight of the total variation.
-    rank, condition
-        of the whole model.
+    rank
+        of the whole model, the product of ``rank_sides``.
+    condition
+        the larger of ``condition_sides``; that of the whole model is their product, ``condition_whole``.
+    rank_sides, condition_sides
+        of scene rows and of scene columns.
     residual
         ||Y - model|| / ||Y|| over all frames.
     rounding
@@ -58,6 +62,8 @@ class Reconstruction:
     lam: float
     rank: int
     condition: float
+    rank_sides: tuple[int, int]
+    condition_sides: tuple[float, float]
     residual: float
     rounding: float | None
     status: Status
@@ -69,12 +75,20 @@ class Reconstruction:
         """Whether the image can be used as it is."""
         return self.status.ok
 
+    @property
+    def condition_whole(self) -> float:
+        """Condition of the whole model; inf when rank deficient."""
+        return self.condition_sides[0] * self.condition_sides[1]
+
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
         return {
             "lambda": self.lam,
             "rank": self.rank,
+            "rank_sides": self.rank_sides,
             "condition": self.condition,
+            "condition_whole": self.condition_whole,
+            "condition_sides": self.condition_sides,
             "residual": self.residual,
             "status": str(self.status),
             "seconds": {**self.seconds, "total": sum(self.seconds.values())},
@@ -155,6 +169,8 @@ def reconstruct(
         lam=solution.lam,
         rank=prepared.rank,
         condition=prepared.condition,
+        rank_sides=(prepared.left.rank, prepared.right.rank),
+        condition_sides=(prepared.left.condition, prepared.right.condition),
         residual=solution.residual,
         rounding=getattr(solution, "rounding", None),
         status=replace(solution.status, flags=_flags(shots, factors)),

@@ -13,6 +13,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Evidence, Settings
 from mitsim.capture.pilot.direct import AnchoredLight, FineLight
 from mitsim.capture.pilot.halves import Sample
+from mitsim.capture.pilot.reach import light_reach
 from mitsim.capture.pilot.switched import SwitchedEffects
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
@@ -56,7 +57,8 @@ def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evi
     first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_look))
     sharp = _sharp(first, seed)
     depth, light = _depth(first, seed, sharp)
-    base = Settings(depth=depth, effects=first_look)
+    reach = light_reach(Simulation(bench, Settings(depth=depth, effects=first_look)), integer(seed, "pilot", "reach"))
+    base = Settings(depth=depth, effects=first_look, reach=reach)
     fine = FineLight(bench, base, sample, accuracy, seed)
     layers = fine.layers()
     layer_error, cell_error = fine.layer_errors(layers), fine.cell_errors()
@@ -77,6 +79,7 @@ def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evi
         seconds_per_frame=fine.seconds_per_frame,
         terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
         unresolved=sharp.irradiance / (light + sharp.irradiance) if sharp.hits * sample.fine < _FEWEST_HITS else 0.0,
+        reach=reach,
     )
 
 
