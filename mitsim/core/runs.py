@@ -149,7 +149,16 @@ class Capture:
     def summary(self) -> dict[str, Any]:
         """What the command line reports; fields of a real camera's capture that nobody knows are None."""
         manifest = self.manifest
-        known = ("mc_error", "mc_to_sensor_noise", "sensor_noise", "heaviest_group", "seconds", "warnings")
+        known = (
+            "mc_error",
+            "total_error",
+            "total_error_bound",
+            "mc_to_sensor_noise",
+            "sensor_noise",
+            "heaviest_group",
+            "seconds",
+            "warnings",
+        )
         return {
             "frames": len(manifest.patterns.captures),
             "shape": self._channel(manifest.patterns.captures[0].file, "DN").shape,
