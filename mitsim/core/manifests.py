@@ -219,6 +219,11 @@ class RunManifest(RunHead):
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
     plan: Plain | None = Field(default=None, description="the effect plan, see Plan")
     mc_error: float | None = Field(default=None, description="relative Monte Carlo error of the expected frames")
+    total_error: float | None = Field(
+        default=None,
+        description="relative error of the expected frames, all in all: the plan's systematic error and that",
+    )
+    total_error_bound: float | None = Field(default=None, description="what it is below, at 95 %")
     mc_to_sensor_noise: float | None = Field(
         default=None, description="largest ratio of that to a frame's sensor noise"
     )

@@ -157,6 +157,8 @@ class Capture:
         manifest = self.manifest
         known = (
             "mc_error",
+            "total_error",
+            "total_error_bound",
             "mc_to_sensor_noise",
             "sensor_noise",
             "heaviest_group",
