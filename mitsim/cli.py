@@ -297,8 +297,8 @@ def reconstruct(
     )
     payload = result.summary()
     lines = [payload["status"]]
-    if payload["psnr"] is not None:
-        lines.append(f"PSNR {payload['psnr']:.2f} dB, SSIM {payload['ssim']:.3f}")
+    if result.quality is not None:
+        lines.append(str(result.quality))
     lines.append(
         f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
         f"residual {payload['residual']:.1e}: {payload['output']}"

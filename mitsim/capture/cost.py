@@ -16,7 +16,7 @@ _DEPOSIT_BYTES = 36.0
 _SECONDS_PER_PIXEL = 9e-8
 """Exposing and writing; measured on two cores."""
 _BYTES_PER_PIXEL = 8
-"""Digital number and expected electrons, uncompressed."""
+"""Two channels, uncompressed: digital number and expected electrons; truth and its standard error."""
 _BYTES_PER_ROW, _HEADER_BYTES = 16, 2000
 """Of an OpenEXR file."""
 
@@ -43,7 +43,7 @@ def frames_cost(
     rows = bench.geometry.pixels
     pixels = rows**2
     files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
-    truth = 4.0 * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES
+    truth = float(_BYTES_PER_PIXEL * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES)
     held = frames_in_memory(classes, shots) + 4 * FRAMES_AT_ONCE
     places = bench.n**2 * (2 * settings.subdivision**2 + (settings.anchors**2 + 1) * settings.coarse_cells**2)
     return Cost(

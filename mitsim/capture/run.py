@@ -139,7 +139,7 @@ def capture(
         with job.clock.stage("transport"):
             light = light or trace_light(bench, plan, lighting, request.seed, _sampling(bench, request), job.progress)
         with job.clock.stage("truth"):
-            truth = light.truth
+            truth = light.apparent
         expected = light.frames(lighting, request.seed)
         with job.clock.stage("optics"):
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
@@ -148,7 +148,7 @@ def capture(
         exposer = Exposer(bench.rig, exposure_s, request.seed, light.simulation.physics.speckle)
         digital = digital_scale(bench, exposure_s)
         recorder.begin()
-        recorder.write_truth(truth, load_recipe().board_reflectance)
+        recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
         shooting = _Shooting(family, recorder, exposer)
         shooting.shoot(expected, job)
         manifest = RunManifest(
@@ -162,6 +162,7 @@ def capture(
             mc_to_sensor_noise=shooting.noise_ratio,
             sensor_noise=shooting.sensor_noise,
             heaviest_group=totals.heaviest,
+            truth_error=truth.error,
             paths=light.paths,
             lost_light=light.lost,
             seconds=job.clock.seconds(),

@@ -228,6 +228,9 @@ class RunManifest(RunHead):
         description="largest part of the Monte Carlo variance in one of 8 groups of the light; above 0.8 a few "
         "heavy paths make it",
     )
+    truth_error: float | None = Field(
+        default=None, description="standard error of truth.exr, rms over the image; 1 is the board's reflectance"
+    )
     paths: int | None = Field(default=None, description="connections and paths traced")
     lost_light: float | None = Field(
         default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"
