@@ -306,11 +306,17 @@ class _Shooting:
 
 def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
+    sensor = bench.sensor
+    full = sensor.superpixel_full_well_e * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn
+    largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
     return DigitalScale(
         exposure_s=exposure_s,
-        black_level_dn=bench.sensor.superpixel_black_level_dn,
-        gain_dn_per_e=bench.sensor.gain_dn_per_e,
-        dark_current_e_per_s=bench.sensor.superpixel_dark_current_e_per_s,
+        black_level_dn=sensor.superpixel_black_level_dn,
+        gain_dn_per_e=sensor.gain_dn_per_e,
+        dark_current_e_per_s=sensor.superpixel_dark_current_e_per_s,
+        read_noise_e=sensor.superpixel_read_noise_e,
+        step_dn=0.0 if sensor.largest_dn is None else 1.0,
+        saturation_dn=None if math.isinf(min(full, largest)) else float(min(np.floor(full), largest)),
     )
 
 
