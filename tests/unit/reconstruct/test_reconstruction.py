@@ -87,7 +87,7 @@ def test_the_memory_that_is_asked_for_holds_the_factorised_model(
     """At least what the slabs and bases take, at most thirty times as much (of so few numbers)."""
     asked: list[float] = []
     monkeypatch.setattr(Cost, "check", lambda self, *_: asked.append(self.memory_bytes))
-    prepared, _ = accumulated(shots, factors)
+    prepared = accumulated(shots, factors).prepared
     sides = prepared.left, prepared.right
     held = sum(side.basis.nbytes + sum(slab.matrix.nbytes for slab in side.slabs) for side in sides)
     assert len(asked) == 1 and held <= asked[0] <= 30 * held
