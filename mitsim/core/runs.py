@@ -11,6 +11,7 @@ import shutil
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, rea
 from mitsim.core.output import output_folder, sweep
 from mitsim.core.pictures import card, scaled, span
 
-TRUTH = "truth.exr"
+TRUTH, AMBIENT = "truth.exr", "ambient.exr"
 Channels = Mapping[str, Channel]
 Metadata = Mapping[str, Value]
 _SHOWN = 3
@@ -34,6 +35,26 @@ _SHOWN = 3
 def frame_name(index: int) -> str:
     """File name of shot number ``index`` in its run folder."""
     return f"frame_{index:05d}.exr"
+
+
+@dataclass(frozen=True, eq=False)
+class Ambient:
+    """What a camera sees with the projector off, as it is taken off every frame of a run.
+
+    Attributes
+    ----------
+    rate
+        (rows, columns) mean over the shots [electrons/s].
+    variance
+        (rows, columns) of that mean [(electrons/s)^2]; its noise is the same in all frames. None where nobody stated
+        it.
+    shots
+        that were averaged.
+    """
+
+    rate: FloatArray
+    variance: FloatArray | None
+    shots: int
 
 
 class Capture:
@@ -117,14 +138,25 @@ class Capture:
         return self.manifest.warnings
 
     @cached_property
+    def ambient(self) -> Ambient | None:
+        """What is taken off every frame but those of signed pairs; None where no ambient frame was taken."""
+        if self.manifest.ambient_frame is None:
+            return None
+        name, digital = self.manifest.ambient_frame.file, self.manifest.digital
+        known = "variance" in self._read(name)[0]
+        unit = (digital.gain_dn_per_e * digital.exposure_s) ** 2
+        variance = self._channel(name, "variance") / unit if known else None
+        return Ambient(digital.rate(self._channel(name, "DN")), variance, self.manifest.ambient_frame.shots)
+
+    @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
         """P_L (n, K) and P_R (n', K')."""
         return self.manifest.patterns.matrices
 
     def measurements(self, shape: tuple[int, int] | None = None) -> Iterator[tuple[FloatArray, int, int]]:
         """(frame (rows, columns) [electrons/s], i, j) of every pattern, read one at a time; the halves of a signed one
-        come as their difference. MitsimError for a frame that is missing, damaged, not finite or of another ``shape``
-        than is asked for."""
+        come as their difference, others without the ambient frame, if one was taken. MitsimError for a frame that is
+        missing, damaged, not finite or of another ``shape`` than is asked for."""
         waiting: dict[tuple[int, int], FloatArray] = {}
         for shot in self.manifest.patterns.captures:
             index = (shot.row, shot.column)
@@ -135,10 +167,20 @@ class Capture:
                     f"{_size(shape or ())}; calibrate this camera"
                 )
             frame = self.manifest.digital.rate(dn) * (shot.sign or 1)
+            if self.ambient is not None and not shot.sign:
+                frame -= self._fitting(self.ambient.rate, frame.shape)
             if shot.sign and index not in waiting:
                 waiting[index] = frame
                 continue
             yield waiting.pop(index, 0.0) + frame, *index
+
+    def _fitting(self, ambient: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+        if ambient.shape != shape:
+            raise MitsimError(
+                f"{self.name}: the ambient frame is {_size(ambient.shape)}, but the frames are {_size(shape)}; take it "
+                "with the same camera"
+            )
+        return ambient
 
     @cached_property
     def fingerprint(self) -> str:
@@ -146,10 +188,14 @@ class Capture:
         manifest = self.manifest
         digest = hashlib.sha256(manifest.digital.model_dump_json().encode())
         digest.update(manifest.patterns.model_dump_json().encode() + manifest.configuration_sha256.encode())
-        for shot in manifest.patterns.captures:
-            if self.folder and not (manifest.configuration_sha256 and shot.file in manifest.checksums):
-                verify(self.folder, shot.file, {}, "")  # no link out of it
-                digest.update(checksum(self.folder / shot.file).encode())
+        files = [shot.file for shot in manifest.patterns.captures]
+        if manifest.ambient_frame is not None:
+            digest.update(manifest.ambient_frame.model_dump_json().encode())
+            files.append(manifest.ambient_frame.file)
+        for file in files:
+            if self.folder and not (manifest.configuration_sha256 and file in manifest.checksums):
+                verify(self.folder, file, {}, "")  # no link out of it
+                digest.update(checksum(self.folder / file).encode())
         return digest.hexdigest()
 
     def summary(self) -> dict[str, Any]:
@@ -172,6 +218,7 @@ class Capture:
             "seed": manifest.configuration.get("seed"),
             "output": None if self.folder is None else str(self.folder),
             "exposure_s": self.exposure_s,
+            "ambient_frame": None if manifest.ambient_frame is None else manifest.ambient_frame.model_dump(),
             **{name: getattr(manifest, name) for name in known},
         }
 
@@ -182,15 +229,18 @@ class Capture:
         """
         with claimed(Path(folder), self.manifest, resume=False) as run:
             if self.folder is not None:
-                for name in (*(shot.file for shot in self.manifest.patterns.captures), TRUTH, MANIFEST):
+                ambient = self.manifest.ambient_frame
+                also = () if ambient is None else (ambient.file,)
+                for name in (*(shot.file for shot in self.manifest.patterns.captures), *also, TRUTH, MANIFEST):
                     if (self.folder / name).is_file():
                         shutil.copyfile(self.folder / name, run.path / name)
             else:
                 run.begin()
                 for index, shot in enumerate(self.manifest.patterns.captures):
                     run.write_frame(index, *self._memory[shot.file])
-                if TRUTH in self._memory:
-                    run.write(TRUTH, *self._memory[TRUTH])
+                for name in (TRUTH, AMBIENT):
+                    if name in self._memory:
+                        run.write(name, *self._memory[name])
                 run.finish(self.manifest)
         return run.path
 
@@ -316,6 +366,18 @@ class RunMemory:
             of its file, (rows, columns) each.
         """
         self._files[frame_name(index)] = channels, metadata
+
+    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        """Keep a file of the run.
+
+        Parameters
+        ----------
+        name
+            of the file.
+        channels, metadata
+            of it, (rows, columns) each.
+        """
+        self._files[name] = channels, metadata
 
     def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
         """Keep the truth.

@@ -82,7 +82,7 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     options = "--json", "--quiet", "--variant", "llvm_ad_mono", "-o", tmp_path / "image"
     found = call("reconstruct", lab.run, "--calibration", lab.calibration, *options).payload
     keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "seconds", "output"}
-    assert found.keys() == keys | {"rank_sides", "condition_whole", "condition_sides"}
+    assert found.keys() == keys | {"truth_error", "rank_sides", "condition_whole", "condition_sides"}
     assert found["rank_sides"] == [16, 16] and found["condition"] == max(found["condition_sides"])
     assert found["condition_whole"] == pytest.approx(np.prod(found["condition_sides"]))
     assert number(found["psnr"], 20, 100) and number(found["ssim"], 0.5, 1)
