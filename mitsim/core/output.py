@@ -143,7 +143,7 @@ def _unfinished(folder: Path) -> str:
         return ""
     if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
         return ""
-    frames = len(list(folder.glob("*.exr"))) - (folder / "truth.exr").is_file()
+    frames = len(list(folder.glob("frame_*.exr")))
     return f": an unfinished {manifest.get('kind')} with {frames} finished frames; go on with resume=True"
 
 
