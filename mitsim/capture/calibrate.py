@@ -71,7 +71,7 @@ def calibrate(
         noisy, saturated = estimate(lit, job, checkpoint=checkpoint)
         with job.clock.stage("noise-free check"):
             clean, _ = estimate(lit, job, noise_free=True, checkpoint=checkpoint)
-        warnings = plan.warnings + (() if noisy.ok else (str(noisy.status),))
+        warnings = lit.light.warnings + (() if noisy.ok else (str(noisy.status),))
         if saturated:
             warnings += (
                 f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "
@@ -172,18 +172,22 @@ def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> Li
             for name in _TRAYS
         }
         return Light(
-            groups=(FiledLight(**trays),),
+            groups=(FiledLight(**trays, outside=float(arrays["outside"])),),
             simulation=Simulation(session.board, plan.settings),
             plan=plan,
             seed=session.seed,
             labels=arrays["labels"],
             flux=arrays["flux"],
+            flux_error=arrays["flux_error"],
             paths=int(arrays["paths"]),
             sampling_error=float(arrays["sampling_error"]),
             reached=bool(arrays["reached"]),
         )
     light = session.trace(plan, job)
-    facts = {name: getattr(light, name) for name in ("labels", "flux", "paths", "sampling_error", "reached")}
+    facts = {
+        name: getattr(light, name) for name in ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
+    }
+    facts["outside"] = light.groups[0].outside
     for name in _TRAYS:
         matrix = getattr(light.groups[0], name)
         facts |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}

@@ -112,10 +112,13 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     Raises
     ------
     MitsimError
-        for too few or too many samples, an integrator that cannot render this sensor, or work beyond the job's limits.
+        for too few or too many samples, an integrator that cannot render this sensor or would lose light of this scene,
+        or work beyond the job's limits.
     """
     import mitsuba as mi
 
+    if loaded.unfit.reference is not None:
+        raise loaded.unfit.reference
     if not _FEWEST_PASSES <= spp <= _MOST_SAMPLES:
         raise ArgumentError("spp", f"{spp}: give at least {_FEWEST_PASSES} samples a pixel, at most {_MOST_SAMPLES}")
     job = job or Job()
@@ -199,7 +202,7 @@ def render(
         plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
-        warnings = plan.warnings
+        warnings = light.warnings
         frame = next(iter(light.frames(uniform, seed)))
         mean = frame.irradiance[..., None]
         error = np.full_like(mean, math.sqrt(frame.variance))

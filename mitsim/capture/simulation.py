@@ -8,7 +8,7 @@ samples the choice that the plan made.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,18 +39,26 @@ class FiledLight:
     """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
 
     ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees beyond
-    that, and ``smooth`` is indirect light: small or smooth, so coarse cells hold them well.
+    that, and ``smooth`` is indirect light: small or smooth, so coarse cells hold them well. ``outside`` is light that
+    came from beyond all cells, a mean over the sensor without its mask: it is in no frame.
     """
 
     fine: sparse.csr_array
     coarse: sparse.csr_array
     smooth: sparse.csr_array
+    outside: float = 0.0
 
     def __add__(self, other: FiledLight) -> FiledLight:
-        return FiledLight(self.fine + other.fine, self.coarse + other.coarse, self.smooth + other.smooth)
+        return FiledLight(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
 
     def __truediv__(self, count: float) -> FiledLight:
-        return FiledLight(self.fine / count, self.coarse / count, self.smooth / count)
+        return FiledLight(*(getattr(self, field.name) / count for field in fields(self)))
+
+    @property
+    def lost(self) -> float:
+        """Part of the light that is in no frame."""
+        filed = float(self.fine.sum() + self.smooth.sum())
+        return self.outside / (filed + self.outside) if self.outside else 0.0
 
 
 @dataclass(frozen=True)
@@ -125,10 +133,11 @@ class Simulation:
         self.bench, self.settings = bench, settings
         self.physics = Physics.simulated(bench, settings.effects)
         pixels = pixels or bench.n
-        self.aim = self._grid(pixels, 1)
-        fine = Bundle(self._grid(pixels, settings.subdivision), 1, settings.depths)
+        # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
+        self.aim = self._grid(pixels, 1, None)
+        fine = Bundle(self._grid(pixels, settings.subdivision, settings.reach), 1, settings.depths)
         depths = settings.depths if settings.coarse_layers else (settings.depth,)
-        coarse = self._grid(pixels, settings.coarse_cells)
+        coarse = self._grid(pixels, settings.coarse_cells, settings.reach)
         self.fine = self._tray(fine)
         self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
         self.smooth = self._tray(Bundle(coarse, 1, depths))
@@ -139,19 +148,28 @@ class Simulation:
         spectrum = self.physics.spectrum
         return Tray(bundle, self.physics.geometry, (light or spectrum) if spectrum else None)
 
-    def _grid(self, pixels: int, subdivision: int) -> CellGrid:
-        """Cells as far as the sensor's edge sees through the field stop: directions are those from its centre.
+    @property
+    def reach(self) -> float:
+        """Largest tan-angle, from the sensor's centre, of what its edge sees at the light's depth."""
+        return self.physics.geometry.reach(self.settings.depth)
+
+    def _grid(self, pixels: int, subdivision: int, reach: float | None) -> CellGrid:
+        """Cells as far as the sensor's edge sees through the field stop, or to ``reach`` if that is farther.
 
         The same for any number of anchors and layers, so that their light can be compared.
         """
-        geometry, depth = self.physics.geometry, self.settings.depth
-        reach = geometry.tan_half_fov + geometry.half_width / depth
+        depth, reach = self.settings.depth, max(self.reach, reach or 0.0)
         return aligned_grid(*self.bench.windows_at(depth), pixels, subdivision, reach)
 
     @cached_property
     def direct(self) -> DirectTracer:
         """Follows direct light from the projector to the sensor's centre, or to all of it where anchors are used."""
         return self._direct(1, self.settings.anchors > 1)
+
+    @property
+    def spread(self) -> DirectTracer:
+        """Follows direct light to random points of the sensor."""
+        return self._direct(1, True)
 
     @cached_property
     def anchored(self) -> DirectTracer | None:
@@ -200,7 +218,8 @@ class Simulation:
         deposits, labels, samples
             as for :meth:`Tray.file`.
         """
-        return self._light(fine=self.fine.file(deposits, labels, samples))
+        light = self._light(fine=self.fine.file(deposits, labels, samples))
+        return replace(light, outside=self.fine.bundle.outside(deposits) / samples)
 
     def file_anchored(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`anchored` beyond its mean over the sensor, per sample.
@@ -224,7 +243,8 @@ class Simulation:
         """
         indirect = deposits.kind == INDIRECT
         fine = self.fine.file(deposits.where(~indirect), labels, samples)
-        return self._light(fine=fine, smooth=self.smooth.file(deposits.where(indirect), labels, samples))
+        light = self._light(fine=fine, smooth=self.smooth.file(deposits.where(indirect), labels, samples))
+        return replace(light, outside=self.fine.bundle.outside(deposits) / samples)
 
     def _light(self, **parts: sparse.csr_array) -> FiledLight:
         rows = next(iter(parts.values())).shape[0]

@@ -252,6 +252,11 @@ class RunManifest(RunHead):
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
     plan: Plain | None = Field(default=None, description="the effect plan, see Plan")
     mc_error: float | None = Field(default=None, description="relative Monte Carlo error of the expected frames")
+    total_error: float | None = Field(
+        default=None,
+        description="relative error of the expected frames, all in all: the plan's systematic error and that",
+    )
+    total_error_bound: float | None = Field(default=None, description="what it is below, at 95 %")
     mc_to_sensor_noise: float | None = Field(
         default=None, description="largest ratio of that to a frame's sensor noise"
     )
@@ -261,7 +266,13 @@ class RunManifest(RunHead):
         description="largest part of the Monte Carlo variance in one of 8 groups of the light; above 0.8 a few "
         "heavy paths make it",
     )
+    truth_error: float | None = Field(
+        default=None, description="standard error of truth.exr, rms over the image; 1 is the board's reflectance"
+    )
     paths: int | None = Field(default=None, description="connections and paths traced")
+    lost_light: float | None = Field(
+        default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"
+    )
     seconds: dict[str, float] = Field(default={}, description="by stage")
 
 

@@ -127,6 +127,12 @@ class Capture:
         known = TRUTH in self._memory if self.folder is None else (self.folder / TRUTH).is_file()
         return self._channel(TRUTH, "reflectance") if known else None
 
+    @cached_property
+    def truth_standard_error(self) -> FloatArray | None:
+        """(n, n) standard error of :attr:`truth`, from sampling; None where nobody stated it, as in 0.4.0."""
+        known = self.truth is not None and "standard_error" in self._read(TRUTH)[0]
+        return self._channel(TRUTH, "standard_error") if known else None
+
     @property
     def truth_board(self) -> float | None:
         """Reflectance of the board that counts as 1 in :attr:`truth`, where that is known."""
@@ -196,7 +202,18 @@ class Capture:
     def summary(self) -> dict[str, Any]:
         """What the command line reports; fields of a real camera's capture that nobody knows are None."""
         manifest = self.manifest
-        known = ("mc_error", "mc_to_sensor_noise", "sensor_noise", "heaviest_group", "seconds", "warnings")
+        known = (
+            "mc_error",
+            "total_error",
+            "total_error_bound",
+            "mc_to_sensor_noise",
+            "sensor_noise",
+            "heaviest_group",
+            "truth_error",
+            "lost_light",
+            "seconds",
+            "warnings",
+        )
         return {
             "frames": len(manifest.patterns.captures),
             "shape": self._channel(manifest.patterns.captures[0].file, "DN").shape,
@@ -349,9 +366,17 @@ class RunMemory:
         """
         self._files[frame_name(index)] = channels, metadata
 
-    def write_truth(self, reflectance: FloatArray, board: float) -> None:
-        """Keep the truth ``reflectance`` (n, n), relative to a ``board`` of that reflectance."""
-        self._files[TRUTH] = _truth(reflectance, board)
+    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
+        """Keep the truth.
+
+        Parameters
+        ----------
+        reflectance, board
+            (n, n), relative to a board of that reflectance.
+        standard_error
+            (n, n) of it, where known.
+        """
+        self._files[TRUTH] = _truth(reflectance, board, standard_error)
 
     def finish(self, manifest: RunManifest) -> Capture:
         """The capture of that ``manifest``."""
@@ -409,9 +434,17 @@ class RunFolder:
         """
         self.write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
 
-    def write_truth(self, reflectance: FloatArray, board: float) -> None:
-        """Write the truth ``reflectance`` (n, n), relative to a ``board`` of that reflectance."""
-        self.write(TRUTH, *_truth(reflectance, board))
+    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
+        """Write the truth.
+
+        Parameters
+        ----------
+        reflectance, board
+            (n, n), relative to a board of that reflectance.
+        standard_error
+            (n, n) of it, where known.
+        """
+        self.write(TRUTH, *_truth(reflectance, board, standard_error))
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
         """Write a file of the run.
@@ -449,8 +482,13 @@ class RunFolder:
         return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": _pixels(channels)}
 
 
-def _truth(reflectance: FloatArray, board: float) -> tuple[Channels, Metadata]:
-    return {"reflectance": reflectance.astype(np.float32)}, {"board_reflectance": board}
+def _truth(
+    reflectance: FloatArray, board: float, standard_error: FloatArray | None
+) -> tuple[dict[str, Channel], Metadata]:
+    channels: dict[str, Channel] = {"reflectance": reflectance.astype(np.float32)}
+    if standard_error is not None:
+        channels["standard_error"] = standard_error.astype(np.float32)
+    return channels, {"board_reflectance": board}
 
 
 def _size(shape: tuple[int, ...]) -> str:

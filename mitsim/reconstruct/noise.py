@@ -19,8 +19,8 @@ class FrameNoise:
     ----------
     manifest
         of the run.
-    dark_variance
-        mean noise variance of a pixel of the dark frame that was taken off every shot [(electrons/s)^2]: one draw,
+    ambient_variance
+        mean noise variance of a pixel of the ambient frame that was taken off every shot [(electrons/s)^2]: one draw,
         common to all; 0 without one.
 
     Attributes
@@ -34,9 +34,9 @@ class FrameNoise:
 
     """
 
-    def __init__(self, manifest: RunManifest, dark_variance: float = 0.0) -> None:
+    def __init__(self, manifest: RunManifest, ambient_variance: float = 0.0) -> None:
         self._digital = manifest.digital
-        self.dark_variance = dark_variance
+        self.ambient_variance = ambient_variance
         self._rendering = np.hypot(manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error"))
         counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
         self.variance: FloatArray = np.zeros(counts)
@@ -60,8 +60,8 @@ class FrameNoise:
         light, shots
             sum of its shots [electrons/s], any shape, and their number.
         """
-        dark = self.dark_variance if shots == 1 else 0.0  # the difference of a pair has no dark frame
-        return np.maximum(self._digital.variance(light, shots) + dark, 0.0)
+        ambient = self.ambient_variance if shots == 1 else 0.0  # the difference of a pair has no ambient frame
+        return np.maximum(self._digital.variance(light, shots) + ambient, 0.0)
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""

@@ -75,6 +75,10 @@ class CameraGeometry(BaseModel):
         """Largest |x/z| and |y/z| of a ray that passes the field stop."""
         return math.tan(math.radians(self.fov) / 2)
 
+    def reach(self, depth: float) -> float:
+        """Largest tan-angle, from the sensor's centre, of what its edge sees at ``depth`` [mm]."""
+        return self.tan_half_fov + self.half_width / depth
+
     @property
     def pixel_edges(self) -> FloatArray:
         """(pixels + 1,) pixel edges [mm]."""

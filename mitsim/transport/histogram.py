@@ -176,7 +176,7 @@ class Bundle:
         return len(self.depths) * self.anchors**2 * self.cells[0] * self.cells[1]
 
     def file(self, deposits: Deposits, labels: IntArray, samples: int = 1) -> sparse.csr_array:
-        """(C + 1, size) light of C classes of pixels and of lamps, per sample; light outside of all cells is dropped.
+        """(C + 1, size) light of C classes of pixels and of lamps, per sample, but for what is :meth:`outside`.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class Bundle:
         samples
             that the light is divided by.
         """
-        inside = self.grid.rows.holds(deposits.row) & self.grid.columns.holds(deposits.column)
+        inside = self._inside(deposits)
         if not inside.all():
             deposits = deposits.where(inside)
         width = self.anchors * self.cells[1]
@@ -207,6 +207,13 @@ class Bundle:
         light = sparse.coo_array(entries, shape=shape).tocsc().tocsr()
         light.eliminate_zeros()
         return light
+
+    def outside(self, deposits: Deposits) -> float:
+        """Light of ``deposits`` from beyond all cells, which is not filed [W m^-2]."""
+        return float(deposits.value[~self._inside(deposits)].sum())
+
+    def _inside(self, deposits: Deposits) -> npt.NDArray[np.bool_]:
+        return self.grid.rows.holds(deposits.row) & self.grid.columns.holds(deposits.column)
 
     def repeated(self, light: sparse.csr_array) -> sparse.csr_array:
         """``light`` that was filed with one anchor, (rows, size / anchors^2), as if every anchor saw it."""

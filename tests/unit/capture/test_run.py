@@ -257,7 +257,8 @@ def test_what_is_refused_leaves_nothing_behind(bench: Bench, tmp_path: Path, cha
 
 
 def test_a_signed_family_is_captured_in_halves(bench: Bench, tmp_path: Path) -> None:
-    done = bench.capture("hadamard:2", tmp_path / "run", accuracy=2e-2, seed=1, exposure=0.02)
+    black = {"black-level": False}
+    done = bench.capture("hadamard:2", tmp_path / "run", accuracy=2e-2, seed=1, exposure=0.02, effects=black)
     assert len(done.manifest.patterns.captures) == 8 and done.exposure_s == 0.02
     block = json.loads((tmp_path / "run" / "manifest.json").read_text())["patterns"]["captures"]
     assert [entry["sign"] for entry in block] == [1, -1] * 4
