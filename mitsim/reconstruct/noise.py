@@ -60,8 +60,8 @@ class FrameNoise:
         light, shots
             sum of its shots [electrons/s], any shape, and their number.
         """
-        dark = self.ambient_variance if shots == 1 else 0.0  # the difference of a pair has no ambient frame
-        return self._own(light, shots) + dark
+        ambient = self.ambient_variance if shots == 1 else 0.0  # the difference of a pair has no ambient frame
+        return self._own(light, shots) + ambient
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""

@@ -34,8 +34,8 @@ METHODS = ("tikhonov", "tv")
 IMAGE_FILE, UNCERTAINTY_FILE, RESULT_FILE = "image.exr", "uncertainty.exr", "result.json"
 _BYTES_A_NUMBER = 32.0
 """Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
-_KEPT_NUMBERS = 1 << 25
-"""Pixels of all measurements up to which they are kept for a second look: 128 of 512 x 512, at most 512 MiB."""
+_KEPT_NUMBERS = 1 << 24
+"""Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
 
 
 @dataclass(frozen=True, eq=False)
