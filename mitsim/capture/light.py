@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
@@ -14,6 +15,7 @@ import numpy as np
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.choice import doubt
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
 from mitsim.capture.simulation import FiledLight, Simulation
@@ -209,8 +211,17 @@ def make_plan(
     check_accuracy(accuracy)
     if bench.loaded.unfit.factored is not None:
         raise bench.loaded.unfit.factored
-    evidence = pilot.measure(bench, lighting, accuracy, seed)
-    return decide(accuracy, evidence, len(lighting.weights), SceneFacts.of(bench), switches)
+    started = time.perf_counter()
+    look = pilot.Look(bench, lighting, accuracy, seed)
+    while True:
+        evidence = look.evidence
+        worth, part = doubt(accuracy, evidence, switches or {})
+        stage = pilot.stage_of(part)
+        if look.price(stage) > worth:
+            break
+        look.refine(stage)
+    plan = decide(accuracy, evidence, SceneFacts.of(bench), switches)
+    return plan.taking(plan=time.perf_counter() - started)
 
 
 @single_threaded_blas()

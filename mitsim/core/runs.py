@@ -46,15 +46,53 @@ class Ambient:
     rate
         (rows, columns) mean over the shots [electrons/s].
     variance
-        (rows, columns) of that mean [(electrons/s)^2]; its noise is the same in all frames. None where nobody stated
-        it.
+        (rows, columns) of that mean [(electrons/s)^2], of what the manifest states of the sensor's noise. It is one
+        draw, the same in all frames.
     shots
         that were averaged.
     """
 
     rate: FloatArray
-    variance: FloatArray | None
+    variance: FloatArray
     shots: int
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What was measured under one pattern.
+
+    Attributes
+    ----------
+    frame
+        (rows, columns) [electrons/s], of a signed pattern the difference of its halves; of others without ambient
+        light.
+    row, column
+        indices (i, j) of the pattern.
+    light
+        (rows, columns) [electrons/s] sum of its shots as they were read: what their shot noise is of.
+    shots
+        their number.
+    saturated
+        readings of them at the full well or the ADC's end.
+    """
+
+    frame: FloatArray
+    row: int
+    column: int
+    light: FloatArray
+    shots: int
+    saturated: int
+
+    def __add__(self, other: Measurement) -> Measurement:
+        """Both halves of a signed pattern as one measurement."""
+        shots, saturated = self.shots + other.shots, self.saturated + other.saturated
+        return Measurement(self.frame + other.frame, self.row, self.column, self.light + other.light, shots, saturated)
+
+    @property
+    def power(self) -> FloatArray:
+        """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
+        # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
+        return np.square(self.light) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
 
 
 class Capture:
@@ -142,11 +180,9 @@ class Capture:
         """What is taken off every frame but those of signed pairs; None where no ambient frame was taken."""
         if self.manifest.ambient_frame is None:
             return None
-        name, digital = self.manifest.ambient_frame.file, self.manifest.digital
-        known = "variance" in self._read(name)[0]
-        unit = (digital.gain_dn_per_e * digital.exposure_s) ** 2
-        variance = self._channel(name, "variance") / unit if known else None
-        return Ambient(digital.rate(self._channel(name, "DN")), variance, self.manifest.ambient_frame.shots)
+        block, digital = self.manifest.ambient_frame, self.manifest.digital
+        rate = digital.rate(self._channel(block.file, "DN"))
+        return Ambient(rate, np.maximum(digital.variance(rate), 0.0) / block.shots, block.shots)
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
@@ -154,10 +190,16 @@ class Capture:
         return self.manifest.patterns.matrices
 
     def measurements(self, shape: tuple[int, int] | None = None) -> Iterator[tuple[FloatArray, int, int]]:
-        """(frame (rows, columns) [electrons/s], i, j) of every pattern, read one at a time; the halves of a signed one
-        come as their difference, others without the ambient frame, if one was taken. MitsimError for a frame that is
-        missing, damaged, not finite or of another ``shape`` than is asked for."""
-        waiting: dict[tuple[int, int], FloatArray] = {}
+        """(frame, i, j) of every pattern; see :meth:`measured`, which also takes ``shape``."""
+        for each in self.measured(shape):
+            yield each.frame, each.row, each.column
+
+    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+        """What was measured under every pattern, read one at a time; the halves of a signed one come as their
+        difference, others without the ambient frame, if one was taken. MitsimError for a frame that is missing,
+        damaged, not finite or of another ``shape`` than is asked for."""
+        digital = self.manifest.digital
+        waiting: dict[tuple[int, int], Measurement] = {}
         for shot in self.manifest.patterns.captures:
             index = (shot.row, shot.column)
             dn = self._channel(shot.file, "DN")
@@ -166,27 +208,32 @@ class Capture:
                     f"{(self.folder or Path()) / shot.file}: the frame is {_size(dn.shape)}, but the calibration's are "
                     f"{_size(shape or ())}; calibrate this camera"
                 )
-            frame = self.manifest.digital.rate(dn) * (shot.sign or 1)
-            if self.ambient is not None and not shot.sign:
-                frame -= self._fitting(self.ambient.rate, frame.shape)
+            light = digital.rate(dn)
+            full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
+            half = Measurement(light * shot.sign if shot.sign else self._lit(light), *index, light, 1, full)
             if shot.sign and index not in waiting:
-                waiting[index] = frame
+                waiting[index] = half
                 continue
-            yield waiting.pop(index, 0.0) + frame, *index
+            yield waiting.pop(index) + half if shot.sign else half
 
-    def _fitting(self, ambient: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-        if ambient.shape != shape:
+    def _lit(self, light: FloatArray) -> FloatArray:
+        """The projector's part of a shot's ``light``."""
+        if self.ambient is None:
+            return light
+        ambient = self.ambient.rate
+        if ambient.shape != light.shape:
             raise MitsimError(
-                f"{self.name}: the ambient frame is {_size(ambient.shape)}, but the frames are {_size(shape)}; take it "
-                "with the same camera"
+                f"{self.name}: the ambient frame is {_size(ambient.shape)}, but the frames are {_size(light.shape)}; "
+                "take it with the same camera"
             )
-        return ambient
+        return light - ambient
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 that captures of the same frames share, in memory or on disk."""
         manifest = self.manifest
-        digest = hashlib.sha256(manifest.digital.model_dump_json().encode())
+        # What is not stated is left out: folders of 0.4.0 keep their fingerprints.
+        digest = hashlib.sha256(manifest.digital.model_dump_json(exclude_defaults=True).encode())
         digest.update(manifest.patterns.model_dump_json().encode() + manifest.configuration_sha256.encode())
         files = [shot.file for shot in manifest.patterns.captures]
         if manifest.ambient_frame is not None:
@@ -203,6 +250,8 @@ class Capture:
         manifest = self.manifest
         known = (
             "mc_error",
+            "total_error",
+            "total_error_bound",
             "mc_to_sensor_noise",
             "sensor_noise",
             "heaviest_group",

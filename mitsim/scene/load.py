@@ -24,9 +24,9 @@ class LoadedScene:
 
     ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
     pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
-    other emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions, ``glossy``
-    whether one does in lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which estimators
-    must refuse it.
+    other emitters; ``mirrors`` tells whether a surface reflects or bends light into single directions, ``glossy``
+    whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
+    estimators must refuse it.
     """
 
     path: Path
@@ -104,7 +104,7 @@ def load_scene(
 
 
 def _polished(scene: mi.Scene) -> tuple[bool, bool]:
-    """Whether a surface of the scene has a delta component, and whether one has a glossy component."""
+    """Whether a surface of the scene is a mirror or bends light, and whether one has a glossy component."""
     flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
-    delta, glossy = mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy
-    return any(mi.has_flag(own, delta) for own in flags), any(mi.has_flag(own, glossy) for own in flags)
+    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+    return any(own & mirror for own in flags), any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)

@@ -1,7 +1,8 @@
 """Direct light: every projector pixel's rays, followed to the first surface and on to each anchor of the sensor.
 
 A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.receiver`), or to one random
-point of the sensor. All anchors see the same points.
+point of the sensor. All anchors see the same points. Where surfaces let light pass (:mod:`mitsim.transport.passage`),
+so does the ray: of the points that it meets one is handed out, drawn in proportion to its light.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from mitsim.optics.anchors import anchor_positions
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.coordinates import x_y
-from mitsim.transport.histogram import DIRECT, Deposits
+from mitsim.transport.histogram import DIRECT, Deposits, Sightings
 from mitsim.transport.paths import Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, sampled_wavelengths
@@ -73,11 +74,38 @@ class DirectTracer(Tracer):
         jitter = stratified(sample, shared)
         wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
-        si = self.scene.ray_intersect(ray)
-        seen_from = self._random_point(sample, shared, rng) if self.spread else self._anchor(row, column)
-        reception = self.receiver.receive(si, -ray.d, seen_from, si.is_valid())
-        value = panchromatic(reception.irradiance * self.rays.flux(pixel, wavelengths) * spectral)
-        return [Deposits.fetched(reception.sightings(value, pixel), DIRECT, (row, column))]
+        sensor = self._random_point(sample, shared, rng) if self.spread else self._anchor(row, column)
+        flux = self.rays.flux(pixel, wavelengths) * spectral
+        if self.receiver.passage.open:
+            seen = self._passing(ray, sensor, flux, pixel, rng)
+        else:
+            si = self.scene.ray_intersect(ray)
+            reception = self.receiver.receive(si, -ray.d, sensor, si.is_valid())
+            seen = reception.sightings(panchromatic(reception.irradiance * flux), pixel)
+        return [Deposits.fetched(seen, DIRECT, (row, column))]
+
+    def _passing(
+        self, ray: mi.Ray3f, sensor: mi.Point3f, flux: mi.Spectrum, pixel: mi.UInt32, rng: mi.PCG32
+    ) -> Sightings:
+        """Light of rays that go on through what lets them pass."""
+        passage = self.receiver.passage
+
+        def further(
+            active: mi.Bool, ray: mi.Ray3f, flux: mi.Spectrum, seen: Sightings, rng: mi.PCG32
+        ) -> tuple[object, ...]:
+            si = self.scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            part = passage.straight(si, active)
+            onward = passage.onward(si, ray.d)
+            reception = self.receiver.receive(si, -ray.d, sensor, active)
+            light = panchromatic(reception.irradiance * flux)
+            seen = seen.joined_by(reception.sightings(light, pixel), rng)
+            flux = flux * part
+            return active & (dr.max(flux) > 0), onward, flux, seen, rng
+
+        state = mi.Bool(True), ray, flux, Sightings.none(), rng
+        seen: Sightings = dr.while_loop(state, lambda active, *_: active, further)[3]
+        return seen
 
     def _anchor(self, row: mi.UInt32, column: mi.UInt32) -> mi.Point3f:
         """Anchors, in the camera's frame."""

@@ -115,7 +115,15 @@ def test_noisy_frames_give_the_camera_within_the_error_that_is_predicted(mode: s
 
 def test_a_flatcam_s_responses_are_centred() -> None:
     found, _ = estimate(lit_session(4, mask="flatcam"), Job(), noise_free=True)
-    assert np.abs(found.left.sum(axis=0)).max() < 1e-10 * np.abs(found.left).sum()
+    for factor in (found.left, found.right):
+        assert np.abs(factor.sum(axis=0)).max() < 1e-10 * np.abs(factor).sum()
+
+
+def test_progress_of_each_side_rises_to_the_whole() -> None:
+    told: list[tuple[str, float]] = []
+    estimate(lit_session(13), Job(progress=lambda stage, part: told.append((stage, part))))
+    for side in SIDES:  # 16 of 32 shots at once
+        assert [part for stage, part in told if stage == f"{side} stripes"] == [0.5, 1.0]
 
 
 # ---- shots -----------------------------------------------------------------------------------------------------------
