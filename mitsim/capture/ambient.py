@@ -1,4 +1,4 @@
-"""The ambient frame of a capture: lamps' light alone in, the mean of some noisy shots of it and its variance out.
+"""The ambient frame of a capture: lamps' light alone in, the mean of some noisy shots of it out.
 
 It is taken with the projector off, not with a black pattern: it then holds what the lamps bring and nothing else, and a
 run less its ambient frame has the expectation of the same run in a dark room. The light that black pixels leak stays in
@@ -19,7 +19,6 @@ from mitsim.core.manifests import MOST_SHOTS
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.rig.patterns import PatternFamily
-from mitsim.sensor.moments import frame_moments
 
 AmbientChoice = Literal["auto", "yes", "no"]
 _AT_ONCE = 16
@@ -70,8 +69,6 @@ class AmbientFrame:
         (rows, columns) expected in each, without dark current.
     digital
         (rows, columns) mean digital numbers.
-    variance
-        (rows, columns) of that mean [DN^2], in closed form for the light that the mean itself shows.
     saturated
         whether a pixel reached the full well or the ADC's end in a shot.
     """
@@ -79,7 +76,6 @@ class AmbientFrame:
     shots: int
     electrons: FloatArray
     digital: FloatArray
-    variance: FloatArray
     saturated: bool
 
     @classmethod
@@ -93,17 +89,14 @@ class AmbientFrame:
         shots
             to average.
         """
-        electrons, sensor = exposer.electrons(expected.projector_off), exposer.rig.sensor
+        electrons = exposer.electrons(expected.projector_off)
         total, saturated = np.zeros_like(electrons), False
         for start in range(0, shots, _AT_ONCE):
             names = [("ambient", shot) for shot in range(start, min(start + _AT_ONCE, shots))]
             for digital in in_threads(lambda name: exposer.digital(electrons, *name), names):
                 total += digital
                 saturated |= exposer.saturated(digital, electrons)
-        mean = total / shots
-        seen = np.maximum(exposer.rate(mean) * exposer.exposure_s, 0.0)
-        variance = frame_moments(seen, exposer.exposure_s, sensor)[1] / shots
-        return cls(shots, electrons, mean, variance, saturated)
+        return cls(shots, electrons, total / shots, saturated)
 
 
 def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames) -> FloatArray | float:

@@ -291,8 +291,8 @@ class _Shooting:
         """Noise of the frames less the ambient frame, ||noise|| / ||light of the projector||, over all frames."""
         own = 0.0
         if self.ambient is not None and not self.family.signed:
-            gain = self.exposer.rig.sensor.gain_dn_per_e
-            own = float(self.ambient.variance.sum()) / gain**2 * len(self.family.shots)
+            own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
+            own *= self.always.size * len(self.family.shots)
         return math.sqrt((self._noise_energy + own) / self._signal) if self._signal else math.inf
 
     @property
@@ -364,7 +364,7 @@ def _ambient(
 
 
 def _record_ambient(recorder: RunFolder | RunMemory, ambient: AmbientFrame, exposer: Exposer) -> None:
-    single = {"DN": ambient.digital, "electrons": ambient.electrons, "variance": ambient.variance}
+    single = {"DN": ambient.digital, "electrons": ambient.electrons}
     channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
     recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposer.exposure_s, "seed": exposer.seed})
 

@@ -38,13 +38,34 @@ def frame_name(index: int) -> str:
 
 
 @dataclass(frozen=True, eq=False)
+class Ambient:
+    """What a camera sees with the projector off, as it is taken off every frame of a run.
+
+    Attributes
+    ----------
+    rate
+        (rows, columns) mean over the shots [electrons/s].
+    variance
+        (rows, columns) of that mean [(electrons/s)^2], of what the manifest states of the sensor's noise. It is one
+        draw, the same in all frames.
+    shots
+        that were averaged.
+    """
+
+    rate: FloatArray
+    variance: FloatArray
+    shots: int
+
+
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """What was measured under one pattern.
 
     Attributes
     ----------
     frame
-        (rows, columns) [electrons/s], of a signed pattern the difference of its halves.
+        (rows, columns) [electrons/s], of a signed pattern the difference of its halves; of others without ambient
+        light.
     row, column
         indices (i, j) of the pattern.
     light
@@ -71,27 +92,7 @@ class Measurement:
     def power(self) -> FloatArray:
         """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
         # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
-        return np.square(self.frame) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
-
-
-@dataclass(frozen=True, eq=False)
-class Ambient:
-    """What a camera sees with the projector off, as it is taken off every frame of a run.
-
-    Attributes
-    ----------
-    rate
-        (rows, columns) mean over the shots [electrons/s].
-    variance
-        (rows, columns) of that mean [(electrons/s)^2]; its noise is the same in all frames. None where nobody stated
-        it.
-    shots
-        that were averaged.
-    """
-
-    rate: FloatArray
-    variance: FloatArray | None
-    shots: int
+        return np.square(self.light) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
 
 
 class Capture:
@@ -179,11 +180,9 @@ class Capture:
         """What is taken off every frame but those of signed pairs; None where no ambient frame was taken."""
         if self.manifest.ambient_frame is None:
             return None
-        name, digital = self.manifest.ambient_frame.file, self.manifest.digital
-        known = "variance" in self._read(name)[0]
-        unit = (digital.gain_dn_per_e * digital.exposure_s) ** 2
-        variance = self._channel(name, "variance") / unit if known else None
-        return Ambient(digital.rate(self._channel(name, "DN")), variance, self.manifest.ambient_frame.shots)
+        block, digital = self.manifest.ambient_frame, self.manifest.digital
+        rate = digital.rate(self._channel(block.file, "DN"))
+        return Ambient(rate, np.maximum(digital.variance(rate), 0.0) / block.shots, block.shots)
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
@@ -211,22 +210,23 @@ class Capture:
                 )
             light = digital.rate(dn)
             full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
-            frame = light * shot.sign if shot.sign else light
-            if self.ambient is not None and not shot.sign:
-                frame = light - self._fitting(self.ambient.rate, light.shape)
-            half = Measurement(frame, *index, light, 1, full)
+            half = Measurement(light * shot.sign if shot.sign else self._lit(light), *index, light, 1, full)
             if shot.sign and index not in waiting:
                 waiting[index] = half
                 continue
             yield waiting.pop(index) + half if shot.sign else half
 
-    def _fitting(self, ambient: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-        if ambient.shape != shape:
+    def _lit(self, light: FloatArray) -> FloatArray:
+        """The projector's part of a shot's ``light``."""
+        if self.ambient is None:
+            return light
+        ambient = self.ambient.rate
+        if ambient.shape != light.shape:
             raise MitsimError(
-                f"{self.name}: the ambient frame is {_size(ambient.shape)}, but the frames are {_size(shape)}; take it "
-                "with the same camera"
+                f"{self.name}: the ambient frame is {_size(ambient.shape)}, but the frames are {_size(light.shape)}; "
+                "take it with the same camera"
             )
-        return ambient
+        return light - ambient
 
     @cached_property
     def fingerprint(self) -> str:
