@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from mitsim.capture.effects import names
 
@@ -11,6 +11,25 @@ _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
 GROUPS = 8
 """Independent estimates of the light: eight tell their spread, the Monte Carlo error, to a quarter (1 / sqrt(14))."""
+
+
+@dataclass(frozen=True)
+class SharpPixels:
+    """Projector pixels whose direct light comes over lobes too sharp for the anchors of all others.
+
+    Attributes
+    ----------
+    pixels
+        their numbers, increasing.
+    anchors
+        points a side of the sensor that their light is connected to.
+    window
+        first and last tan-angle of their light along rows, then along columns.
+    """
+
+    pixels: tuple[int, ...]
+    anchors: int
+    window: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -38,6 +57,8 @@ class Settings:
     reach
         largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None: no more
         than of light at ``depth``.
+    sharp, sharp_samples
+        pixels whose direct light is traced apart, and samples that each group is predicted to need of it.
     """
 
     depth: float
@@ -52,6 +73,8 @@ class Settings:
     coarse_cells: int = 1
     coarse_layers: bool = False
     reach: float | None = None
+    sharp: SharpPixels | None = None
+    sharp_samples: float = 1.0
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -121,8 +144,10 @@ class Evidence:
         terms of the shadow, wave-optical over geometric.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
-    reach
-        as :attr:`Settings.reach`.
+    reach, sharp
+        as in :class:`Settings`.
+    sharp_light
+        what that light takes.
     """
 
     depth: float
@@ -140,11 +165,14 @@ class Evidence:
     terms: float
     unresolved: float = 0.0
     reach: float | None = None
+    sharp: SharpPixels | None = None
+    sharp_light: Effort = field(default_factory=lambda: Effort.none())
 
     def connecting(self, settings: Settings, anchors: int) -> float:
         """Seconds of direct light in the samples of ``settings``, and of its differences between ``anchors`` a side."""
         differences = settings.anchored_samples * anchors**2 * self.anchored.cost if anchors > 1 else 0.0
-        return GROUPS * (settings.direct_samples * self.direct.cost + differences)
+        sharp = settings.sharp_samples * self.sharp_light.cost
+        return GROUPS * (settings.direct_samples * self.direct.cost + differences + sharp)
 
     def following(self, settings: Settings) -> float:
         """Seconds of all other light in the samples of ``settings``; none when no effect calls for it."""

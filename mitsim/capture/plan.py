@@ -227,6 +227,7 @@ def decide(
         subdivision=cells,
         effects=on,
         reach=evidence.reach,
+        sharp=evidence.sharp,
     )
     coarse = _coarse(evidence, settings, accuracy)
     settings = replace(settings, coarse_cells=coarse.cells, coarse_layers=coarse.layers)
@@ -303,6 +304,8 @@ def allocate_samples(evidence: Evidence, settings: Settings, target: float) -> S
     """
     paths = evidence.anchored.paths * settings.anchors**2 * (settings.anchors > 1)
     efforts: dict[str, Effort] = {"direct": evidence.direct, "anchored": replace(evidence.anchored, paths=paths)}
+    if settings.sharp:
+        efforts["sharp"] = evidence.sharp_light
     if settings.effects & names(lambda effect: effect.followed):
         efforts |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera}
     parts = {name: math.sqrt(effort.variance * effort.paths) for name, effort in efforts.items()}

@@ -5,7 +5,6 @@ Every error is relative, ``||a - b|| / ||b||``, over up to four shots of the fam
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 from mitsim.capture import effects
@@ -14,6 +13,7 @@ from mitsim.capture.evidence import Evidence, Settings
 from mitsim.capture.pilot.direct import AnchoredLight, FineLight
 from mitsim.capture.pilot.halves import Sample
 from mitsim.capture.pilot.reach import light_reach
+from mitsim.capture.pilot.sharp import sharp_pixels
 from mitsim.capture.pilot.switched import SwitchedEffects
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
@@ -58,12 +58,14 @@ def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evi
     sharp = _sharp(first, seed)
     depth, light = _depth(first, seed, sharp)
     reach = light_reach(Simulation(bench, Settings(depth=depth, effects=first_look)), integer(seed, "pilot", "reach"))
-    base = Settings(depth=depth, effects=first_look, reach=reach)
+    apart = sharp_pixels(first, sharp, light, accuracy, integer(seed, "pilot", "sharp"))
+    base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
     fine = FineLight(bench, base, sample, accuracy, seed)
     layers = fine.layers()
     layer_error, cell_error = fine.layer_errors(layers), fine.cell_errors()
     switched = SwitchedEffects(bench, replace(base, effects=frozenset(present), subdivision=2), sample, seed)
     anchored = AnchoredLight(bench, base, sample, switched.light, seed)
+    whole = light + sharp.irradiance
     return Evidence(
         depth=depth,
         layers=layers,
@@ -78,8 +80,10 @@ def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evi
         from_camera=switched.effort("from_camera"),
         seconds_per_frame=fine.seconds_per_frame,
         terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
-        unresolved=sharp.irradiance / (light + sharp.irradiance) if sharp.hits * sample.fine < _FEWEST_HITS else 0.0,
+        unresolved=0.0 if apart or sharp.hits * sample.fine >= _FEWEST_HITS else sharp.irradiance / whole,
         reach=reach,
+        sharp=apart,
+        sharp_light=switched.sharp_effort(),
     )
 
 
@@ -87,7 +91,7 @@ def _sharp(simulation: Simulation, seed: int) -> SharpLight:
     """Direct light over lobes that are too sharp to be met by connections."""
     loaded = simulation.bench.loaded
     if not loaded.glossy:
-        return SharpLight(0.0, 0.0, math.inf)
+        return SharpLight.none(simulation.bench.n**2)
     parts = loaded.scene, loaded.camera, simulation.physics.projector, simulation.physics.geometry
     return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,8 +55,12 @@ class FineLight:
         halves = [tracer.trace(first, 0, many)]
         started = time.perf_counter()
         halves.append(tracer.trace(second, 0, many))
-        self.pace = (time.perf_counter() - started) / (tracer.lanes * many)
+        self.pace = (time.perf_counter() - started) / max(tracer.lanes * many, 1)
         self._many = halves[0], halves[1]
+        apart = Simulation(bench, base).apart
+        self._sharp = (
+            [apart.trace(half, 0, sample.sharp(Simulation(bench, base))) for half in (first, second)] if apart else []
+        )
         self._few = tracer.trace(first, 0, few), tracer.trace(second, 0, few)
         self.seconds_per_frame = 0.0
 
@@ -71,7 +75,7 @@ class FineLight:
 
     def _range(self) -> tuple[float, float]:
         """Nearest and farthest depth that the light is seen at [mm]."""
-        inverse = np.concatenate([deposits.inverse_depth for deposits in self._many])
+        inverse = np.concatenate([deposits.inverse_depth for deposits in (*self._many, *self._sharp)])
         if not inverse.size:
             return self.base.depth, self.base.depth
         return 1 / float(inverse.max()), 1 / max(float(inverse.min()), _FARTHEST / self.base.depth)
@@ -93,20 +97,27 @@ class FineLight:
     def effort(self, light: float) -> Effort:
         """Monte Carlo error of one estimate, relative to all ``light``, how fast it falls, and what it takes."""
         samples = self.sample.fine
-        many = noise(self._frames((), 1), light)
-        few = noise(self._halves(Simulation(self.bench, self.base), self._few, samples // 4), light)
+        simulation = Simulation(self.bench, self.base)
+        many = noise(self._halves(simulation, self._many, samples), light)
+        few = noise(self._halves(simulation, self._few, samples // 4), light)
         rate = math.log(few / many) / math.log(4) if many > 0 and few > 0 else 1.0
         return Effort(Noise(many, samples, min(max(rate, 0.5), 1.0)), self.bench.n**2, self.pace)
 
     def _frames(self, layers: tuple[float, ...], subdivision: int) -> Halves:
         simulation = Simulation(self.bench, replace(self.base, layers=layers, subdivision=subdivision))
-        halves = self._halves(simulation, self._many, self.sample.fine)
+        halves = self._halves(simulation, self._many, self.sample.fine, self._sharp)
         if not (layers or self.seconds_per_frame) and subdivision == 1:
             self.seconds_per_frame = self._seconds(simulation)
         return halves
 
-    def _halves(self, simulation: Simulation, deposits: tuple[Deposits, Deposits], samples: int) -> Halves:
-        first, second = (self.sample.frames(simulation, half, samples) for half in deposits)
+    def _halves(
+        self, simulation: Simulation, deposits: tuple[Deposits, Deposits], samples: int, sharp: Sequence[Deposits] = ()
+    ) -> Halves:
+        apart = sharp or (None, None)
+        first, second = (
+            self.sample.frames(simulation, half, samples, sharp=more)
+            for half, more in zip(deposits, apart, strict=True)
+        )
         return first, second
 
     def _seconds(self, simulation: Simulation) -> float:
@@ -184,4 +195,5 @@ def _tracer(simulation: Simulation, sample: Sample) -> DirectTracer:
     """Direct light to every anchor, of those projector pixels only that the sample's shots show."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, simulation.settings.anchors, physics.geometry
-    return DirectTracer(*parts, pixels=sample.shown)
+    apart = simulation.settings.sharp
+    return DirectTracer(*parts, pixels=np.setdiff1d(sample.shown, apart.pixels) if apart else sample.shown)

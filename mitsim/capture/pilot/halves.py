@@ -22,6 +22,8 @@ _SHOTS = 4
 """Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming."""
 _PIXELS = 64**2
 """Few pixels are sampled more often, until they take as many samples as so many pixels."""
+_SHARP_PATHS = 2**21
+"""Connections of sharp pixels, some 0.2 s."""
 _GOOD_ENOUGH = 0.3
 """Part of the accuracy below which a finer step is not tried: its square is a tenth of the budget's."""
 
@@ -68,8 +70,18 @@ class Sample:
         """Samples a projector pixel of indirect light, and a cell of light that is followed from the camera."""
         return self.direct // 2
 
+    def sharp(self, simulation: Simulation) -> int:
+        """Samples of each pixel that a ``simulation`` traces apart."""
+        paths = simulation.apart.lanes if simulation.apart else 1
+        return min(max(_SHARP_PATHS // paths, 4), self.fine)
+
     def frames(
-        self, simulation: Simulation, direct: Deposits, samples: int, followed: Deposits | None = None
+        self,
+        simulation: Simulation,
+        direct: Deposits,
+        samples: int,
+        followed: Deposits | None = None,
+        sharp: Deposits | None = None,
     ) -> FloatArray:
         """(shots, pixels, pixels) frames.
 
@@ -81,11 +93,15 @@ class Sample:
             direct light, and its samples.
         followed
             light over more surfaces or from the camera.
+        sharp
+            direct light of sharp pixels.
         """
         labels = self.lighting.labels
         light = simulation.file_direct(direct, labels, samples)
         if followed is not None:
             light = light + simulation.file_followed(followed, labels, self.followed)
+        if sharp is not None:
+            light = light + simulation.file_sharp(sharp, labels, self.sharp(simulation))
         frames = simulation.expected([light], self.rows, self.lighting, 0)
         return np.stack([frame.irradiance for frame in frames])
 

@@ -15,6 +15,8 @@ from mitsim.core.seeds import integer
 from mitsim.transport import histogram
 from mitsim.transport.histogram import Deposits
 
+_SHARP_RATE = 0.7
+"""Power of the samples that the error of sharp light falls with: stratified over a pixel, but its lobes are narrow."""
 _KINDS = {"indirect": histogram.INDIRECT, "ambient": histogram.AMBIENT}
 
 
@@ -36,7 +38,8 @@ class SwitchedEffects:
         self.seeds = tuple(integer(seed, "pilot", "effects", half) for half in range(2))
         self.simulation = Simulation(bench, everything)
         self.direct, self.followed = self._direct(self.simulation), self._follow(self.simulation)
-        self.frames = self._form(self.simulation, self.direct, self.followed)
+        self.sharp = self._sharp(self.simulation)
+        self.frames = self._form(self.simulation, self.direct, self.followed, self.sharp)
 
     @property
     def light(self) -> float:
@@ -65,13 +68,27 @@ class SwitchedEffects:
         deposits = tuple(stage.tracer.trace(seed, 0, samples) for seed in self.seeds)
         pace = (time.perf_counter() - started) / (2 * lanes * samples)
         none = tuple(Deposits.none() for _ in self.seeds)
-        error = noise(self._form(self.simulation, none, deposits), self.light)
+        error = noise(self._form(self.simulation, none, deposits, none), self.light)
         return Effort(Noise(error, samples, 0.5), lanes, pace)
+
+    def sharp_effort(self) -> Effort:
+        """The same of sharp pixels, from the halves that are there; the error is taken to fall with the root."""
+        tracer = self.simulation.apart
+        if tracer is None:
+            return Effort.none()
+        samples, none = self.sample.sharp(self.simulation), (Deposits.none(), Deposits.none())
+        started = time.perf_counter()
+        tracer.trace(self.seeds[0], 0, samples)
+        pace = (time.perf_counter() - started) / (tracer.lanes * samples)
+        error = noise(self._form(self.simulation, none, none, self.sharp), self.light)
+        return Effort(Noise(error, samples, _SHARP_RATE), tracer.lanes, pace)
 
     def _without(self, effect: Effect) -> Halves:
         simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {effect.name}))
         retraced = effect.retraced(simulation.physics)
-        direct = self._direct(simulation) if DIRECT in retraced else self.direct
+        direct, sharp = self.direct, self.sharp
+        if DIRECT in retraced:
+            direct, sharp = self._direct(simulation), self._sharp(simulation)
         if FOLLOWED in retraced:
             followed = self._follow(simulation)
         elif effect.kind:
@@ -79,7 +96,7 @@ class SwitchedEffects:
             followed = tuple(deposits.where(deposits.kind != left_out) for deposits in self.followed)
         else:
             followed = self.followed
-        return self._form(simulation, direct, followed)
+        return self._form(simulation, direct, followed, sharp)
 
     def _direct(self, simulation: Simulation) -> tuple[Deposits, ...]:
         return tuple(simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds)
@@ -87,9 +104,16 @@ class SwitchedEffects:
     def _follow(self, simulation: Simulation) -> tuple[Deposits, ...]:
         return tuple(simulation.follow(seed, self.sample.followed) for seed in self.seeds)
 
-    def _form(self, simulation: Simulation, direct: tuple[Deposits, ...], followed: tuple[Deposits, ...]) -> Halves:
-        samples = self.sample.direct
-        first, second = (
-            self.sample.frames(simulation, one, samples, other) for one, other in zip(direct, followed, strict=True)
-        )
-        return first, second
+    def _sharp(self, simulation: Simulation) -> tuple[Deposits, ...]:
+        tracer = simulation.apart
+        if tracer is None:
+            return tuple(Deposits.none() for _ in self.seeds)
+        return tuple(tracer.trace(seed, 0, self.sample.sharp(simulation)) for seed in self.seeds)
+
+    def _form(self, simulation: Simulation, *parts: tuple[Deposits, ...]) -> Halves:
+        """Frames of two halves; ``parts`` are direct, followed and sharp light."""
+        halves = [
+            self.sample.frames(simulation, direct, self.sample.direct, *more)
+            for direct, *more in zip(*parts, strict=True)
+        ]
+        return halves[0], halves[1]
