@@ -56,7 +56,13 @@ class _Aims:
 
 
 class AimedTracer(DirectTracer):
-    """Direct light of some projector pixels at a number of anchors."""
+    """Direct light of some projector pixels at a number of anchors.
+
+    Attributes
+    ----------
+    far
+        pairs, anchor * pixels + place of the pixel, that are connected seldom.
+    """
 
     def __init__(
         self,
@@ -78,21 +84,21 @@ class AimedTracer(DirectTracer):
         self._aims = self._aim()
         near = self._is_near().ravel()
         pairs = np.arange(len(near), dtype=np.int64)
-        self._near, self._far = pairs[near], pairs[~near]
+        self._near, self.far = pairs[near], pairs[~near]
 
     @property
     def lanes(self) -> int:
         """Connections of one sample: all near pairs of pixel and anchor, and one of a few others."""
-        return len(self._near) - (-len(self._far) // _SELDOM)
+        return len(self._near) - (-len(self.far) // _SELDOM)
 
     def _pair(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        near, far = (dr.opaque(mi.UInt32, len(pairs)) for pairs in (self._near, self._far))
+        near, far = (dr.opaque(mi.UInt32, len(pairs)) for pairs in (self._near, self.far))
         _, rng = streams(seed, lane, sample)
         one_of = (lane - near) * _SELDOM + dr.minimum(mi.UInt32(rng.next_float32() * _SELDOM), _SELDOM - 1)
         is_near = lane < near
         place = dr.select(is_near, lane, near + one_of)
         share = dr.select(is_near, 1.0, dr.select(one_of < far, float(_SELDOM), 0.0))
-        pairs = mi.UInt32(np.concatenate([self._near, self._far]))
+        pairs = mi.UInt32(np.concatenate([self._near, self.far]))
         pair = dr.gather(mi.UInt32, pairs, place, place < near + far)
         count = dr.opaque(mi.UInt32, len(self._pixels))
         return pair % count, pair // count, mi.Float(share)

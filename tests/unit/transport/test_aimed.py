@@ -54,13 +54,13 @@ SCENES = {
 def lit(small_scene: Callable[..., Path], variant: str) -> Callable[[str], tuple[Bench, np.ndarray]]:
     """A bench with a sensor of 6.4 mm before some shape, and its eight pixels that light lobes most."""
 
-    def load(extra: str) -> tuple[Bench, np.ndarray]:
-        path = small_scene("lobes", n=N, pitch=0.1, sheet_z=-500, extra=extra)
+    def load(extra: str, n: int = N) -> tuple[Bench, np.ndarray]:
+        path = small_scene("lobes", n=n, pitch=0.1, sheet_z=-500, extra=extra)
         yy, xx = np.mgrid[:64, :64]
         write_png(path.parent / "bumps.png", 127 + 60 * np.sin(xx * 0.7) * np.cos(yy * 0.5))
         bench = open_bench(path, variant, for_render=True)
         loaded = bench.loaded
-        found = sharp_light(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, 1, 1024)
+        found = sharp_light(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, 1, 2**18 // n**2)
         return bench, np.sort(np.argsort(-found.by_pixel)[:8])
 
     return load
@@ -94,3 +94,19 @@ def test_aimed_rays_find_sharp_lobes_faster(lit: Callable[[str], tuple[Bench, np
     aimed, even = both(*lit(plate(metal(1e-3))), 256)
     noise = [part.std(axis=0, ddof=1).mean() / part.mean() for part in (aimed, even)]
     assert noise[0] < 0.02 and noise[0] < noise[1] / 5
+
+
+def test_tails_that_are_seldom_connected_are_whole(lit: Callable[..., tuple[Bench, np.ndarray]]) -> None:
+    """At roughness 3e-4 most anchors lie beyond the lobes of a pixel's light; connected seldom, they get all of it."""
+    bench, pixels = lit(plate(metal(3e-4)), 64)
+    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 5, bench.geometry
+    aimed, even = AimedTracer(*parts, pixels), DirectTracer(*parts, pixels=pixels)
+    assert aimed.lanes < 0.7 * even.lanes
+    sums = np.zeros((2, SEEDS))
+    for index, (tracer, samples) in enumerate(((aimed, 2048), (even, 512))):
+        for seed in range(SEEDS):
+            found = tracer.trace(seed, 0, samples)
+            place = (found.anchor_row * 5 + found.anchor_column) * len(pixels) + np.searchsorted(pixels, found.pixel)
+            sums[index, seed] = found.value[np.isin(place, aimed.far)].sum() / samples
+    (one, other), error = sums.mean(axis=1), np.hypot(*sums.std(axis=1, ddof=1)) / np.sqrt(SEEDS)
+    assert abs(one - other) < SEVEN * error < 0.1 * other
