@@ -1,5 +1,5 @@
-# make setup | demo | test | test-all | lint | docs | robustness | wheel.  Everything lives in .venv; PYTHON=python3.12
-# picks another Python.
+# make setup | demo | test | test-all | lint | docs | robustness | mutants | wheel.  Everything lives in .venv;
+# PYTHON=python3.12 picks another Python.
 VENV := .venv
 PYTHON ?= python3
 READY := $(VENV)/.ready
@@ -10,7 +10,7 @@ INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
 # One test process a processor.
 PARALLEL := -n logical --maxprocesses 8 --dist worksteal
 
-.PHONY: setup demo test test-all lint docs robustness wheel
+.PHONY: setup demo test test-all lint docs robustness mutants wheel
 
 setup: $(READY)
 
@@ -49,6 +49,10 @@ docs: $(DOCS_READY)
 robustness: setup
 	@rm -f docs/_build/robustness.json
 	@$(VENV)/bin/python -m pytest -m robustness $(PARALLEL) --robustness docs/robustness.md
+
+# Planted bugs that the quick tests must see; not part of any test run.
+mutants: setup
+	@$(VENV)/bin/python benchmarks/mutants.py
 
 wheel: setup
 	@rm -rf dist

@@ -297,12 +297,22 @@ def reconstruct(
     )
     payload = result.summary()
     lines = [payload["status"]]
-    if payload["psnr"] is not None:
-        lines.append(f"PSNR {payload['psnr']:.2f} dB, SSIM {payload['ssim']:.3f}")
+    if result.quality is not None:
+        lines.append(str(result.quality))
     lines.append(
-        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition']:.3g}, "
+        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
         f"residual {payload['residual']:.1e}: {payload['output']}"
     )
+    misfit, uncertainty = payload["misfit"], payload["uncertainty"]
+    if misfit:
+        noise = "" if misfit["noise_stated"] else " of shot noise alone, as no other was stated"
+        lines.append(
+            f"misfit: chi-square {misfit['chi_square']:.3g} a datum{noise}, {misfit['unexplained']:.1e} unexplained"
+        )
+    if uncertainty is not None:
+        budget = sorted(payload["uncertainty_budget"].items(), key=lambda source: -source[1])
+        largest = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for name, value in budget[:3])
+        lines.append(f"standard uncertainty {uncertainty:.1e} rms; largest: {largest}")
     return _finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
 
 
@@ -480,7 +490,8 @@ def _print_plan(plan: Plan) -> None:
         table.add_row(row.name, row.state, row.reason, error, f"{row.seconds:.2f}")
     console = Console()
     console.print(table)
-    console.print(f"Predicted time for transport and optics: {plan.predicted_seconds:.2f} s")
+    stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in plan.predicted.items())
+    console.print(f"Predicted time from start to finish: {plan.predicted_seconds:.2f} s ({stages})")
     if plan.cost:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
         console.print(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")

@@ -177,12 +177,15 @@ def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> Li
             seed=session.seed,
             labels=arrays["labels"],
             flux=arrays["flux"],
+            flux_error=arrays["flux_error"],
             paths=int(arrays["paths"]),
             sampling_error=float(arrays["sampling_error"]),
             reached=bool(arrays["reached"]),
         )
     light = session.trace(plan, job)
-    facts = {name: getattr(light, name) for name in ("labels", "flux", "paths", "sampling_error", "reached")}
+    facts = {
+        name: getattr(light, name) for name in ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
+    }
     facts |= {name: getattr(light.groups[0], name) for name in ("received", "outside")}
     for name in TRAYS:
         matrix = getattr(light.groups[0], name)

@@ -13,12 +13,18 @@ _LANES_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
 _DEPOSIT_BYTES = 36.0
 """An entry of a sparse matrix, and the sum that it is added to."""
-_SECONDS_PER_PIXEL = 9e-8
-"""Exposing and writing; measured on two cores."""
+_EXPOSING_S, _WRITING_S = 7e-8, 2.5e-8
+"""A pixel; measured on two cores."""
 _BYTES_PER_PIXEL = 8
-"""Digital number and expected electrons, uncompressed."""
+"""Two channels, uncompressed: digital number and expected electrons; truth and its standard error."""
 _BYTES_PER_ROW, _HEADER_BYTES = 16, 2000
 """Of an OpenEXR file."""
+
+
+def frame_seconds(bench: Bench, shots: int) -> dict[str, float]:
+    """Seconds of exposing and of writing so many ``shots`` of a ``bench``."""
+    pixels = shots * bench.geometry.pixels**2
+    return {"sensor": pixels * _EXPOSING_S, "write": pixels * _WRITING_S}
 
 
 def frames_cost(
@@ -35,7 +41,7 @@ def frames_cost(
     lighting
         its classes and shots.
     seconds
-        what its light takes.
+        that it takes.
     on_disk
         bytes of frames that are there already.
     """
@@ -43,11 +49,11 @@ def frames_cost(
     rows = bench.geometry.pixels
     pixels = rows**2
     files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
-    truth = 4.0 * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES
+    truth = float(_BYTES_PER_PIXEL * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES)
     held = frames_in_memory(classes, shots) + 4 * FRAMES_AT_ONCE
     places = bench.n**2 * (2 * settings.subdivision**2 + (settings.anchors**2 + 1) * settings.coarse_cells**2)
     return Cost(
-        seconds=seconds + shots * pixels * _SECONDS_PER_PIXEL,
+        seconds=seconds,
         memory_bytes=_LANES_BYTES + 8.0 * held * pixels + GROUPS * places * _DEPOSIT_BYTES,
         disk_bytes=max(files + truth - on_disk, 0.0),
     )

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
-from mitsim.capture.effects import names
+import numpy as np
 
+from mitsim.core.arrays import FloatArray
+
+Number = float | FloatArray
+COUNTED = ("anchors", "layers", "cells")
+"""What a plan counts: points of the sensor a side, depths, and cells a side of a projector pixel."""
+COARSE = ("anchored", "indirect")
+"""Light that is filed in coarse cells: direct light's differences between anchors, and indirect light."""
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
 GROUPS = 8
 """Independent estimates of the light: eight tell their spread, the Monte Carlo error, to a quarter (1 / sqrt(14))."""
+LOOKS = 4
+"""Independent looks of the pilot, the fewest whose spread tells a standard error worth its name."""
+SURE = 2.35
+"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``LOOKS`` - 1 degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +104,11 @@ class Noise:
     samples: float
     rate: float
 
-    def samples_for(self, target: float) -> float:
+    def samples_for(self, target: Number) -> Number:
         """Samples a cell at which the error is ``target``."""
-        return self.samples * (self.error / target) ** (1 / self.rate) if self.error > 0 else _FEWEST_SAMPLES
+        if self.error <= 0:
+            return _FEWEST_SAMPLES + 0 * target
+        return self.samples * (self.error / target) ** (1 / self.rate)
 
 
 @dataclass(frozen=True)
@@ -109,14 +125,104 @@ class Effort:
         return cls(Noise(0.0, 1, 0.5), 0, 0.0)
 
     @property
-    def cost(self) -> float:
-        """Seconds a sample."""
-        return self.paths * self.seconds
-
-    @property
     def variance(self) -> float:
         """Relative variance of one sample, where the error falls with the square root of their number."""
         return self.noise.samples * self.noise.error**2
+
+
+@dataclass(frozen=True, order=True)
+class Part:
+    """What a plan may leave out (an effect; ``count`` 0), or a number that it may choose (anchors, layers, cells)."""
+
+    name: str
+    count: int = 0
+
+
+class Estimate(NamedTuple):
+    """A relative error: the best ``value`` for it, and the ``bound`` that it stays below at 95 %."""
+
+    value: float
+    bound: float
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """What each part changes in the frames, as inner products between independent looks: the sum of any of them, with
+    its signs, without the looks' noise.
+
+    Attributes
+    ----------
+    parts
+        what was changed.
+    products
+        (looks, looks, parts, parts) inner products of the changes, relative to the squared norm of all light; those of
+        a look with itself hold its noise, and are not used.
+    """
+
+    parts: tuple[Part, ...]
+    products: FloatArray
+
+    @classmethod
+    def between(cls, seen: Mapping[Part, FloatArray], energy: float) -> Changes:
+        """Of changes (looks, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
+        count = len(seen)
+        products = np.zeros((LOOKS, LOOKS, count, count))
+        flat = [change.reshape(LOOKS, -1) for change in seen.values()]
+        for i, first in enumerate(flat):
+            for j, second in enumerate(flat[: i + 1]):
+                # Not by BLAS, whose sums depend on the number of its threads in the last bits.
+                pairs = np.einsum("an,bn->ab", first, second)
+                products[:, :, i, j], products[:, :, j, i] = pairs, pairs.T
+        return cls(tuple(seen), products / energy if energy > 0 else products)
+
+    def squared(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(m,) squared changes by m sums of parts and their standard errors, from ``chosen`` (m, parts) weights.
+
+        The mean product of two different looks, and its jackknife over looks.
+        """
+        looks = len(self.products)
+        pairs = np.zeros((looks, looks, len(chosen)))
+        for i, j in zip(*np.triu_indices(looks, 1), strict=True):
+            pairs[i, j] = np.einsum("mp,pq,mq->m", chosen, self.products[i, j], chosen)
+        total, kept = pairs.sum(axis=(0, 1)), looks * (looks - 1) / 2
+        of_look = pairs.sum(axis=0) + pairs.sum(axis=1)
+        without = (total - of_look) / (kept - looks + 1)
+        spread = np.sqrt((looks - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
+        return total / kept, spread
+
+    def estimate(self, parts: Collection[Part]) -> Estimate:
+        """Relative change of the frames by all ``parts`` together; parts that were not measured change nothing."""
+        chosen = np.array([[part in parts for part in self.parts]], dtype=np.float64)
+        squared, spread = (float(values[0]) for values in self.squared(chosen))
+        least = max(squared, 0.0)
+        return Estimate(math.sqrt(least), math.sqrt(least + SURE * spread))
+
+
+@dataclass(frozen=True)
+class Forming:
+    """What forming frames depends on besides settings.
+
+    Attributes
+    ----------
+    pixels, cells
+        a side of the sensor, and of the grid with one cell a projector pixel.
+    lit
+        part of the rows of cells that hold light in a frame.
+    terms
+        of the wave-optical shadow; a geometric one has one.
+    shots, classes
+        of the family.
+    seconds
+        that the pilot measured for a frame of one anchor, layer and cell a pixel, with a wave-optical shadow.
+    """
+
+    pixels: int
+    cells: int
+    lit: float
+    terms: float
+    shots: int
+    classes: int
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -127,21 +233,18 @@ class Evidence:
     ----------
     depth, layers
         depth of the light [mm]; candidates for the layers' depths, by their number.
-    anchor_error, layer_error
-        error of the frames by anchors a side, and by number of layers.
-    cell_error
-        by cells a side of a projector pixel.
-    effect_error
-        error of leaving out each effect that the bench has.
+    changes
+        of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
+        cells that was tried, and by one coarse cell a pixel, or one layer, for light of each of ``COARSE``.
     direct_part
         direct light in all light.
     direct, anchored, indirect, from_camera
         what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
         and what is followed from the camera.
-    seconds_per_frame
-        of forming a frame with one anchor, one layer, a wave-optical shadow and a cell a projector pixel.
-    terms
-        terms of the shadow, wave-optical over geometric.
+    forming
+        how frames are formed.
+    apart
+        effects that are no part of the expected frames, with the independent error of leaving each out.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
     reach, sharp
@@ -152,31 +255,35 @@ class Evidence:
 
     depth: float
     layers: Mapping[int, tuple[float, ...]]
-    anchor_error: Mapping[int, float]
-    layer_error: Mapping[int, float]
-    cell_error: Mapping[int, float]
-    effect_error: Mapping[str, float]
+    changes: Changes
     direct_part: float
     direct: Effort
     anchored: Effort
     indirect: Effort
     from_camera: Effort
-    seconds_per_frame: float
-    terms: float
+    forming: Forming
+    apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())
 
-    def connecting(self, settings: Settings, anchors: int) -> float:
-        """Seconds of direct light in the samples of ``settings``, and of its differences between ``anchors`` a side."""
-        differences = settings.anchored_samples * anchors**2 * self.anchored.cost if anchors > 1 else 0.0
-        sharp = settings.sharp_samples * self.sharp_light.cost
-        return GROUPS * (settings.direct_samples * self.direct.cost + differences + sharp)
+    def error(self, *parts: Part) -> Estimate:
+        """Relative change of the frames by all ``parts`` together."""
+        apart = sum(self.apart.get(part.name, 0.0) ** 2 for part in parts)
+        value, bound = self.changes.estimate(parts)
+        return Estimate(math.hypot(value, math.sqrt(apart)), math.hypot(bound, math.sqrt(apart)))
 
-    def following(self, settings: Settings) -> float:
-        """Seconds of all other light in the samples of ``settings``; none when no effect calls for it."""
-        if not settings.effects & names(lambda effect: effect.followed):
-            return 0.0
-        indirect = settings.indirect_samples * self.indirect.cost
-        return GROUPS * (indirect + settings.from_camera_samples * self.from_camera.cost)
+    @cached_property
+    def effects(self) -> dict[str, Estimate]:
+        """Error of leaving out each effect that the bench has."""
+        measured = [part.name for part in self.changes.parts if part.count == 0]
+        return {name: self.error(Part(name)) for name in (*measured, *self.apart)}
+
+    @cached_property
+    def ladders(self) -> dict[str, dict[int, Estimate]]:
+        """Error of each number of anchors, layers and cells that was tried, fewest first."""
+        found: dict[str, dict[int, Estimate]] = {name: {} for name in COUNTED}
+        for part in sorted(part for part in self.changes.parts if part.name in COUNTED):
+            found[part.name][part.count] = self.error(part)
+        return {name: errors or {1: Estimate(0.0, 0.0)} for name, errors in found.items()}

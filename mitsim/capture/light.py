@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
@@ -14,16 +15,16 @@ import numpy as np
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
-from mitsim.capture.effects import names
+from mitsim.capture.choice import doubt
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
 from mitsim.capture.simulation import FiledLight, Simulation
+from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.rig.patterns import Lighting
-from mitsim.rig.recipe import load_recipe
 
 if TYPE_CHECKING:
     from mitsim.core.job import Job
@@ -86,6 +87,8 @@ class Light:
         (n^2,) row of each projector pixel: its class, or the pixel itself when any family is to be formed.
     flux
         (n^2,) irradiance that each pixel's direct light casts on the sensor without the mask, mean over the sensor.
+    flux_error
+        (n^2,) its standard error, from the spread of the groups.
     paths
         connections and paths traced.
     sampling_error
@@ -98,6 +101,7 @@ class Light:
     seed: int
     labels: Labels
     flux: FloatArray
+    flux_error: FloatArray
     paths: int
     sampling_error: float
     reached: bool
@@ -169,32 +173,17 @@ class Light:
         return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
     @cached_property
-    def board_flux(self) -> FloatArray:
-        """(n^2,) direct light of each projector pixel on the sensor, over the calibration board [W m^-2]."""
-        settings = self.plan.settings
-        plan = replace(
-            self.plan,
-            settings=Settings(
-                self.bench.geometry.scene_distance,
-                settings.anchors,
-                effects=names(lambda effect: effect.in_truth) & settings.effects,
-                direct_samples=settings.direct_samples,
-            ),
-        )
-        board = self.bench.with_board(load_recipe().board_reflectance)
-        return trace_light(
-            board, plan, Lighting.uniform(board.n), self.seed, Sampling(purpose="board", by_pixel=False)
-        ).flux
+    def apparent(self) -> Truth:
+        """What a perfect image of this light would show, with its standard error; traced on its own."""
+        return trace_truth(self.bench, self.plan.settings, self.seed, self.flux_error)
 
-    @cached_property
+    @property
     def truth(self) -> FloatArray:
         """(n, n) apparent reflectance: each projector pixel's flux toward the camera over that of the board.
 
         The board is the session's: one of reflectance 0.99 counts as 1.
         """
-        board = self.board_flux
-        ratio = np.divide(self.flux, board, out=np.zeros_like(board), where=board > 0)
-        return ratio.reshape(self.bench.n, self.bench.n)
+        return self.apparent.reflectance
 
 
 @single_threaded_blas()
@@ -213,10 +202,26 @@ def make_plan(
         root of the pilot's random streams.
     switches
         effects that are switched on or off by name, whatever they are worth.
+
+    Raises
+    ------
+    MitsimError
+        for a scene that the factored estimator cannot render.
     """
     check_accuracy(accuracy)
-    evidence = pilot.measure(bench, lighting, accuracy, seed)
-    return decide(accuracy, evidence, len(lighting.weights), SceneFacts.of(bench), switches)
+    if bench.loaded.unfit.factored is not None:
+        raise bench.loaded.unfit.factored
+    started = time.perf_counter()
+    look = pilot.Look(bench, lighting, accuracy, seed)
+    while True:
+        evidence = look.evidence
+        worth, part = doubt(accuracy, evidence, switches or {})
+        stage = pilot.stage_of(part)
+        if look.price(stage) > worth:
+            break
+        look.refine(stage)
+    plan = decide(accuracy, evidence, SceneFacts.of(bench), switches)
+    return plan.taking(plan=time.perf_counter() - started)
 
 
 @single_threaded_blas()
@@ -262,7 +267,8 @@ def trace_light(
             plan=plan,
             seed=seed,
             labels=labels,
-            flux=np.asarray(sum(group.flux for group in groups) / GROUPS),
+            flux=np.mean([group.flux for group in groups], axis=0),
+            flux_error=np.std([group.flux for group in groups], axis=0, ddof=1) / GROUPS**0.5,
             paths=sum(group.paths for group in groups),
             sampling_error=math.inf,
             reached=False,

@@ -112,10 +112,13 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     Raises
     ------
     MitsimError
-        for too few or too many samples, an integrator that cannot render this sensor, or work beyond the job's limits.
+        for too few or too many samples, an integrator that cannot render this sensor or would lose light of this scene,
+        or work beyond the job's limits.
     """
     import mitsuba as mi
 
+    if loaded.unfit.reference is not None:
+        raise loaded.unfit.reference
     if not _FEWEST_PASSES <= spp <= _MOST_SAMPLES:
         raise ArgumentError("spp", f"{spp}: give at least {_FEWEST_PASSES} samples a pixel, at most {_MOST_SAMPLES}")
     job = job or Job()

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.cost import frames_cost
+from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import Exposer, NoiseTarget, in_chunks
 from mitsim.capture.light import Light, Sampling, make_plan, trace_light
@@ -28,7 +28,7 @@ from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.runs import Capture, RunFolder, RunMemory, claimed, frame_name
 from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.rig.patterns import PatternFamily, Shot
+from mitsim.rig.patterns import Lighting, PatternFamily, Shot
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import Digital
 
@@ -47,9 +47,15 @@ def plan_request(bench: Bench, request: Request) -> Plan:
     MitsimError when the request does not fit the bench, or no light of the projector reaches the camera.
     """
     lighting = bench.family(request.patterns, request.seed).lighting
-    plan = make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
+    plan = _planned(bench, lighting, request)
     cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds)
     return replace(plan, request=request, cost=cost)
+
+
+def _planned(bench: Bench, lighting: Lighting, request: Request) -> Plan:
+    """The plan of a capture, with what exposing and writing its frames takes."""
+    plan = make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
+    return plan.taking(**frame_seconds(bench, len(lighting.weights)))
 
 
 def trace_request(bench: Bench, plan: Plan, job: Job | None = None) -> Light:
@@ -127,19 +133,21 @@ def capture(
     lighting = family.lighting
     on_disk = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if output and resume else 0
     place = Path(output) if output else None
-    first_look = frames_cost(bench, Settings(bench.geometry.scene_distance), lighting, on_disk=on_disk)
+    exposing = sum(frame_seconds(bench, len(family.shots)).values())
+    first_look = frames_cost(bench, Settings(bench.geometry.scene_distance), lighting, exposing, on_disk)
     first_look.check(request.patterns, job.limits, place)
     head = RunHead.of(_configuration(bench, request))
     with _recorder(place, head, resume) as recorder:
         with job.clock.stage("plan"):
             plan = light.plan if light else plan
-            plan = plan or make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
-        cost = frames_cost(bench, plan.settings, lighting, 0.0 if light else plan.predicted_seconds, on_disk)
+            plan = plan or _planned(bench, lighting, request)
+        seconds = exposing if light else plan.predicted_seconds
+        cost = frames_cost(bench, plan.settings, lighting, seconds, on_disk)
         cost.check(request.patterns, job.limits, place)
         with job.clock.stage("transport"):
             light = light or trace_light(bench, plan, lighting, request.seed, _sampling(bench, request), job.progress)
         with job.clock.stage("truth"):
-            truth = light.truth
+            truth = light.apparent
         expected = light.frames(lighting, request.seed)
         with job.clock.stage("optics"):
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
@@ -148,9 +156,10 @@ def capture(
         exposer = Exposer(bench.rig, exposure_s, request.seed, light.simulation.physics.speckle)
         digital = digital_scale(bench, exposure_s)
         recorder.begin()
-        recorder.write_truth(truth, load_recipe().board_reflectance)
+        recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
         shooting = _Shooting(family, recorder, exposer)
         shooting.shoot(expected, job)
+        total = light.plan.total(totals.mc_error)
         manifest = RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
@@ -159,9 +168,12 @@ def capture(
             patterns=patterns,
             plan=plan.block(),
             mc_error=totals.mc_error,
+            total_error=total.value,
+            total_error_bound=total.bound,
             mc_to_sensor_noise=shooting.noise_ratio,
             sensor_noise=shooting.sensor_noise,
             heaviest_group=totals.heaviest,
+            truth_error=truth.error,
             paths=light.paths,
             lost_light=light.lost,
             seconds=job.clock.seconds(),
@@ -294,11 +306,17 @@ class _Shooting:
 
 def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
+    sensor = bench.sensor
+    full = sensor.superpixel_full_well_e * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn
+    largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
     return DigitalScale(
         exposure_s=exposure_s,
-        black_level_dn=bench.sensor.superpixel_black_level_dn,
-        gain_dn_per_e=bench.sensor.gain_dn_per_e,
-        dark_current_e_per_s=bench.sensor.superpixel_dark_current_e_per_s,
+        black_level_dn=sensor.superpixel_black_level_dn,
+        gain_dn_per_e=sensor.gain_dn_per_e,
+        dark_current_e_per_s=sensor.superpixel_dark_current_e_per_s,
+        read_noise_e=sensor.superpixel_read_noise_e,
+        step_dn=0.0 if sensor.largest_dn is None else 1.0,
+        saturation_dn=None if math.isinf(min(full, largest)) else float(min(np.floor(full), largest)),
     )
 
 

@@ -15,7 +15,7 @@ from itertools import islice
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.cost import frames_cost
+from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.exposer import Exposer, in_chunks
 from mitsim.capture.light import Light, Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan
@@ -90,7 +90,8 @@ class Session:
         with job.clock.stage("plan"):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
         by_pixel = Lighting(np.arange(n * n), np.broadcast_to(1.0, (self.shots, n * n)))
-        cost = frames_cost(self.bench, plan.settings, by_pixel, plan.predicted_seconds)
+        exposing = frame_seconds(self.bench, self.shots)["sensor"]
+        cost = frames_cost(self.bench, plan.settings, by_pixel, plan.predicted_seconds + exposing)
         cost.check("calibration", job.limits)
         return plan
 

@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import LARGEST, Positive, validated
+from mitsim.core.configuration import LARGEST, NonNegative, Positive, validated
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.jsonfile import plain, read_json, write_json
 
@@ -81,11 +81,44 @@ class Digital(_Part):
     gain_dn_per_e: Positive = Field(description="digital numbers per electron")
     black_level_dn: BinnedSum = Field(description="digital number of a (binned) pixel without charge")
     dark_current_e_per_s: BinnedSum = Field(description="dark electrons a second and (binned) pixel")
+    read_noise_e: BinnedSum | None = Field(
+        default=None, description="standard deviation of a (binned) pixel's reading [electrons]; none: not stated"
+    )
+    step_dn: BinnedSum | None = Field(
+        default=None, description="step between digital numbers; 0: real output; none: not stated, taken as 0"
+    )
+    saturation_dn: BinnedSum | None = Field(
+        default=None, description="digital number at the full well or the ADC's end; none: never, or not stated"
+    )
+    exposure_uncertainty: float = Field(
+        default=0.0, ge=0, le=1, description="relative standard uncertainty of exposure times light"
+    )
+
+    @property
+    def noise_is_stated(self) -> bool:
+        """Whether all of a frame's noise is known, and not only what its light makes."""
+        return self.read_noise_e is not None
 
     def rate(self, dn: npt.NDArray[Any]) -> FloatArray:
         """Photoelectrons a second of digital numbers ``dn``."""
         electrons = (dn.astype(np.float64) - self.black_level_dn) / self.gain_dn_per_e
         return np.asarray(electrons / self.exposure_s - self.dark_current_e_per_s)
+
+    def variance(self, light: FloatArray | float, shots: int = 1) -> FloatArray:
+        """Noise variance [(electrons / s)^2] of a sum or difference of shots, after EMVA 1288: shot noise of light and
+        dark current, read noise, rounding; what is not stated counts as 0.
+
+        Parameters
+        ----------
+        light
+            sum of the :meth:`rate` of these shots, any shape; measured light keeps the variance's mean unbiased.
+        shots
+            their number.
+        """
+        rounding = (self.step_dn or 0.0) ** 2 / 12 / self.gain_dn_per_e**2
+        still = shots * ((self.read_noise_e or 0.0) ** 2 + rounding)
+        charge = np.asarray(light) + shots * self.dark_current_e_per_s
+        return np.asarray(charge / self.exposure_s + still / self.exposure_s**2)
 
 
 class ShotFile(_Part):
@@ -219,6 +252,11 @@ class RunManifest(RunHead):
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
     plan: Plain | None = Field(default=None, description="the effect plan, see Plan")
     mc_error: float | None = Field(default=None, description="relative Monte Carlo error of the expected frames")
+    total_error: float | None = Field(
+        default=None,
+        description="relative error of the expected frames, all in all: the plan's systematic error and that",
+    )
+    total_error_bound: float | None = Field(default=None, description="what it is below, at 95 %")
     mc_to_sensor_noise: float | None = Field(
         default=None, description="largest ratio of that to a frame's sensor noise"
     )
@@ -228,11 +266,22 @@ class RunManifest(RunHead):
         description="largest part of the Monte Carlo variance in one of 8 groups of the light; above 0.8 a few "
         "heavy paths make it",
     )
+    truth_error: float | None = Field(
+        default=None, description="standard error of truth.exr, rms over the image; 1 is the board's reflectance"
+    )
     paths: int | None = Field(default=None, description="connections and paths traced")
     lost_light: float | None = Field(
         default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"
     )
     seconds: dict[str, float] = Field(default={}, description="by stage")
+
+
+class FactorNoise(_Part):
+    """How far a calibration's factors are from those of the camera."""
+
+    left: NonNegative = Field(description="standard deviation of each number of the left factor, as its noise makes it")
+    right: NonNegative = Field(description="the same of the right factor")
+    unexplained: NonNegative = Field(description="part of the responses that no separable camera explains, rms")
 
 
 class CalibrationManifest(_Head):
@@ -246,6 +295,7 @@ class CalibrationManifest(_Head):
     )
     digital: Digital | None = Field(default=None, description="of the session's frames")
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
+    noise: FactorNoise | None = Field(default=None, description="how exact the factors are; none: not stated")
     result: Plain = Field(default={}, description="the session in numbers, as `calibrate --json` gives them")
     estimate: str | None = Field(default=None, description="the estimator's own words")
     verdict: str | None = Field(

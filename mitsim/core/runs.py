@@ -11,6 +11,7 @@ import shutil
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,43 @@ _SHOWN = 3
 def frame_name(index: int) -> str:
     """File name of shot number ``index`` in its run folder."""
     return f"frame_{index:05d}.exr"
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What was measured under one pattern.
+
+    Attributes
+    ----------
+    frame
+        (rows, columns) [electrons/s], of a signed pattern the difference of its halves.
+    row, column
+        indices (i, j) of the pattern.
+    light
+        (rows, columns) [electrons/s] sum of its shots as they were read: what their shot noise is of.
+    shots
+        their number.
+    saturated
+        readings of them at the full well or the ADC's end.
+    """
+
+    frame: FloatArray
+    row: int
+    column: int
+    light: FloatArray
+    shots: int
+    saturated: int
+
+    def __add__(self, other: Measurement) -> Measurement:
+        """Both halves of a signed pattern as one measurement."""
+        shots, saturated = self.shots + other.shots, self.saturated + other.saturated
+        return Measurement(self.frame + other.frame, self.row, self.column, self.light + other.light, shots, saturated)
+
+    @property
+    def power(self) -> FloatArray:
+        """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
+        # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
+        return np.square(self.frame) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
 
 
 class Capture:
@@ -89,6 +127,12 @@ class Capture:
         known = TRUTH in self._memory if self.folder is None else (self.folder / TRUTH).is_file()
         return self._channel(TRUTH, "reflectance") if known else None
 
+    @cached_property
+    def truth_standard_error(self) -> FloatArray | None:
+        """(n, n) standard error of :attr:`truth`, from sampling; None where nobody stated it, as in 0.4.0."""
+        known = self.truth is not None and "standard_error" in self._read(TRUTH)[0]
+        return self._channel(TRUTH, "standard_error") if known else None
+
     @property
     def truth_board(self) -> float | None:
         """Reflectance of the board that counts as 1 in :attr:`truth`, where that is known."""
@@ -116,10 +160,16 @@ class Capture:
         return self.manifest.patterns.matrices
 
     def measurements(self, shape: tuple[int, int] | None = None) -> Iterator[tuple[FloatArray, int, int]]:
-        """(frame (rows, columns) [electrons/s], i, j) of every pattern, read one at a time; the halves of a signed one
-        come as their difference. MitsimError for a frame that is missing, damaged, not finite or of another ``shape``
-        than is asked for."""
-        waiting: dict[tuple[int, int], FloatArray] = {}
+        """(frame, i, j) of every pattern; see :meth:`measured`, which also takes ``shape``."""
+        for each in self.measured(shape):
+            yield each.frame, each.row, each.column
+
+    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+        """What was measured under every pattern, read one at a time; the halves of a signed one come as their
+        difference. MitsimError for a frame that is missing, damaged, not finite or of another ``shape`` than is asked
+        for."""
+        digital = self.manifest.digital
+        waiting: dict[tuple[int, int], Measurement] = {}
         for shot in self.manifest.patterns.captures:
             index = (shot.row, shot.column)
             dn = self._channel(shot.file, "DN")
@@ -128,17 +178,20 @@ class Capture:
                     f"{(self.folder or Path()) / shot.file}: the frame is {_size(dn.shape)}, but the calibration's are "
                     f"{_size(shape or ())}; calibrate this camera"
                 )
-            frame = self.manifest.digital.rate(dn) * (shot.sign or 1)
+            light = digital.rate(dn)
+            full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
+            half = Measurement(light * shot.sign if shot.sign else light, *index, light, 1, full)
             if shot.sign and index not in waiting:
-                waiting[index] = frame
+                waiting[index] = half
                 continue
-            yield waiting.pop(index, 0.0) + frame, *index
+            yield waiting.pop(index) + half if shot.sign else half
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 that captures of the same frames share, in memory or on disk."""
         manifest = self.manifest
-        digest = hashlib.sha256(manifest.digital.model_dump_json().encode())
+        # What is not stated is left out: folders of 0.4.0 keep their fingerprints.
+        digest = hashlib.sha256(manifest.digital.model_dump_json(exclude_defaults=True).encode())
         digest.update(manifest.patterns.model_dump_json().encode() + manifest.configuration_sha256.encode())
         for shot in manifest.patterns.captures:
             if self.folder and not (manifest.configuration_sha256 and shot.file in manifest.checksums):
@@ -151,9 +204,12 @@ class Capture:
         manifest = self.manifest
         known = (
             "mc_error",
+            "total_error",
+            "total_error_bound",
             "mc_to_sensor_noise",
             "sensor_noise",
             "heaviest_group",
+            "truth_error",
             "lost_light",
             "seconds",
             "warnings",
@@ -310,9 +366,17 @@ class RunMemory:
         """
         self._files[frame_name(index)] = channels, metadata
 
-    def write_truth(self, reflectance: FloatArray, board: float) -> None:
-        """Keep the truth ``reflectance`` (n, n), relative to a ``board`` of that reflectance."""
-        self._files[TRUTH] = _truth(reflectance, board)
+    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
+        """Keep the truth.
+
+        Parameters
+        ----------
+        reflectance, board
+            (n, n), relative to a board of that reflectance.
+        standard_error
+            (n, n) of it, where known.
+        """
+        self._files[TRUTH] = _truth(reflectance, board, standard_error)
 
     def finish(self, manifest: RunManifest) -> Capture:
         """The capture of that ``manifest``."""
@@ -370,9 +434,17 @@ class RunFolder:
         """
         self.write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
 
-    def write_truth(self, reflectance: FloatArray, board: float) -> None:
-        """Write the truth ``reflectance`` (n, n), relative to a ``board`` of that reflectance."""
-        self.write(TRUTH, *_truth(reflectance, board))
+    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
+        """Write the truth.
+
+        Parameters
+        ----------
+        reflectance, board
+            (n, n), relative to a board of that reflectance.
+        standard_error
+            (n, n) of it, where known.
+        """
+        self.write(TRUTH, *_truth(reflectance, board, standard_error))
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
         """Write a file of the run.
@@ -410,8 +482,13 @@ class RunFolder:
         return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": _pixels(channels)}
 
 
-def _truth(reflectance: FloatArray, board: float) -> tuple[Channels, Metadata]:
-    return {"reflectance": reflectance.astype(np.float32)}, {"board_reflectance": board}
+def _truth(
+    reflectance: FloatArray, board: float, standard_error: FloatArray | None
+) -> tuple[dict[str, Channel], Metadata]:
+    channels: dict[str, Channel] = {"reflectance": reflectance.astype(np.float32)}
+    if standard_error is not None:
+        channels["standard_error"] = standard_error.astype(np.float32)
+    return channels, {"board_reflectance": board}
 
 
 def _size(shape: tuple[int, ...]) -> str:

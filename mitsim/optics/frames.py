@@ -31,7 +31,7 @@ _AT_ONCE = 32
 """Frames held at a time: enough to keep all processors busy; 64 MiB of a sensor of 512 pixels."""
 _LARGEST_BASIS = 256
 """Classes whose frames are held to be mixed: 512 MiB of a sensor of 512 pixels."""
-_PROBES = 8
+PROBES = 8
 """Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`_probes`."""
 _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
@@ -207,6 +207,11 @@ def frames_in_memory(classes: int, shots: int) -> int:
     return (classes if _mixes(classes, shots) else _AT_ONCE) + _AT_ONCE
 
 
+def formed_frames(classes: int, shots: int) -> int:
+    """Frames that are formed for a run of so many ``classes`` and ``shots``, whose frames are asked for twice."""
+    return classes if _mixes(classes, shots) else 2 * shots
+
+
 def _mixes(classes: int, shots: int) -> bool:
     return classes <= min(_LARGEST_BASIS, shots)
 
@@ -274,6 +279,20 @@ class ExpectedFrames:
             else:
                 yield from self._frames(_mix(weights, irradiance), _mix(weights, deviation))
 
+    def by_group(self, columns: IntArray) -> FloatArray:
+        """(groups, shots, pixels, c) frames that each group of the light makes by itself, at c ``columns`` of pixels.
+
+        Nothing is set to zero that came out below it, so differences of frames stay linear in the light.
+        """
+        shots = sparse.csr_array(sparse.csr_array(self._weights) @ self._basis) if self._mixed else self._basis
+        frames = _seen(self._lights, shots, columns)
+        if self._ambient:
+            frames += _seen(self._ambient, sparse.csr_array(np.ones((1, 1))), columns)
+        if self._glint is not None:
+            shares = self._weights[:, self._glint.classes]
+            frames += np.tensordot(shares, self._glint.irradiance[:, :, columns], 1)
+        return frames
+
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) deviations of their groups."""
         frames, deviations = _formed(self._lights, self._basis[start:stop], self._seed)
@@ -339,13 +358,31 @@ def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_arr
     return sparse.csr_array((product.data, wide, product.indptr), shape=(basis.shape[0], light.shape[1]))
 
 
+def _seen(lights: Sequence[Filed], basis: sparse.csr_array, columns: IntArray) -> FloatArray:
+    """(groups, b, pixels, c) frames of mixtures ``basis`` (b, rows) of each group's light, at c ``columns``."""
+    pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
+    chosen = np.zeros((pixels, len(columns)))
+    chosen[columns, np.arange(len(columns))] = 1
+    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
+    frames = np.zeros((groups, basis.shape[0], pixels, len(columns)))
+
+    def form(row: int) -> None:
+        for optics, parts in mixed:
+            flat, _ = _row(_mean_of([part[[row]] for part in parts]), 0)
+            seen = optics.probe(flat, _aligned(flat, [_row(part, row) for part in parts]), chosen)
+            frames[:, row] += np.moveaxis(seen.reshape(pixels, groups, -1), 1, 0)
+
+    in_threads(form, range(basis.shape[0]))
+    return frames
+
+
 def _probes(pixels: int, seed: int) -> FloatArray:
     """(pixels, 1 + 8) vectors v with E sum |A v|^2 = ||A||^2: the constant one exactly, the rest by random signs.
 
     Most of a frame's error is common to its columns, and a few signs alone would see that part with 12 % scatter.
     """
     constant = np.full((pixels, 1), pixels**-0.5)
-    signs = stream(seed, "probe").choice((-1.0, 1.0), size=(pixels, _PROBES)) / _PROBES**0.5
+    signs = stream(seed, "probe").choice((-1.0, 1.0), size=(pixels, PROBES)) / PROBES**0.5
     return np.concatenate([constant, signs - constant @ (constant.T @ signs)], axis=1)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.framefile import checksum, read_frame, write_frame
-from mitsim.core.manifests import CalibrationManifest, read_manifest, write_manifest
+from mitsim.core.manifests import CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.output import output_folder
 from mitsim.core.pictures import card, scaled, span
 from mitsim.core.runs import Capture, finite_channel, verify
@@ -59,13 +59,24 @@ class Factors:
     def of(cls, estimate: Estimate, manifest: CalibrationManifest) -> Factors:
         """The factors of an ``estimate``, of the camera that the ``manifest`` names."""
         left, right = (side.astype(np.float32).astype(np.float64) for side in (estimate.left, estimate.right))
-        update = {"estimate": str(estimate.status), "verdict": estimate.status.verdict.value}
+        update = {
+            "estimate": str(estimate.status),
+            "verdict": estimate.status.verdict.value,
+            "noise": _factor_noise(estimate),
+        }
         return cls(left, right, manifest.model_copy(update=update), estimate.status, estimate=estimate)
 
     @cached_property
     def condition(self) -> float:
         """The larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient."""
         return max(squared_condition(self.left), squared_condition(self.right))
+
+    @property
+    def sides(self) -> tuple[FloatArray, FloatArray]:
+        """Both factors as the solver takes them: without their columns' means where frames are centred."""
+        if not self.manifest.centre:
+            return self.left, self.right
+        return centred_columns(self.left), centred_columns(self.right)
 
     @property
     def ok(self) -> bool:
@@ -156,9 +167,7 @@ class Factors:
                 f"patterns {patterns.name!r} are for {lit[0]} x {lit[1]} scene pixels, but the factors have "
                 f"{rows} x {columns}; use patterns of that size"
             )
-        factors = self.left, self.right
-        if self.manifest.centre:
-            factors = centred_columns(self.left), centred_columns(self.right)
+        factors = self.sides
         # (K, m, n) stacks Phi diag(p_i): frame (i, j) is lefts[i] X rights[j]^T.
         lefts, rights = (
             factor[None] * side.T[:, None, :].astype(np.float64)
@@ -193,6 +202,17 @@ class Factors:
 
     def _sides(self) -> tuple[tuple[str, FloatArray], ...]:
         return tuple(zip(_FILES, (self.left, self.right), strict=True))
+
+
+def _factor_noise(estimate: Estimate) -> FactorNoise | None:
+    """How exact the factors of an ``estimate`` are; None where all is noise."""
+    left, right = (
+        error * float(np.linalg.norm(side)) / np.sqrt(side.size)
+        for side, error in zip((estimate.left, estimate.right), estimate.predicted_error, strict=True)
+    )
+    if not np.isfinite([left, right]).all():
+        return None
+    return FactorNoise(left=float(left), right=float(right), unexplained=estimate.unexplained)
 
 
 def load_calibration(folder: Path | str) -> Factors:

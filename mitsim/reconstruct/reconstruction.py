@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,19 +16,26 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, whole_file
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.pictures import card, png
 from mitsim.core.resources import Cost, Limits
-from mitsim.core.runs import Capture
+from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.reconstruct.misfit import Misfit, judge
+from mitsim.reconstruct.noise import FrameNoise, factor_energy
+from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.tv import solve_tv
+from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Propagation, Uncertainty, uncertainty
 
 METHODS = ("tikhonov", "tv")
-IMAGE_FILE, RESULT_FILE = "image.exr", "result.json"
+IMAGE_FILE, UNCERTAINTY_FILE, RESULT_FILE = "image.exr", "uncertainty.exr", "result.json"
 _BYTES_A_NUMBER = 32.0
 """Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
+_KEPT_NUMBERS = 1 << 25
+"""Pixels of all measurements up to which they are kept for a second look: 128 of 512 x 512, at most 512 MiB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +48,23 @@ class Reconstruction:
         (n, n') reflectance, 1 = the calibration's board, neither clipped nor normalised.
     lam
         lambda that was used, in the unit of (Phi_L Phi_R)^2; for ``tv`` the weight of the total variation.
-    rank, condition
-        of the whole model.
+    rank
+        of the whole model, the product of ``rank_sides``.
+    condition
+        the larger of ``condition_sides``; that of the whole model is their product, ``condition_whole``.
+    rank_sides, condition_sides
+        of scene rows and of scene columns.
     residual
         ||Y - model|| / ||Y|| over all frames.
     rounding
         what rounding may have changed, ||error|| / ||image||; None for ``tv``.
+    misfit
+        what of the measurements fits no image; None where there are no more data than unknowns.
+    uncertainties
+        standard uncertainty of the image by source; None for ``tv``, which is not linear in the frames.
     status
-        whether it can be trusted, what is wrong and what to do; flags of the capture and of the calibration count.
+        whether it can be trusted, what is wrong and what to do; misfit and flags of the capture and of the calibration
+        count.
     seconds
         by stage.
     inputs
@@ -58,8 +75,12 @@ class Reconstruction:
     lam: float
     rank: int
     condition: float
+    rank_sides: tuple[int, int]
+    condition_sides: tuple[float, float]
     residual: float
     rounding: float | None
+    misfit: Misfit | None
+    uncertainties: Uncertainty | None
     status: Status
     seconds: dict[str, float]
     inputs: dict[str, str | float]
@@ -69,19 +90,35 @@ class Reconstruction:
         """Whether the image can be used as it is."""
         return self.status.ok
 
+    @property
+    def condition_whole(self) -> float:
+        """Condition of the whole model; inf when rank deficient."""
+        return self.condition_sides[0] * self.condition_sides[1]
+
+    @property
+    def uncertainty(self) -> FloatArray | None:
+        """(n, n') standard uncertainty of the image, random and systematic parts together; without what lambda takes
+        away, which ``uncertainties.bias`` states."""
+        return self.uncertainties.total if self.uncertainties else None
+
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
         return {
             "lambda": self.lam,
             "rank": self.rank,
+            "rank_sides": self.rank_sides,
             "condition": self.condition,
+            "condition_whole": self.condition_whole,
+            "condition_sides": self.condition_sides,
             "residual": self.residual,
+            "misfit": self.misfit and self.misfit.summary(),
+            **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
             "status": str(self.status),
             "seconds": {**self.seconds, "total": sum(self.seconds.values())},
         }
 
     def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:
-        """Write image.exr, image.png (for display) and result.json.
+        """Write image.exr, image.png (for display), uncertainty.exr where it is known, and result.json.
 
         Parameters
         ----------
@@ -106,6 +143,9 @@ class Reconstruction:
         write_frame(
             folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
         )
+        (folder / UNCERTAINTY_FILE).unlink(missing_ok=True)
+        if self.uncertainties:
+            write_frame(folder / UNCERTAINTY_FILE, self.uncertainties.channels(), {"method": self.inputs["method"]})
         with whole_file(folder / "image.png") as part:
             part.write_bytes(png(self.image))
         write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
@@ -121,6 +161,7 @@ class Reconstruction:
         return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), facts))
 
 
+@single_threaded_blas()
 def reconstruct(
     shots: Capture, factors: Factors, lam: float | Literal["auto"] = "auto", method: str = "tikhonov"
 ) -> Reconstruction:
@@ -147,23 +188,99 @@ def reconstruct(
     asked = inputs(shots, factors, lam, method)
     factors.check_fit(shots)
     started = time.perf_counter()
-    prepared, frames = accumulated(shots, factors)
+    data = accumulated(shots, factors)
+    prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
     solution = prepared.solve(frames, lam) if method == "tikhonov" else solve_tv(prepared, frames, lam)
+    solved = time.perf_counter()
+    misfit = data.misfit(shots, factors, solution.image)
+    judged = time.perf_counter()
+    uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
+    status = misfit.judged(solution.status) if misfit else solution.status
     return Reconstruction(
         image=solution.image,
         lam=solution.lam,
         rank=prepared.rank,
         condition=prepared.condition,
+        rank_sides=(prepared.left.rank, prepared.right.rank),
+        condition_sides=(prepared.left.condition, prepared.right.condition),
         residual=solution.residual,
         rounding=getattr(solution, "rounding", None),
-        status=replace(solution.status, flags=_flags(shots, factors)),
-        seconds={"accumulate": added - started, "solve": time.perf_counter() - added},
+        misfit=misfit,
+        uncertainties=uncertainties,
+        status=replace(status, flags=(*status.flags, *_flags(shots, factors))),
+        seconds={
+            "accumulate": added - started,
+            "solve": solved - added,
+            "misfit": judged - solved,
+            "uncertainty": time.perf_counter() - judged,
+        },
         inputs=asked,
     )
 
 
-def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator]:
+@dataclass(frozen=True, eq=False)
+class Accumulated:
+    """A run's frames added up.
+
+    Attributes
+    ----------
+    prepared
+        the model, factorised.
+    frames, noise
+        sums of all frames, and of their noise.
+    kept
+        the frames themselves while they are few; all or none.
+    """
+
+    prepared: Prepared
+    frames: Accumulator
+    noise: FrameNoise
+    kept: tuple[Measurement, ...]
+
+    def misfit(self, shots: Capture, factors: Factors, image: FloatArray) -> Misfit | None:
+        """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
+
+        Parameters
+        ----------
+        shots, factors
+            that these sums are of.
+        image
+            their reconstruction, for what the factors' noise adds to the frames.
+        """
+        problem, stated = self.prepared.problem(self.frames), factors.manifest.noise
+        return judge(
+            self.prepared,
+            np.where(problem.sigma > 0, problem.projected, 0.0),
+            self.kept or shots.measured(),
+            self.noise,
+            factor_energy(self.prepared, shots.patterns, stated, image) if stated else None,
+            Evidence(factors, shots.patterns),
+        )
+
+    def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
+        """Standard uncertainty of a solution.
+
+        Parameters
+        ----------
+        shots, factors
+            that these sums are of.
+        solution
+            of these sums.
+        """
+        sides = factors.sides
+        calibrated = factors.manifest.digital.exposure_uncertainty if factors.manifest.digital else 0.0
+        return uncertainty(
+            Propagation(self.prepared, sides, shots.patterns, solution.lam),
+            self.noise,
+            factors.manifest.noise,
+            math.hypot(shots.manifest.digital.exposure_uncertainty, calibrated),
+            solution.image,
+            self.prepared.problem(self.frames),
+        )
+
+
+def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     """The model of ``shots`` and ``factors`` factorised, and every frame added. MitsimError when that takes more memory
     than is free, or a frame cannot be read."""
     left, right = shots.patterns
@@ -171,10 +288,14 @@ def accumulated(shots: Capture, factors: Factors) -> tuple[Prepared, Accumulator
     numbers = sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides)
     Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{shots.name}: factorising its patterns", Limits())
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
-    frames = prepared.accumulator()
-    for measurement, row, column in shots.measurements((len(factors.left), len(factors.right))):
-        frames.add(measurement, row, column)
-    return prepared, frames
+    frames, noise, kept = prepared.accumulator(), FrameNoise(shots.manifest), list[Measurement]()
+    few = left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= _KEPT_NUMBERS
+    for measurement in shots.measured((len(factors.left), len(factors.right))):
+        frames.add(measurement.frame, measurement.row, measurement.column)
+        noise.add(measurement)
+        if few:
+            kept.append(measurement)
+    return Accumulated(prepared, frames, noise, tuple(kept))
 
 
 def inputs(shots: Capture, factors: Factors, lam: float | str, method: str) -> dict[str, str | float]:

@@ -101,6 +101,11 @@ class Prepared:
         return max(self.left.condition, self.right.condition)
 
     @property
+    def condition_whole(self) -> float:
+        """cond(A) of the whole model, the product of its sides'; inf when rank deficient."""
+        return self.left.condition * self.right.condition
+
+    @property
     def rank(self) -> int:
         """Numerical rank of the whole model."""
         return self.left.rank * self.right.rank
@@ -112,8 +117,13 @@ class Prepared:
 
     @property
     def extent(self) -> str:
-        """Rank and condition as every status ends with them."""
-        return f"Rank {self.rank} of {self.unknowns}, condition {self.condition:.1e}"
+        """Rank and condition of the whole model and of its two sides, as every status ends with them."""
+        left, right = self.left, self.right
+        return (
+            f"Rank {self.rank} of {self.unknowns} (rows {left.rank} of {left.scene_size}, columns {right.rank} of "
+            f"{right.scene_size}), condition {self.condition_whole:.1e} (rows {left.condition:.1e}, columns "
+            f"{right.condition:.1e})"
+        )
 
     def accumulator(self) -> Accumulator:
         """An empty sum to add frames to."""

@@ -19,6 +19,8 @@ class Verdict(Enum):
     """Some directions are not measured, and nothing fills them."""
     ILL_CONDITIONED = "ill-conditioned"
     """Rounding may change what is seen."""
+    MISFIT = "misfit"
+    """Measurements hold more than any image explains."""
     NOT_CONVERGED = "not converged"
     """The iterations ended before the image stood still."""
     CALIBRATED = "calibrated"

@@ -11,6 +11,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file, looking_beside
+from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 
@@ -23,8 +24,9 @@ class LoadedScene:
 
     ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
     pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
-    other emitters; ``mirrors`` tells whether a surface reflects or transmits light in single directions, ``glossy``
-    whether one does in lobes. ``files`` lists all that Mitsuba read, the scene first.
+    other emitters; ``mirrors`` tells whether a surface reflects or bends light into single directions, ``glossy``
+    whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
+    estimators must refuse it.
     """
 
     path: Path
@@ -36,6 +38,7 @@ class LoadedScene:
     lamps: tuple[mi.Emitter, ...]
     mirrors: bool
     glossy: bool
+    unfit: Unfit
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -57,7 +60,7 @@ def load_scene(
     defines
         values of its parameters by name.
     needs_projector
-        refuse a scene without exactly one projector.
+        refuse a scene without exactly one projector, or one that the factored estimator cannot render.
     outside
         allow files outside the scene's folder.
 
@@ -67,6 +70,8 @@ def load_scene(
         one line that names the file for anything wrong with it.
     """
     checked = check_file(path, defines or {}, outside)
+    if needs_projector and checked.unfit.factored is not None:
+        raise checked.unfit.factored
     checked.config.variant = mi.variant()
     with looking_beside(checked.outline):
         scene = mi.parser.instantiate(checked.config, checked.state)
@@ -91,14 +96,15 @@ def load_scene(
         except MitsimError:
             if needs_projector:
                 raise
+    facts = *_polished(scene), checked.unfit
     if grid is None:
-        return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *_polished(scene))
+        return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
-    return LoadedScene(path, checked.files, scene, cameras[0], projectors[0], grid, lamps, *_polished(scene))
+    return LoadedScene(path, checked.files, scene, cameras[0], projectors[0], grid, lamps, *facts)
 
 
 def _polished(scene: mi.Scene) -> tuple[bool, bool]:
-    """Whether a surface of the scene has a delta component, and whether one has a glossy component."""
+    """Whether a surface of the scene is a mirror or bends light, and whether one has a glossy component."""
     flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
-    delta, glossy = mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy
-    return any(mi.has_flag(own, delta) for own in flags), any(mi.has_flag(own, glossy) for own in flags)
+    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+    return any(own & mirror for own in flags), any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)

@@ -98,7 +98,7 @@ class Comparison:
 
     def _idealised(self, family: PatternFamily) -> Recovery:
         """The paper's model of the same scene, with noise of its own."""
-        camera, flux = self._ideal, float(self.light.board_flux.mean())
+        camera, flux = self._ideal, float(self.light.apparent.board_flux.mean())
         expected = camera.frames(family, self.light.truth * flux)
         exposer = Exposer(camera.bench.rig, peak_time(camera.bench, expected), self.light.seed + 1)
         model = prepare(*camera.calibrated(flux), family.left, family.right, centre=camera.centre)
@@ -107,7 +107,7 @@ class Comparison:
     def _recovery(self, exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, model: Prepared) -> Recovery:
         (sums,) = accumulate(exposer, family, expected, [model])
         solution = model.solve(sums, "auto")
-        quality = Quality.of(solution.image, self.light.truth)
+        quality = Quality.of(solution.image, self.light.truth, self.light.apparent.error)
         return Recovery(solution.image, quality, solution.lam, str(solution.status))
 
 

@@ -6,6 +6,7 @@ families and exposure conventions uses the same light, which is traced once.
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from collections.abc import Mapping
@@ -40,7 +41,8 @@ _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)--
 @dataclass(frozen=True)
 class DemoResult:
     """What `mitsim demo` reports: PSNR [dB] by family, rendered and idealised, at equal peak, and by exposure
-    convention; what the main family gains over uniform light, as a number and in words; and where the page is."""
+    convention; what the main family gains over uniform light, as a number and in words; the truth's standard error; and
+    where the page is."""
 
     psnr: dict[str, float]
     psnr_ideal: dict[str, float]
@@ -48,6 +50,7 @@ class DemoResult:
     gain_db: float
     verdict: str
     mc_error: float
+    truth_error: float
     seconds: dict[str, float]
     report: str
     warnings: tuple[str, ...]
@@ -62,7 +65,8 @@ class DemoResult:
             f"{label(name):>14}: {value:5.1f} dB rendered and calibrated, {self.psnr_ideal[name]:5.1f} dB idealised"
             for name, value in self.psnr.items()
         ]
-        return [*table, f"{self.verdict}.", f"Report: {self.report}"]
+        truth = f"The truth is good to {-20 * math.log10(self.truth_error):.1f} dB."
+        return [*table, f"{self.verdict}.", *([truth] if self.truth_error else ()), f"Report: {self.report}"]
 
 
 def demo(bench: Bench, output: Path | str, request: Request | None = None, job: Job | None = None) -> DemoResult:
@@ -133,6 +137,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
         gain_db=psnr[request.patterns] - psnr["uniform"],
         verdict=page.verdict,
         mc_error=shots.manifest.mc_error or 0.0,
+        truth_error=light.apparent.error,
         seconds=job.clock.seconds(),
         report=str(report),
         warnings=evidence.warnings,
@@ -189,7 +194,8 @@ def _page(evidence: _Evidence) -> ReportData:
         seeds={"root": light.seed},
         versions=versions(),
         notes=(
-            "PSNR has peak 1 and no gain or offset fit; truth is apparent reflectance relative to the board.",
+            "PSNR has peak 1 and no gain or offset fit; truth is apparent reflectance relative to the board, with a "
+            f"standard error of {light.apparent.error:.1e} from sampling of its own.",
             "Idealised: the paper's model with its own exact factors and the same sensor noise.",
             "lambda is chosen by an unbiased risk estimate; no result has seen the truth.",
             *evidence.warnings,

@@ -164,7 +164,7 @@ def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
     request = request.changed(effects={**request.effects, "diffraction": True})
     families = [bench.family(name, request.seed) for name in dict.fromkeys((request.patterns, "uniform"))]
     light = bench.light(job=job, **request.model_dump())
-    trials = _Trials(families, light.truth, float(light.board_flux.mean()), request.seed)
+    trials = _Trials(families, light.truth, float(light.apparent.board_flux.mean()), request.seed)
     shadows, quality = [], []
     for done, mask in enumerate(MASKS):
         job.progress("idealised frames", done / len(MASKS))

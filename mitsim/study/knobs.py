@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,9 +12,10 @@ import numpy as np
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import names, present
-from mitsim.capture.evidence import GROUPS, Evidence, Settings
+from mitsim.capture.evidence import GROUPS, Evidence, Part, Settings
 from mitsim.capture.light import Light, Sampling, Target, trace_light
 from mitsim.capture.plan import Plan, SceneFacts, decide
+from mitsim.capture.prices import paces_of, tracing_seconds
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -127,7 +127,7 @@ def _lights(bench: Bench) -> Iterator[tuple[str, Bench]]:
 
 def _tracing(settings: Settings, evidence: Evidence) -> float:
     """Seconds of tracing what the settings predict, at the pilot's pace."""
-    return evidence.connecting(settings, settings.anchors) + evidence.following(settings)
+    return sum(tracing_seconds(evidence, settings, paces_of(evidence)).values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,14 +147,15 @@ class Stand:
 
     def plan(self, accuracy: float) -> Plan:
         """What the evidence calls for at an ``accuracy``."""
-        return decide(accuracy, self.evidence, len(self.family.lighting.weights), SceneFacts.of(self.bench))
+        return decide(accuracy, self.evidence, SceneFacts.of(self.bench))
 
     def finest(self, plan: Plan, margin: float) -> Plan:
         """Everything on, one step finer than ``plan`` in each number, and its accuracy over ``margin`` of noise."""
         evidence, now = self.evidence, plan.settings
-        anchors = next((count for count in evidence.anchor_error if count > now.anchors), now.anchors)
-        layers = next((count for count in evidence.layer_error if count > len(now.depths)), len(now.depths))
-        cells = next((count for count in evidence.cell_error if count > now.subdivision), now.subdivision)
+        chosen = {"anchors": now.anchors, "layers": len(now.depths), "cells": now.subdivision}
+        anchors, layers, cells = (
+            next((finer for finer in evidence.ladders[name] if finer > count), count) for name, count in chosen.items()
+        )
         settings = replace(
             now,
             anchors=anchors,
@@ -168,9 +169,8 @@ class Stand:
 
     def discretisation(self, settings: Settings) -> float:
         """Relative error that the numbers in ``settings`` are predicted to leave."""
-        anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
-        errors = self.evidence
-        return math.hypot(errors.anchor_error[anchors], errors.layer_error[layers], errors.cell_error[cells])
+        counts = {"anchors": settings.anchors, "layers": len(settings.depths), "cells": settings.subdivision}
+        return self.evidence.error(*(Part(name, count) for name, count in counts.items())).value
 
     def trace(self, trial: Trial, seed: int) -> Light:
         """Light of a ``trial``, by the family's classes, from a ``seed``."""

@@ -15,19 +15,50 @@ from numpy.typing import NDArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.runs import Capture
 
+_LIMITED = ", which limits the PSNR"
 Image = NDArray[np.floating[Any]]
 
 _SSIM_WINDOW = 7
 """Pixels a side; scikit-image's default."""
+_LIMITS_DB = 10.0
+"""How far above an image's PSNR the truth must be: nearer, it makes more than a tenth of the squared error."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """How close an image is to the truth: ``psnr_db`` as :func:`psnr`, and ``ssim`` as :func:`ssim`; None for images
-    smaller than its window."""
+    """How close an image is to the truth.
+
+    Attributes
+    ----------
+    psnr_db
+        as :func:`psnr`.
+    ssim
+        as :func:`ssim`; None for images smaller than its window.
+    truth_error
+        standard error of the truth, rms over the image; None where nobody stated it.
+    """
 
     psnr_db: float
     ssim: float | None
+    truth_error: float | None = None
+
+    @property
+    def truth_db(self) -> float | None:
+        """PSNR [dB] of the truth against exact values: no image can be judged beyond it."""
+        if self.truth_error is None:
+            return None
+        return float("inf") if self.truth_error == 0 else float(-20 * np.log10(self.truth_error))
+
+    @property
+    def limited_by_truth(self) -> bool:
+        """Whether the truth's own error makes more than a tenth of the squared error."""
+        return self.truth_db is not None and self.truth_db - self.psnr_db < _LIMITS_DB
+
+    def __str__(self) -> str:
+        text = f"PSNR {self.psnr_db:.2f} dB" + ("" if self.ssim is None else f", SSIM {self.ssim:.3f}")
+        if self.truth_db is None:
+            return text
+        return f"{text}, truth good to {self.truth_db:.1f} dB{_LIMITED if self.limited_by_truth else ''}"
 
     @property
     def is_image(self) -> bool:
@@ -35,9 +66,23 @@ class Quality:
         return self.psnr_db > 0
 
     @classmethod
-    def of(cls, image: Image, truth: Image) -> Quality:
-        """That of ``image`` (rows, columns) beside ``truth``; MitsimError as :func:`psnr`."""
-        return cls(psnr(image, truth), ssim(image, truth) if min(truth.shape) >= _SSIM_WINDOW else None)
+    def of(cls, image: Image, truth: Image, truth_error: float | None = None) -> Quality:
+        """That of an image.
+
+        Parameters
+        ----------
+        image, truth
+            (rows, columns) each.
+        truth_error
+            rms standard error of the truth, where known.
+
+        Raises
+        ------
+        MitsimError
+            as :func:`psnr`.
+        """
+        similar = ssim(image, truth) if min(truth.shape) >= _SSIM_WINDOW else None
+        return cls(psnr(image, truth), similar, truth_error)
 
 
 def psnr(image: Image, truth: Image) -> float:
@@ -75,8 +120,19 @@ def truth_for(shots: Capture, board_reflectance: float | None = None) -> NDArray
     It is relative to a board of ``board_reflectance`` where that and the truth's own board are known, otherwise to the
     latter, that of the shipped session recipe.
     """
-    truth, board = shots.truth, shots.truth_board
-    return truth if truth is None or board_reflectance is None or board is None else truth * (board / board_reflectance)
+    return None if shots.truth is None else shots.truth * _rescaling(shots, board_reflectance)
+
+
+def truth_error_for(shots: Capture, board_reflectance: float | None = None) -> float | None:
+    """Standard error of :func:`truth_for` the ``shots`` and ``board_reflectance``, rms over the image; None where
+    nobody stated it."""
+    error = shots.truth_standard_error
+    return None if error is None else float(np.sqrt(np.mean(np.square(error)))) * _rescaling(shots, board_reflectance)
+
+
+def _rescaling(shots: Capture, board_reflectance: float | None) -> float:
+    board = shots.truth_board
+    return 1.0 if board_reflectance is None or board is None else board / board_reflectance
 
 
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -12,7 +12,7 @@ from mitsim.core.runs import load_run
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruction import Reconstruction, inputs, may_replace
 from mitsim.reconstruct.reconstruction import reconstruct as solve
-from mitsim.study.metrics import Quality, truth_for
+from mitsim.study.metrics import Quality, truth_error_for, truth_for
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ class Judged:
     def summary(self) -> dict[str, Any]:
         """All but the image, by the keys of the command line's JSON."""
         measured = {"psnr": self.quality and self.quality.psnr_db, "ssim": self.quality and self.quality.ssim}
-        return {**measured, **self.reconstruction.summary(), "output": self.output}
+        error = self.quality and self.quality.truth_error
+        return {**measured, "truth_error": error, **self.reconstruction.summary(), "output": self.output}
 
 
 def reconstruct(
@@ -53,14 +54,15 @@ def reconstruct(
     started = time.perf_counter()
     shots, factors = load_run(run), load_calibration(calibration)
     factors.check_fit(shots)
-    truth = truth_for(shots, factors.manifest.board_reflectance)
+    board = factors.manifest.board_reflectance
+    truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
     replaces = may_replace(Path(output), inputs(shots, factors, lam, method), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter() - started
         image = solve(shots, factors, lam, method)
         judged = Judged(
             reconstruction=replace(image, seconds={"read": read, **image.seconds}),
-            quality=None if truth is None else Quality.of(image.image, truth),
+            quality=None if truth is None else Quality.of(image.image, truth, truth_error),
             output=str(folder),
         )
         judged.reconstruction.write(folder, judged.summary())

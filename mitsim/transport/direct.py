@@ -1,10 +1,13 @@
 """Direct light: every projector pixel's rays, followed to the first surface and on to each anchor of the sensor.
 
 A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.receiver`), or to one random
-point of the sensor. All anchors see the same points.
+point of the sensor. All anchors see the same points. Where surfaces let light pass (:mod:`mitsim.transport.passage`),
+so does the ray: of the points that it meets one is handed out, drawn in proportion to its light.
 """
 
 from __future__ import annotations
+
+from copy import copy
 
 import drjit as dr
 import mitsuba as mi
@@ -14,11 +17,11 @@ import numpy.typing as npt
 from mitsim.optics.anchors import anchor_positions
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.coordinates import x_y
-from mitsim.transport.histogram import DIRECT, Deposits
+from mitsim.transport.histogram import DIRECT, Deposits, Sightings
 from mitsim.transport.paths import Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, sampled_wavelengths
-from mitsim.transport.sampling import panchromatic, stratified, streams
+from mitsim.transport.sampling import panchromatic, shuffled, stratified, streams
 
 IntArray = npt.NDArray[np.int64]
 
@@ -71,10 +74,15 @@ class DirectTracer(Tracer):
         jitter, weight = self._place(number, row, column, stratified(sample, shared))
         wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
-        si = self.scene.ray_intersect(ray)
-        reception = self.receiver.receive(si, -ray.d, self._sensor_point(row, column, rng), si.is_valid())
-        value = panchromatic(reception.irradiance * self.rays.flux(pixel, wavelengths) * spectral) * (weight * share)
-        return [Deposits.fetched(reception.sightings(value, pixel), DIRECT, (row, column))]
+        sensor = self._random_point(sample, shared, rng) if self.spread else self._anchor(row, column)
+        flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
+        if self.receiver.passage.open:
+            seen = self._passing(ray, sensor, flux, pixel, rng)
+        else:
+            si = self.scene.ray_intersect(ray)
+            reception = self.receiver.receive(si, -ray.d, sensor, si.is_valid())
+            seen = reception.sightings(panchromatic(reception.irradiance * flux), pixel)
+        return [Deposits.fetched(seen, DIRECT, (row, column))]
 
     def _pair(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """A lane's place in the list of pixels, its anchor, and its weight."""
@@ -89,10 +97,69 @@ class DirectTracer(Tracer):
         del number, row, column
         return jitter, mi.Float(1)
 
-    def _sensor_point(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
-        """Anchors, or random points of the sensor, in the camera's frame."""
-        if self.spread:
-            side = 2 * dr.opaque(mi.Float, self.receiver.geometry.half_width)
-            return mi.Point3f((rng.next_float32() - 0.5) * side, (rng.next_float32() - 0.5) * side, 0)
+    def _passing(
+        self, ray: mi.Ray3f, sensor: mi.Point3f, flux: mi.Spectrum, pixel: mi.UInt32, rng: mi.PCG32
+    ) -> Sightings:
+        """Light of rays that go on through what lets them pass."""
+        passage = self.receiver.passage
+
+        def further(
+            active: mi.Bool, ray: mi.Ray3f, flux: mi.Spectrum, seen: Sightings, rng: mi.PCG32
+        ) -> tuple[object, ...]:
+            si = self.scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            part = passage.straight(si, active)
+            onward = passage.onward(si, ray.d)
+            reception = self.receiver.receive(si, -ray.d, sensor, active)
+            light = panchromatic(reception.irradiance * flux)
+            seen = seen.joined_by(reception.sightings(light, pixel), rng)
+            flux = flux * part
+            return active & (dr.max(flux) > 0), onward, flux, seen, rng
+
+        state = mi.Bool(True), ray, flux, Sightings.none(), rng
+        seen: Sightings = dr.while_loop(state, lambda active, *_: active, further)[3]
+        return seen
+
+    def _anchor(self, row: mi.UInt32, column: mi.UInt32) -> mi.Point3f:
+        """Anchors, in the camera's frame."""
         positions = mi.Float(self.positions.astype(np.float32))
         return mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
+
+    def _random_point(self, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32) -> mi.Point3f:
+        """Random points of the sensor, in the camera's frame; ``shared`` belongs to all samples of a stream."""
+        return self._on_sensor(mi.Point2f(rng.next_float32(), rng.next_float32()))
+
+    def _on_sensor(self, point: mi.Point2f) -> mi.Point3f:
+        """Points of the unit square on the sensor, in the camera's frame."""
+        side = 2 * dr.opaque(mi.Float, self.receiver.geometry.half_width)
+        return mi.Point3f((point.x - 0.5) * side, (point.y - 0.5) * side, 0)
+
+
+class FluxTracer(DirectTracer):
+    """Direct light at the sensor as a whole: its points are stratified together with those of the projector's pixels.
+
+    Frames keep the plain random points that they are bit-equal with.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry
+    ) -> None:
+        """What is followed.
+
+        Parameters
+        ----------
+        scene, camera, projector
+            as loaded.
+        geometry
+            stands in for the camera's own.
+        """
+        super().__init__(scene, camera, projector, 1, geometry, spread=True)
+
+    def at(self, pixels: IntArray) -> FluxTracer:
+        """The same for the projector pixels ``pixels`` (m,) alone."""
+        part = copy(self)
+        part._pixels = pixels
+        return part
+
+    def _random_point(self, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32) -> mi.Point3f:
+        return self._on_sensor(stratified(shuffled(sample, shared), shared))

@@ -29,6 +29,7 @@ from mitsim.transport.cells import CellAxis, CellGrid
 from mitsim.transport.connection import ProjectorConnector
 from mitsim.transport.coordinates import x_y
 from mitsim.transport.histogram import Deposits, Sightings
+from mitsim.transport.passage import Passage
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import sampled_wavelengths
@@ -78,7 +79,7 @@ class FromCameraTracer(Tracer):
         """
         self.geometry: CameraGeometry = geometry or camera.geometry
         self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
-        self.connector = ProjectorConnector(projector)
+        self.connector, self.passage = ProjectorConnector(projector), Passage(scene)
 
     @property
     def lanes(self) -> int:
@@ -86,7 +87,8 @@ class FromCameraTracer(Tracer):
         return self.grid.shape[0] * self.grid.shape[1]
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return _Walk(self, seed, sample, lane).deposits(self.paths.mirrors or self.paths.interreflection)
+        further = self.paths.mirrors or self.paths.interreflection or self.passage.open
+        return _Walk(self, seed, sample, lane).deposits(further)
 
 
 class _Walk(Walk):
@@ -94,11 +96,11 @@ class _Walk(Walk):
 
     STATE = (
         *("active", "ray", "strength", "part", "bounce", "surfaces", "in_mirror", "mirrored", "by_delta", "travelled"),
-        *("rng", "inverse_depth", "came_from", "came_pdf", "kept"),
+        *("straight", "rng", "inverse_depth", "came_from", "came_pdf", "kept"),
     )
 
     def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, cell: mi.UInt32) -> None:
-        super().__init__(tracer.scene, tracer.paths.mirrors, tracer.paths.interreflection)
+        super().__init__(tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection)
         self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
         self.connector = tracer.connector
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
@@ -138,7 +140,7 @@ class _Walk(Walk):
     def vertex(self, first: bool) -> None:
         """Find the next vertex of every path, connect it to the lights, and leave it."""
         si = self.scene.ray_intersect(mi.RayDifferential3f(self.ray), mi.RayFlags.All, first, self.active)
-        if first or self.paths.mirrors:
+        if first or self.paths.mirrors or self.passage.open:
             # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
             self.inverse_depth = dr.select(
                 self.mirrored, dr.rcp((self.travelled + si.t) * self.slope), self.inverse_depth
@@ -155,31 +157,36 @@ class _Walk(Walk):
             self._connect(si, bsdf)
         for emitter in self.paths.emitters:
             self._light(si, bsdf, emitter)
-        if self.paths.mirrors or self.paths.interreflection:
+        if self.paths.mirrors or self.paths.interreflection or self.passage.open:
             self._leave(si, first)
 
     def _connect(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
         """Light of the projector that this vertex sends on along its path."""
-        connection = self.connector.connect(si, self.rng, self.active)
-        active = connection.valid & ~self.scene.ray_test(si.spawn_ray_to(connection.target), connection.valid)
+        # A vertex that is seen straight is the projector's side's.
+        connection = self.connector.connect(si, self.rng, self.active & ~self.straight)
+        seen, passed = self.passage.between(si, connection.target, connection.valid)
+        active = connection.valid & seen
         toward = si.to_local(connection.direction)
         if self.tracer.projector.aperture > 0 and self.paths.interreflection:
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, toward, active)
             value *= self._share(connection.pdf, pdf)
         else:
             value = bsdf.eval(mi.BSDFContext(), si, toward, active)
-        self._keep_of_projector(active, self._radiance(value * connection.weight), connection.pixel, self.surfaces)
+        self._keep_of_projector(
+            active, self._radiance(value * connection.weight * passed), connection.pixel, self.surfaces
+        )
 
     def _light(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, emitter: mi.Emitter) -> None:
         """The same for another light of the scene."""
         point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         ds, light = emitter.sample_direction(si, point, self.active)
         active = self.active & (ds.pdf > 0)
-        active &= ~self.scene.ray_test(si.spawn_ray_to(ds.p), active)
+        seen, passed = self.passage.between(si, ds.p, active)
+        active &= seen
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
         # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
         share = dr.select(ds.delta, 1, self._share(ds.pdf, pdf)) if self.paths.interreflection else 1
-        self._keep_seen("ambient", active, self._radiance(value * light) * share, self._lamps())
+        self._keep_seen("ambient", active, self._radiance(value * light * passed) * share, self._lamps())
 
     def _emitter_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a lamp that the path has run into."""
@@ -206,19 +213,23 @@ class _Walk(Walk):
     def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
         sample, value, going = self._sampled(si, mi.TransportMode.Radiance)
-        delta = is_delta(sample)
-        if first:
-            self.in_mirror = mi.Bool(delta)
-            self.part = dr.select(delta, 1, camera_part(sample.pdf))
+        delta, passing = is_delta(sample), self.passage.passes(sample)
+        if first or self.passage.open:
+            turned = self.straight & ~passing
+            self.in_mirror = dr.select(turned, delta, self.in_mirror)
+            self.part = dr.select(turned, dr.select(delta, 1, camera_part(sample.pdf)), self.part)
             if not self.paths.emitters:
                 going &= self.part > 0
+            self.straight &= passing
         self.strength *= value
-        self._end_some(going, self.mirrored, first)
-        self.mirrored &= delta
-        self.surfaces = dr.select(delta, self.surfaces, self.surfaces + 1)
+        self._end_some(going, self.mirrored, passing, first)
+        self.mirrored &= delta | passing
+        self.surfaces = dr.select(delta | passing, self.surfaces, self.surfaces + 1)
         self.travelled += si.t
-        self.came_from, self.came_pdf, self.by_delta = mi.Point3f(si.p), mi.Float(sample.pdf), mi.Bool(delta)
-        self.ray = si.spawn_ray(si.to_world(sample.wo))
+        self.came_from = dr.select(passing, self.came_from, si.p)
+        self.came_pdf = dr.select(passing, self.came_pdf, sample.pdf)
+        self.by_delta = dr.select(passing, self.by_delta, delta)
+        self.ray = self._onward(si, si.to_world(sample.wo), passing)
 
     # ---- light that is kept -----------------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.coordinates import rows_columns, turn_and_origin
 from mitsim.transport.host import channels, per_lane, vectors
+from mitsim.transport.passage import Passage
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 
 IntArray = npt.NDArray[np.int64]
@@ -55,7 +56,7 @@ class Crossings:
     ray
         (k,) number of the ray that was sent.
     chain
-        (k,) a number for the sequence of surfaces it met, and whether each reflected or transmitted it.
+        (k,) a number for the sequence of surfaces that turned it, and whether each reflected or transmitted it.
     sensor, tangent
         (k, 2) where it crosses [mm] and its tan-angles from there, (row, column) in index coordinates.
     throughput
@@ -130,13 +131,12 @@ class GlintRays:
             np.ones((count, len(self._colour))),
         )
         crossings = []
-        for depth in range(self._max_depth + 1):
+        for _ in range(self._max_depth + 1):
             si = self._intersect(rays)
             distance = np.where(per_lane(si.is_valid(), len(rays.index)), per_lane(si.t, len(rays.index)), np.inf)
             distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
             crossing, arrived = self._cross(rays, distance)
-            if depth:
-                crossings.append(crossing)
+            crossings.append(crossing)
             onward = self._bounce(rays, si, ~arrived & np.isfinite(distance))
             if not onward:
                 break
@@ -157,13 +157,14 @@ class GlintRays:
         reach = np.full(len(ahead), np.inf)
         np.divide(-origin[:, 2], direction[:, 2], out=reach, where=ahead)
         arrived = ahead & (reach < distance)
-        o, d, r = origin[arrived], direction[arrived], reach[arrived, None]
+        turned = arrived & (rays.chain != 0)
+        o, d, r = origin[turned], direction[turned], reach[turned, None]
         crossing = Crossings(
-            rays.index[arrived],
-            rays.chain[arrived],
+            rays.index[turned],
+            rays.chain[turned],
             _rows_columns(o + d * r),
             _rows_columns(d / d[:, 2:]),
-            rays.spectrum[arrived] @ self._colour,
+            rays.spectrum[turned] @ self._colour,
         )
         return crossing, arrived
 
@@ -188,7 +189,8 @@ class GlintRays:
             clear = _OFFSET * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
             reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
             code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
-            chain = rays.chain[chosen] * _CHAIN + code
+            straight = lobe.kind == int(mi.BSDFFlags.Null)
+            chain = rays.chain[chosen] if straight else rays.chain[chosen] * _CHAIN + code
             start = point[chosen] + direction * clear[:, None]
             if len(chosen):
                 onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
@@ -197,24 +199,31 @@ class GlintRays:
     def _sampled(self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.BSDFSample3f, FloatArray]:
         """Direction sample, and weights (k, channels) over all wavelength sets."""
         weights = []
+        choice = lobe.choice * (1 - dr.max(Passage.straight(si, active))) if lobe.by_chance else lobe.choice
         for wavelengths in self._wavelengths:
             if wavelengths is not None:
                 si.wavelengths = wavelengths
-            sample, weight = lobe.bsdf.sample(lobe.context, si, lobe.choice, mi.Point2f(0.5), active)
+            sample, weight = lobe.bsdf.sample(lobe.context, si, choice, mi.Point2f(0.5), active)
             weight = weight * sample.pdf if lobe.by_chance else weight
+            if lobe.kind == int(mi.BSDFFlags.Null):
+                # Whatever was sampled, light that passes keeps its direction.
+                weight, sample.wo = lobe.bsdf.eval_null_transmission(si, active), -si.wi
+                sample.sampled_type, sample.eta = mi.UInt32(lobe.kind), mi.Float(1)
+            weight = dr.select((sample.sampled_type & lobe.kind) != 0, weight, 0)
             weights.append(channels(mi.unpolarized_spectrum(weight), dr.width(si.t)))
         return sample, np.concatenate(weights, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Lobe:
-    """One way on at a material: the context and random number that choose it, and whether that was one of several.
+    """One way on at a material, of a ``kind``: the context and random number that choose it, and whether of several.
 
     If so, Mitsuba has divided the weight by the probability of the choice, which is the sample's ``pdf``.
     """
 
     bsdf: mi.BSDF
     context: mi.BSDFContext
+    kind: int
     choice: float = 0.5
     by_chance: bool = False
 
@@ -223,26 +232,31 @@ def _lobes(bsdf: mi.BSDF) -> list[_Lobe]:
     """Every delta part of a material, so that nothing is left to chance.
 
     Parts are chosen by type, because components of a ``twosided`` are not numbered alike on both sides; those of a
-    blend can be told by component only, and a ``mask`` obeys neither: its first and last outcome are taken (a mirror or
-    the reflection of glass, and the hole).
+    blend can be told by component only, and a ``mask`` obeys neither: its first and last outcome short of the hole are
+    taken (a mirror, or the reflection of glass and its transmission). What passes is the same for all materials.
     """
-    name, delta = str(bsdf), int(mi.BSDFFlags.Delta)
-    lobes = []
+    flags = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null
+    reflected, refracted, straight = (int(flag) for flag in flags)
+    name, delta = str(bsdf), reflected | refracted
+    lobes = [_Lobe(bsdf, _context(), straight)] if bsdf.flags() & straight else []
     if name.startswith("Mask"):
-        everything = mi.BSDFContext(mi.TransportMode.Importance)
-        return [_Lobe(bsdf, everything, choice, True) for choice in (0.0, 1 - 2**-24)]
+        outcomes = (reflected, 0.0), (refracted, 1 - 2**-23)
+        return lobes + [_Lobe(bsdf, _context(), kind, choice, True) for kind, choice in outcomes if bsdf.flags() & kind]
     if "BlendBSDF" in name:
         for component in range(bsdf.component_count()):
             if bsdf.flags(component) & delta:
-                lobes.append(_Lobe(bsdf, mi.BSDFContext(mi.TransportMode.Importance)))
+                lobes.append(_Lobe(bsdf, _context(), delta))
                 lobes[-1].context.component = component
         return lobes
-    reflection = int(mi.BSDFFlags.DeltaReflection)
-    for kinds in (reflection, delta & ~reflection):
-        if bsdf.flags() & kinds:
-            lobes.append(_Lobe(bsdf, mi.BSDFContext(mi.TransportMode.Importance)))
-            lobes[-1].context.type_mask = kinds
+    for kind in (reflected, refracted):
+        if bsdf.flags() & kind:
+            lobes.append(_Lobe(bsdf, _context(), kind))
+            lobes[-1].context.type_mask = kind
     return lobes
+
+
+def _context() -> mi.BSDFContext:
+    return mi.BSDFContext(mi.TransportMode.Importance)
 
 
 def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> tuple[FloatArray, FloatArray, FloatArray]:

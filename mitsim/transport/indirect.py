@@ -62,10 +62,10 @@ class IndirectTracer(Tracer):
 class _Walk(Walk):
     """Paths from the projector's pixels."""
 
-    STATE = ("active", "ray", "strength", "bounce", "scattered", "rng", "kept")
+    STATE = ("active", "ray", "strength", "bounce", "scattered", "straight", "rng", "kept")
 
     def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> None:
-        super().__init__(tracer.scene, tracer.mirrors, tracer.interreflection)
+        super().__init__(tracer.receiver.passage, tracer.mirrors, tracer.interreflection)
         self.tracer, self.pixel = tracer, pixel
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, self.rng = streams(seed, pixel, sample)
@@ -86,7 +86,8 @@ class _Walk(Walk):
 
     def _connect(self, si: mi.SurfaceInteraction3f) -> None:
         """Light that this surface sends to the sensor's centre."""
-        reception = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active)
+        # Light that has met nothing but what it passes is the direct tracer's.
+        reception = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active & ~self.straight)
         value = panchromatic(reception.irradiance * self.flux * self.strength)
         caustic = self.scattered == 0
         value *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
@@ -98,12 +99,13 @@ class _Walk(Walk):
         toward = -self.ray.d
         si.wi = si.to_local(toward)
         sample, value, going = self._sampled(si, mi.TransportMode.Importance, self.first_turn if first else None)
-        delta = is_delta(sample)
+        delta, passing = is_delta(sample), self.passage.passes(sample)
         onward = si.to_world(sample.wo)
         # Light that is followed forward sees shading normals the other way round (Veach 1997, 5.3).
         turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
         turned /= mi.Frame3f.cos_theta(sample.wo) * dr.dot(si.n, toward)
         self.strength *= value * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
-        self._end_some(going, (self.scattered == 0) & delta, first)
-        self.scattered += dr.select(delta, mi.UInt32(0), mi.UInt32(1))
-        self.ray = si.spawn_ray(onward)
+        self._end_some(going, (self.scattered == 0) & delta, passing, first)
+        self.scattered += dr.select(delta | passing, mi.UInt32(0), mi.UInt32(1))
+        self.straight &= passing
+        self.ray = self._onward(si, onward, passing)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits, Sightings
+from mitsim.transport.passage import Passage
 
 _KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 _LANES_PER_LAUNCH = 2**22
@@ -61,8 +62,9 @@ def camera_part(pdf: mi.Float) -> mi.Float:
 
 
 def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
-    """Whether the direction of ``sample`` is a mirror's, or straight on."""
-    return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    """Whether the direction of ``sample`` is a mirror's, reflected or refracted."""
+    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+    return (sample.sampled_type & mirror) != 0
 
 
 class Tracer(ABC):
@@ -100,7 +102,8 @@ class Walk(ABC):
     """The paths of one launch, a lane each: the first surface apart, and all others in a loop of one kernel.
 
     Of each kind of light one connection a path is kept. ``STATE`` names the attributes that change on the way; the
-    first tells which paths still go on.
+    first tells which paths still go on. ``straight`` are those that have only passed surfaces so far
+    (:mod:`mitsim.transport.passage`): their light is direct light's own.
     """
 
     STATE: ClassVar[tuple[str, ...]]
@@ -108,19 +111,21 @@ class Walk(ABC):
     active: mi.Bool
     strength: mi.Spectrum
     bounce: mi.UInt32
+    straight: mi.Bool
     rng: mi.PCG32
 
-    def __init__(self, scene: mi.Scene, mirrors: bool, interreflection: bool) -> None:
+    def __init__(self, passage: Passage, mirrors: bool, interreflection: bool) -> None:
         """Paths before their first surface.
 
         Parameters
         ----------
-        scene
-            as loaded.
+        passage
+            the scene, and what light passes in it.
         mirrors, interreflection
             paths over delta reflections and transmissions, and over other surfaces.
         """
-        self.scene, self.mirrors, self.interreflection = scene, mirrors, interreflection
+        self.passage, self.scene, self.straight = passage, passage.scene, mi.Bool(True)
+        self.mirrors, self.interreflection = mirrors, interreflection
         self.kept = {kind: Sightings.none() for kind in _KINDS}
 
     @abstractmethod
@@ -143,20 +148,30 @@ class Walk(ABC):
         sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, self.active)
         going = self.active & (sample.pdf > 0)
         if not self.interreflection:
-            going &= is_delta(sample)
+            going &= (is_delta(sample) & self.mirrors) | self.passage.passes(sample)
         elif not self.mirrors:
             going &= ~is_delta(sample)
         return sample, mi.unpolarized_spectrum(value), going
 
-    def _end_some(self, going: mi.Bool, mirrored: mi.Bool, first: bool) -> None:
-        """Go on with a chance: what a path still carries; but chains of mirrors are short and full of light."""
-        self.bounce += 1
+    def _end_some(self, going: mi.Bool, mirrored: mi.Bool, passing: mi.Bool, first: bool) -> None:
+        """Go on with a chance: what a path still carries; but chains of mirrors are short and full of light.
+
+        What only passes a surface goes on.
+        """
+        self.bounce += dr.select(passing, mi.UInt32(0), mi.UInt32(1))
         if not first:
             carried = dr.minimum(dr.max(self.strength), _LONGEST)
-            chance = dr.select(mirrored & (self.bounce < _MIRRORS), 1, carried)
+            chance = dr.select((mirrored & (self.bounce < _MIRRORS)) | passing, 1, carried)
             going &= self.rng.next_float32() < chance
             self.strength *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
         self.active = going & (dr.max(self.strength) > 0)
+
+    def _onward(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, passing: mi.Bool) -> mi.Ray3f:
+        """The ray that leaves each vertex."""
+        ray = si.spawn_ray(direction)
+        if self.passage.open:
+            ray.o = dr.select(passing, self.passage.onward(si, direction).o, ray.o)
+        return ray
 
     def deposits(self, further: bool) -> list[Deposits]:
         """Light on the host of every path, followed to its end or, unless ``further``, to the first surface only."""

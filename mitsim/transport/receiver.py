@@ -20,6 +20,7 @@ import mitsuba as mi
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.coordinates import rows_columns
 from mitsim.transport.histogram import Sightings
+from mitsim.transport.passage import Passage
 
 
 @dataclass
@@ -53,7 +54,7 @@ class Receiver:
     """
 
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, geometry: CameraGeometry | None = None) -> None:
-        self.scene, self.camera = scene, camera
+        self.scene, self.camera, self.passage = scene, camera, Passage(scene)
         self.geometry: CameraGeometry = geometry or camera.geometry
 
     def receive(
@@ -82,7 +83,8 @@ class Receiver:
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
         active = active & (point.z > dr.opaque(mi.Float, self.geometry.mask_distance))
         active &= (dr.abs(t.x) <= stop) & (dr.abs(t.y) <= stop)
-        active &= ~self.scene.ray_test(si.spawn_ray_to(sensor), active)
+        seen, passed = self.passage.between(si, sensor, active)
+        active &= seen
         si.wi = si.to_local(direction)
         reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), active)
         cosine = dr.rsqrt(1 + dr.squared_norm(t))
@@ -90,7 +92,7 @@ class Receiver:
         if self.geometry.angular_exponent > 0:
             geometric *= dr.power(cosine, dr.opaque(mi.Float, self.geometry.angular_exponent))
         inverse_depth = dr.rcp(point.z)
-        irradiance = dr.select(active, mi.unpolarized_spectrum(reflected) * geometric, 0)
+        irradiance = dr.select(active, mi.unpolarized_spectrum(reflected) * passed * geometric, 0)
         row, column = rows_columns(point.x, point.y)
         return Reception(irradiance, row * inverse_depth, column * inverse_depth, inverse_depth, pdf)
 

@@ -42,6 +42,15 @@ def stratified(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
     return mi.Point2f(_unit(first), _unit(second))
 
 
+def shuffled(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
+    """Numbers of samples in another order, drawn from ``rng``, in which each aligned block of 2^m is again one.
+
+    :func:`stratified` points of them are as even as those of ``index`` and independent of these, so two pairs of
+    dimensions pad to four (Burley 2020, "Practical hash-based Owen scrambling", section 4).
+    """
+    return _scrambled(index, rng.next_uint32())
+
+
 def _second_dimension(index: mi.UInt32) -> mi.UInt32:
     """Dimension 2 of Sobol's sequence, 32-bit fixed point: direction numbers of the polynomial x + 1."""
     result, direction = mi.UInt32(0), 1 << 31

@@ -224,7 +224,7 @@ class Fuzz:
 
         self.scene.write_text(scene_changed(RICH, random.Random(seed)), encoding="utf-8")
         check_file(self.scene, {})
-        load_scene(self.scene)
+        load_scene(self.scene, needs_projector=False)
 
     def mesh(self, seed: int) -> None:
         """Mesh files that pass the check, loaded by Mitsuba."""
@@ -237,7 +237,7 @@ class Fuzz:
         shape = f'<shape type="{kind}"><string name="filename" value="{name}"/></shape>'
         self.scene.write_text(GOOD.replace("<!--here-->", shape))
         check_file(self.scene, {})
-        load_scene(self.scene)
+        load_scene(self.scene, needs_projector=False)
 
     def image(self, seed: int) -> None:
         """Pictures that pass the check, loaded by Mitsuba."""
@@ -249,7 +249,7 @@ class Fuzz:
         light = f'<emitter type="envmap"><string name="filename" value="p.{"exr" if seed % 2 else "png"}"/></emitter>'
         self.scene.write_text(GOOD.replace("<!--here-->", light))
         check_file(self.scene, {})
-        load_scene(self.scene)
+        load_scene(self.scene, needs_projector=False)
 
     def json(self, seed: int) -> None:
         """Manifests: other items in good JSON, or other bytes."""

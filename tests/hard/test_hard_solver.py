@@ -25,7 +25,11 @@ from tests.robustness import Recorder
 
 pytestmark = pytest.mark.robustness("Solver")
 EPS = float(np.finfo(np.float64).eps)
-ENDING = re.compile(r"Rank (\d+) of (\d+), condition (inf|\d\.\de[+-]\d\d)")
+NUMBER = r"(inf|\d\.\de[+-]\d\d)"
+ENDING = re.compile(
+    r"Rank (\d+) of (\d+) \(rows (\d+) of (\d+), columns (\d+) of (\d+)\), "
+    rf"condition {NUMBER} \(rows {NUMBER}, columns {NUMBER}\)"
+)
 LAMBDAS = (*(10.0**-power for power in range(2, 17, 2)), 0.0)
 Frames = dict[tuple[int, int], np.ndarray]
 
@@ -56,11 +60,19 @@ def summed(prepared: Prepared, frames: Frames):
 
 
 def check_ending(status: str, prepared: Prepared) -> None:
-    """Rank and condition stand in the status, and are those of the model."""
+    """Rank and condition of the whole and of both sides stand in the status, and are those of the model.
+
+    (Planted: the condition of one side in the place of the whole's.)
+    """
     found = ENDING.search(status)
     assert found and status.endswith("."), status
-    assert (int(found[1]), int(found[2])) == (prepared.rank, prepared.unknowns)
-    assert float(found[3]) == pytest.approx(prepared.condition, rel=0.06)
+    left, right = prepared.left, prepared.right
+    ranks = prepared.rank, prepared.unknowns, left.rank, left.scene_size, right.rank, right.scene_size
+    assert tuple(map(int, found.groups()[:6])) == ranks
+    conditions = tuple(map(float, found.groups()[6:]))
+    # Two digits are written.
+    assert conditions[1:] == pytest.approx((left.condition, right.condition), rel=0.06)
+    assert conditions[0] == pytest.approx(left.condition * right.condition, rel=0.06)
 
 
 # ---- short, dark and close -------------------------------------------------------------------------------------------

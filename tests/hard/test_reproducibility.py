@@ -17,8 +17,9 @@ from threadpoolctl import threadpool_limits
 
 from mitsim.capture import light
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import LOOKS, Changes, Part
 from mitsim.capture.light import make_plan, trace_light
-from mitsim.capture.pilot import direct, halves
+from mitsim.capture.pilot import direct, looks
 from mitsim.core import parallel
 from mitsim.core.framefile import read_frame
 from mitsim.optics import frames
@@ -105,15 +106,15 @@ def test_neither_do_large_ones(
 
 def test_sums_do_not_depend_on_threads_of_blas(measured: Recorder) -> None:
     """Norms and products of the pilot: BLAS's own of so many numbers differ between 1, 2, 3 and 8 threads."""
-    a, b = np.random.default_rng(0).random((2, 2, 300, 300))
-    naive, norms, differences = set(), set(), set()
+    a, b = np.random.default_rng(0).random((2, LOOKS, 300, 300))
+    naive, norms, products = set(), set(), set()
     for count in THREADS:
         with threadpool_limits(count):
             naive.add(float(np.vdot(a[0], a[1])))
-            norms.add(halves.norm((a[0], a[1])))
-            differences.add(halves.difference((a[0], a[1]), (b[0], b[1])))
+            norms.add(looks.norm(a))
+            products.add(Changes.between({Part("a"): a, Part("b"): b}, 1.0).products.tobytes())
     measured(len(naive), what="answers of BLAS")
-    measured(max(len(norms), len(differences)), at_most=1, what="ours")
+    measured(max(len(norms), len(products)), at_most=1, what="ours")
 
 
 @pytest.mark.parametrize("columns", [100, 20_000, 3 * 2**14 + 5])

@@ -11,9 +11,9 @@ import pytest
 from scipy.integrate import quad
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.diffraction import EdgeWaves
+from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
 from mitsim.optics.profile import Steps
-from mitsim.optics.shadow import Directions
+from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
@@ -204,6 +204,54 @@ def test_a_slit_is_a_difference_of_two_fresnel_integrals(s: float) -> None:
     waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 1, 6.0)
     got = waves.field(Steps(np.array([-0.03, 0.03]), np.ones(1)), s)
     assert abs(got[0] - expected) < 1e-9
+
+
+def test_fringes_that_the_grid_cannot_hold_fade_out() -> None:
+    """Beyond lambda D / (2 step) = 2.2 mm from an edge its fringes are finer than two cells.
+
+    The last quarter of the way they lose amplitude, half of it in the middle, until nothing is left: no step, whose own
+    fringes would be seen. The other edge is too far to be seen.
+    """
+    unit, fade = (LAMBDA_NM * 1e-6 * 2.0 / 2) ** 0.5, LAMBDA_NM * 1e-6 * 2.0 / (2 * STEP)
+    waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 10_000, 6.0)
+    wave = np.abs(waves.field(Steps(np.array([0.0, 5.0]), np.ones(1)), 0.0) - 1)
+    for part, left in ((0.7, 1.0), (0.875, 0.5)):
+        k = round(part * fade / STEP)
+        whole = unit / (2**0.5 * np.pi * (k + 0.5) * STEP)  # of the Fresnel integral's tail, to 1e-8
+        assert wave[k] == pytest.approx(left * whole, rel=0.01, abs=1e-9)
+    assert wave[round(0.98 * fade / STEP) :].max() < 0.02 * whole
+    assert wave[round(fade / STEP) + 1 :].max() < 1e-12
+
+
+@pytest.mark.parametrize("low", [-3.0, 0.4])
+def test_a_range_s_profile_is_part_of_a_wider_one_s(low: float) -> None:
+    """To rounding: every edge that reaches the range's ends is in, also the farthest, 5 and 3 mm away."""
+    shadow = ShadowGeometry.of(CameraGeometry(**{**NEAR, "mask_distance": 8.0}), 40.0)
+    (((_, part),), start, step), (((_, wide),), wide_start, _) = (
+        wave_profiles(shadow, LAMBDA_NM, *ends, 0.0) for ends in ((low, low + 1.0), (-6.0, 6.0))
+    )
+    first = round((start - wide_start) / step)
+    np.testing.assert_allclose(part, wide[first : first + len(part)], rtol=0, atol=1e-11)
+
+
+def test_a_thick_mask_s_shadow_in_one_direction_hangs_on_no_other() -> None:
+    """All directions on one side of the axis: the grid of waves must reach the edges that the farthest one sees."""
+    geometry = CameraGeometry(**{**NEAR, "mask_distance": 8.0, "mask_thickness": 0.02, "pixels": 4})
+    tau = np.array([0.1, 0.2, 0.3])
+    ((together, _),) = shadow_terms(geometry, Directions(tau, 0.0), Directions([0.1], 0.0), 40.0, line())
+    for j, one in enumerate(tau):
+        ((alone, _),) = shadow_terms(geometry, Directions([one], 0.0), Directions([0.1], 0.0), 40.0, line())
+        np.testing.assert_allclose(together[:, j], alone[:, 0], rtol=0, atol=1e-11)
+
+
+def test_a_thick_mask_s_grid_is_twice_as_wide_and_each_feature_holds_whole_cells() -> None:
+    thin, thick = (ShadowGeometry.of(CameraGeometry(**NEAR, mask_thickness=t), 40.0) for t in (0.0, 0.02))
+    assert STEP * 0.98 < grid_step(thin, LAMBDA_NM) <= STEP
+    assert grid_step(thick, LAMBDA_NM) == pytest.approx(2 * grid_step(thin, LAMBDA_NM), rel=1e-12)
+    near = ShadowGeometry.of(CameraGeometry(**{**NEAR, "mask_distance": 0.1}), 40.0)
+    step, fresnel_length = grid_step(near, LAMBDA_NM), (LAMBDA_NM * 1e-6 * 0.1 * (1 - 0.1 / 40)) ** 0.5
+    assert 0.98 * fresnel_length / 130 < step <= fresnel_length / 130, "finer where fringes are"
+    assert 0.06 / step == pytest.approx(round(0.06 / step), abs=1e-9)
 
 
 def test_light_is_neither_made_nor_lost() -> None:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 VERBS = ("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "doctor")
@@ -81,13 +82,29 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     options = "--json", "--quiet", "--variant", "llvm_ad_mono", "-o", tmp_path / "image"
     found = call("reconstruct", lab.run, "--calibration", lab.calibration, *options).payload
     keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "seconds", "output"}
-    assert found.keys() == keys
+    assert found.keys() == keys | {
+        *("rank_sides", "condition_whole", "condition_sides"),
+        *("misfit", "uncertainty", "uncertainty_budget"),
+    }
+    assert number(found["uncertainty"], 1e-6, 0.1) and all(map(number, found["uncertainty_budget"].values()))
+    assert found["misfit"].keys() == {
+        *("chi_square", "unexplained", "worst_tile", "noise_stated", "flagged", "cause", "signatures", "map"),
+    }
+    assert number(found["misfit"]["chi_square"], 0.5, 1.2) and found["misfit"]["noise_stated"]
+    assert not found["misfit"]["flagged"] and found["misfit"]["cause"] is None
+    assert found["rank_sides"] == [16, 16] and found["condition"] == max(found["condition_sides"])
+    assert found["condition_whole"] == pytest.approx(np.prod(found["condition_sides"]))
     assert number(found["psnr"], 20, 100) and number(found["ssim"], 0.5, 1)
     assert number(found["lambda"]) and found["rank"] == 16 * 16 and number(found["condition"], 1, 1e6)
     assert number(found["residual"], 1e-9, 0.5) and found["status"].endswith(".")
     assert_seconds(found["seconds"])
     assert found["output"] == str(tmp_path / "image")
-    assert sorted(path.name for path in (tmp_path / "image").iterdir()) == ["image.exr", "image.png", "result.json"]
+    assert sorted(path.name for path in (tmp_path / "image").iterdir()) == [
+        "image.exr",
+        "image.png",
+        "result.json",
+        "uncertainty.exr",
+    ]
     written = json.loads((tmp_path / "image" / "result.json").read_text())
     assert written.pop("inputs").keys() == {"run", "calibration", "lambda", "method"}
     assert written == found

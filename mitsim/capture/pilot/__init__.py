@@ -5,16 +5,19 @@ Every error is relative, ``||a - b|| / ||b||``, over up to four shots of the fam
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from functools import cached_property
 
 from mitsim.capture import effects
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import Evidence, Settings
+from mitsim.capture.evidence import LOOKS, Changes, Evidence, Forming, Part, Settings
 from mitsim.capture.pilot.direct import AnchoredLight, FineLight
-from mitsim.capture.pilot.halves import Sample
+from mitsim.capture.pilot.looks import Sample
 from mitsim.capture.pilot.reach import light_reach
 from mitsim.capture.pilot.sharp import sharp_pixels
 from mitsim.capture.pilot.switched import SwitchedEffects
+from mitsim.capture.prices import FIXED, Numbers, forming_seconds
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
@@ -22,6 +25,19 @@ from mitsim.rig.patterns import Lighting
 from mitsim.scene.darkness import why_dark
 from mitsim.transport.lobes import SharpLight, sharp_light
 
+STAGES = ("cells", "effects", "anchors")
+"""What is looked at apart: cells and layers of direct light, effects switched off, anchors."""
+_STAGE_OF = {
+    "cells": "cells",
+    "layers": "cells",
+    "anchors": "anchors",
+    "anchored cells": "anchors",
+    "anchored layers": "anchors",
+}
+FINER = 4
+"""Samples of a stage over those of the look before: standard errors are halved at least."""
+_FRAMES_AS_MANY = 20.0
+"""Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
 _LOBE_RAYS = 2**20
 """Rays that look for sharp lobes: a lobe of 1e-4 of the hemisphere is met a hundred times."""
 _FEWEST_HITS = 30.0
@@ -32,8 +48,8 @@ _ALIGNED = 1e-6
 """Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
 
 
-def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evidence:
-    """Trace a few small batches and compare effects and discretisations on a handful of shots.
+class Look:
+    """A look at a scene, as short as it can be at first; each of its three stages is repeated with more samples.
 
     Parameters
     ----------
@@ -51,40 +67,103 @@ def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evi
     MitsimError
         when no light of the projector reaches the camera.
     """
-    sample = Sample.of(lighting)
-    present = effects.present(bench)
-    first_look = frozenset(present) & effects.names(lambda effect: effect.first_look)
-    first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_look))
-    sharp = _sharp(first, seed)
-    depth, light = _depth(first, seed, sharp)
-    reach = light_reach(Simulation(bench, Settings(depth=depth, effects=first_look)), integer(seed, "pilot", "reach"))
-    apart = sharp_pixels(first, sharp, light, accuracy, integer(seed, "pilot", "sharp"))
-    base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
-    fine = FineLight(bench, base, sample, accuracy, seed)
-    layers = fine.layers()
-    layer_error, cell_error = fine.layer_errors(layers), fine.cell_errors()
-    switched = SwitchedEffects(bench, replace(base, effects=frozenset(present), subdivision=2), sample, seed)
-    anchored = AnchoredLight(bench, base, sample, switched.light, seed)
-    whole = light + sharp.irradiance
-    return Evidence(
-        depth=depth,
-        layers=layers,
-        anchor_error=anchored.errors(accuracy),
-        layer_error=layer_error,
-        cell_error=cell_error,
-        effect_error=switched.errors(present),
-        direct_part=anchored.part,
-        direct=fine.effort(switched.light),
-        anchored=anchored.effort(fine.pace),
-        indirect=switched.effort("indirect"),
-        from_camera=switched.effort("from_camera"),
-        seconds_per_frame=fine.seconds_per_frame,
-        terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
-        unresolved=0.0 if apart or sharp.hits * sample.fine >= _FEWEST_HITS else sharp.irradiance / whole,
-        reach=reach,
-        sharp=apart,
-        sharp_light=switched.sharp_effort(),
-    )
+
+    def __init__(self, bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> None:
+        self.bench, self.lighting, self.accuracy, self.seed = bench, lighting, accuracy, seed
+        self.present = effects.present(bench)
+        first_look = frozenset(self.present) & effects.names(lambda effect: effect.first_look)
+        first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_look))
+        self._sharp = _sharp(first, seed)
+        depth, self._light = _depth(first, seed, self._sharp)
+        seen = Simulation(bench, Settings(depth=depth, effects=first_look))
+        reach = light_reach(seen, integer(seed, "pilot", "reach"))
+        own = integer(seed, "pilot", "sharp")
+        apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
+        self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
+        self.samples = dict.fromkeys(STAGES, Sample.of(lighting, bench.geometry.pixels))
+        for stage in STAGES:
+            self._measure(stage)
+
+    def refine(self, stage: str) -> None:
+        """Repeat a ``stage`` with so many more samples that its standard errors are halved."""
+        self.samples[stage] = self._finer(stage)
+        self._measure(stage)
+
+    def price(self, stage: str) -> float:
+        """Work of repeating a ``stage``, in seconds at fixed paces; infinite where it has all the samples it may."""
+        now, finer = self.samples[stage], self._finer(stage)
+        if (finer.fine, finer.direct) == (now.fine, now.direct):
+            return math.inf
+        one, changes = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED), 0
+        pixels, shown = self.bench.n**2, len(finer.shown)
+        if stage == "cells":
+            paths, changes = FIXED.direct * shown * finer.fine, len(self.fine.changes)
+        elif stage == "anchors":
+            connections = sum(part.count**2 for part in self.anchored.changes if part.name == stage)
+            paths, changes = FIXED.anchored * shown * finer.anchored * connections, len(self.anchored.changes)
+        else:
+            followed = sum(getattr(FIXED, name) * lanes for name, lanes in self.switched.lanes.items())
+            paths, changes = FIXED.direct * pixels * finer.direct + followed * finer.followed, len(self.present)
+        return LOOKS * paths + changes * float(one)
+
+    def _finer(self, stage: str) -> Sample:
+        sample = self.samples[stage]
+        return replace(sample, effort=FINER * sample.effort)
+
+    def _measure(self, stage: str) -> None:
+        bench, base, sample, seed = self.bench, self._base, self.samples[stage], self.seed
+        if stage == "cells":
+            self.fine = FineLight(bench, base, sample, self.accuracy, seed)
+        elif stage == "effects":
+            everything = replace(base, effects=frozenset(self.present), subdivision=2)
+            self.switched = SwitchedEffects(bench, everything, sample, seed, self.fine.judging)
+        else:
+            self.anchored = AnchoredLight(bench, base, sample, self.accuracy, seed, self.fine.judging)
+
+    @cached_property
+    def forming(self) -> Forming:
+        """How frames are formed."""
+        return self.fine.forming(self.lighting)
+
+    @property
+    def evidence(self) -> Evidence:
+        """What has been found."""
+        fine, switched, anchored = self.fine, self.switched, self.anchored
+        seen = {**anchored.changes, **fine.changes, **switched.changes}
+        light, sharp, apart = switched.light, self._sharp, self._base.sharp
+        few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
+        return Evidence(
+            depth=self._base.depth,
+            layers=fine.layers,
+            changes=Changes.between(seen, light**2),
+            direct_part=anchored.light / light if light else 0.0,
+            direct=fine.effort(light),
+            anchored=anchored.effort(fine.pace, light),
+            indirect=switched.effort("indirect"),
+            from_camera=switched.effort("from_camera"),
+            forming=self.forming,
+            apart=switched.apart,
+            unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
+            reach=self._base.reach,
+            sharp=apart,
+            sharp_light=switched.sharp_effort(),
+        )
+
+
+def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evidence:
+    """What the shortest :class:`Look` of these arguments finds.
+
+    Parameters
+    ----------
+    bench, lighting, accuracy, seed
+        as there.
+    """
+    return Look(bench, lighting, accuracy, seed).evidence
+
+
+def stage_of(part: Part) -> str:
+    """The stage that tells the error of a ``part``."""
+    return _STAGE_OF.get(part.name, "effects")
 
 
 def _sharp(simulation: Simulation, seed: int) -> SharpLight:

@@ -24,7 +24,7 @@ _EVEN = 0.1
 """Variance of an ordinary pixel's connection, relative to its square: print and falloff (photograph: 0.05 to 0.2)."""
 _WORTH = 0.5
 """Part of the paths that tracing apart must save before it is done for their sake alone; it costs a pass of its own."""
-_RATE = 0.75
+SHARP_RATE = 0.75
 """Power of the samples that the error falls with, as rays are stratified (flat plates of 1e-3 and 1e-4: 0.7 to 0.9)."""
 _TRIAL, _LARGEST_TRIAL = 16, 2**21
 """Samples that tell how noisy the light is, and connections of them, some 0.5 s."""
@@ -91,7 +91,7 @@ def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, s
     first, second = (np.bincount(at, light.value, len(every)) for at, light in zip(parts, seen, strict=True))
     energy = float((first * second).sum())
     noise = math.sqrt(float(np.square(first - second).sum()) / 2 / energy) if energy > 0 else math.inf
-    return float(tracer.lanes * samples * (noise / accuracy) ** (1 / _RATE))
+    return float(tracer.lanes * samples * (noise / accuracy) ** (1 / SHARP_RATE))
 
 
 def _paths(moments: FloatArray, even: float, pixels: int, anchors: int) -> FloatArray:

@@ -1,23 +1,25 @@
-"""All effects at once, and each of them switched off: how much the frames change, and what followed light takes."""
+"""All effects at once, and each of them switched off: how the frames change, and what followed light takes."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import DIRECT, EFFECTS, FOLLOWED, Effect
-from mitsim.capture.evidence import Effort, Noise, Settings
-from mitsim.capture.pilot.halves import Halves, Sample, difference, noise, norm
+from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
+from mitsim.capture.pilot.looks import Sample, coarsened, noise, norm
+from mitsim.capture.pilot.sharp import SHARP_RATE
 from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.transport import histogram
 from mitsim.transport.histogram import Deposits
 
-_SHARP_RATE = 0.7
-"""Power of the samples that the error of sharp light falls with: stratified over a pixel, but its lobes are narrow."""
 _KINDS = {"indirect": histogram.INDIRECT, "ambient": histogram.AMBIENT}
+_TRACERS = ("indirect", "from_camera")
 
 
 class SwitchedEffects:
@@ -31,89 +33,137 @@ class SwitchedEffects:
         shots and samples.
     seed
         root of the random streams.
+    layers
+        depths [mm] that judge one layer; none for a flat scene.
     """
 
-    def __init__(self, bench: Bench, everything: Settings, sample: Sample, seed: int) -> None:
-        self.bench, self.everything, self.sample = bench, everything, sample
-        self.seeds = tuple(integer(seed, "pilot", "effects", half) for half in range(2))
+    def __init__(
+        self, bench: Bench, everything: Settings, sample: Sample, seed: int, layers: tuple[float, ...] = ()
+    ) -> None:
+        self.bench, self.everything, self.sample, self.layers = bench, everything, sample, layers
+        self.seeds = [integer(seed, "pilot", "effects", look) for look in range(LOOKS)]
         self.simulation = Simulation(bench, everything)
-        self.direct, self.followed = self._direct(self.simulation), self._follow(self.simulation)
+        self.paces: dict[str, float] = {}
+        self.direct = self._direct(self.simulation)
+        self.followed = {name: self._follow(self.simulation, name) for name in _TRACERS}
         self.sharp = self._sharp(self.simulation)
-        self.frames = self._form(self.simulation, self.direct, self.followed, self.sharp)
+        self.frames = self._form(self.simulation, self.direct, self._joined(self.followed), self.sharp)
+        self.light = norm(self.frames)
+        """Norm of the frames of all light."""
+
+    @cached_property
+    def changes(self) -> dict[Part, FloatArray]:
+        """Change of the frames by each effect that they have, and by coarse cells for indirect light."""
+        shown = [name for name in EFFECTS if name in self.everything.effects and EFFECTS[name].in_frames]
+        found = {Part(name): self.frames - self._without(EFFECTS[name]) for name in shown}
+        bounced = any((light.kind == histogram.INDIRECT).any() for light in self.followed["indirect"])
+        return {**found, **coarsened("indirect", self._indirect, self.layers)} if bounced else found
+
+    def _indirect(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
+        """Frames of indirect light in coarse cells and layers."""
+        coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
+        indirect = [light.where(light.kind == histogram.INDIRECT) for light in self.followed["indirect"]]
+        return self._form(Simulation(self.bench, coarse), [Deposits.none()] * LOOKS, indirect)
 
     @property
-    def light(self) -> float:
-        """Norm of the frames of all light."""
-        return norm(self.frames)
+    def apart(self) -> dict[str, float]:
+        """Error of leaving out each effect that is drawn with the sensor's noise: speckle's contrast."""
+        effects = self.everything.effects
+        return {name: self.simulation.physics.speckle for name in effects if not EFFECTS[name].in_frames}
 
-    def errors(self, names: Collection[str]) -> dict[str, float]:
-        """Relative change of the frames when each effect of ``names`` is left out."""
-        errors = {}
-        for name in names:
-            effect = EFFECTS[name]
-            errors[name] = difference(self._without(effect), self.frames) if effect.in_frames else self._drawn()
-        return errors
-
-    def _drawn(self) -> float:
-        """Speckle, which is drawn with the sensor's noise: its contrast is its relative error."""
-        return self.simulation.physics.speckle
+    @property
+    def lanes(self) -> dict[str, int]:
+        """Paths in a sample of each tracer."""
+        return {name: lanes for name, (_, lanes) in self._noise.items()}
 
     def effort(self, name: str) -> Effort:
         """Monte Carlo error of one estimate by the tracer ``name``, relative to all light, and what it takes."""
-        stage = self.simulation.tracers().get(name)
-        if stage is None:
+        if name not in self._noise:
             return Effort.none()
-        samples, lanes = self.sample.followed, stage.tracer.lanes
-        started = time.perf_counter()
-        deposits = tuple(stage.tracer.trace(seed, 0, samples) for seed in self.seeds)
-        pace = (time.perf_counter() - started) / (2 * lanes * samples)
-        none = tuple(Deposits.none() for _ in self.seeds)
-        error = noise(self._form(self.simulation, none, deposits, none), self.light)
-        return Effort(Noise(error, samples, 0.5), lanes, pace)
+        error, lanes = self._noise[name]
+        relative = error / self.light if self.light else 0.0
+        return Effort(Noise(relative, self.sample.followed, 0.5), lanes, self.paces[name])
 
     def sharp_effort(self) -> Effort:
-        """The same of sharp pixels, from the halves that are there; the error is taken to fall with the root."""
+        """The same of pixels that are traced apart, their rate being that of stratified rays."""
         tracer = self.simulation.apart
         if tracer is None:
             return Effort.none()
-        samples, none = self.sample.sharp(self.simulation), (Deposits.none(), Deposits.none())
-        started = time.perf_counter()
-        tracer.trace(self.seeds[0], 0, samples)
-        pace = (time.perf_counter() - started) / (tracer.lanes * samples)
-        error = noise(self._form(self.simulation, none, none, self.sharp), self.light)
-        return Effort(Noise(error, samples, _SHARP_RATE), tracer.lanes, pace)
+        nothing, samples = [Deposits.none()] * LOOKS, self.sample.sharp(self.simulation)
+        error = noise(self._form(self.simulation, nothing, nothing, self.sharp))
+        relative = error / self.light if self.light else 0.0
+        return Effort(Noise(relative, samples, SHARP_RATE), tracer.lanes, self.paces["sharp"])
 
-    def _without(self, effect: Effect) -> Halves:
+    @cached_property
+    def _noise(self) -> dict[str, tuple[float, int]]:
+        """Error of a look by each tracer, and its paths in a sample."""
+        nothing = [Deposits.none()] * LOOKS
+        return {
+            name: (noise(self._form(self.simulation, nothing, self.followed[name])), stage.tracer.lanes)
+            for name, stage in self.simulation.tracers().items()
+            if name in _TRACERS
+        }
+
+    def _without(self, effect: Effect) -> FloatArray:
         simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {effect.name}))
         retraced = effect.retraced(simulation.physics)
         direct, sharp = self.direct, self.sharp
         if DIRECT in retraced:
             direct, sharp = self._direct(simulation), self._sharp(simulation)
         if FOLLOWED in retraced:
-            followed = self._follow(simulation)
-        elif effect.kind:
-            left_out = _KINDS[effect.kind]
-            followed = tuple(deposits.where(deposits.kind != left_out) for deposits in self.followed)
+            followed = self._joined({name: self._follow(simulation, name) for name in _TRACERS})
         else:
-            followed = self.followed
+            followed = self._joined(self.followed)
+            if effect.kind:
+                followed = [light.where(light.kind != _KINDS[effect.kind]) for light in followed]
         return self._form(simulation, direct, followed, sharp)
 
-    def _direct(self, simulation: Simulation) -> tuple[Deposits, ...]:
-        return tuple(simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds)
+    def _direct(self, simulation: Simulation) -> list[Deposits]:
+        return [simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds]
 
-    def _follow(self, simulation: Simulation) -> tuple[Deposits, ...]:
-        return tuple(simulation.follow(seed, self.sample.followed) for seed in self.seeds)
-
-    def _sharp(self, simulation: Simulation) -> tuple[Deposits, ...]:
-        tracer = simulation.apart
+    def _follow(self, simulation: Simulation, name: str) -> list[Deposits]:
+        """Light of the tracer ``name``, look by look; the first, which may compile a kernel, is not timed."""
+        tracer = getattr(simulation, name)
         if tracer is None:
-            return tuple(Deposits.none() for _ in self.seeds)
-        return tuple(tracer.trace(seed, 0, self.sample.sharp(simulation)) for seed in self.seeds)
+            return [Deposits.none()] * LOOKS
+        first, *others = (integer(seed, name) for seed in self.seeds)
+        found = [tracer.trace(first, 0, self.sample.followed)]
+        started = time.perf_counter()
+        found += [tracer.trace(seed, 0, self.sample.followed) for seed in others]
+        seconds = time.perf_counter() - started
+        self.paces.setdefault(name, seconds / ((LOOKS - 1) * tracer.lanes * self.sample.followed))
+        return found
 
-    def _form(self, simulation: Simulation, *parts: tuple[Deposits, ...]) -> Halves:
-        """Frames of two halves; ``parts`` are direct, followed and sharp light."""
-        halves = [
-            self.sample.frames(simulation, direct, self.sample.direct, *more)
-            for direct, *more in zip(*parts, strict=True)
+    @staticmethod
+    def _joined(followed: dict[str, list[Deposits]]) -> list[Deposits]:
+        return [Deposits.joined(looks) for looks in zip(*followed.values(), strict=True)]
+
+    def _sharp(self, simulation: Simulation) -> list[Deposits]:
+        """Light of pixels that are traced apart, look by look; the first, which may compile a kernel, is not timed."""
+        tracer, samples = simulation.apart, self.sample.sharp(simulation)
+        if tracer is None:
+            return []
+        found = [tracer.trace(integer(self.seeds[0], "sharp"), 0, samples)]
+        started = time.perf_counter()
+        found += [tracer.trace(integer(seed, "sharp"), 0, samples) for seed in self.seeds[1:]]
+        self.paces.setdefault("sharp", (time.perf_counter() - started) / ((LOOKS - 1) * tracer.lanes * samples))
+        return found
+
+    def _form(
+        self,
+        simulation: Simulation,
+        direct: list[Deposits],
+        followed: list[Deposits],
+        sharp: Sequence[Deposits] = (),
+    ) -> FloatArray:
+        sample, labels = self.sample, self.sample.lighting.labels
+        lights = [
+            simulation.file_direct(one, labels, sample.direct)
+            + simulation.file_followed(other, labels, sample.followed)
+            for one, other in zip(direct, followed, strict=True)
         ]
-        return halves[0], halves[1]
+        if sharp:
+            samples = sample.sharp(simulation)
+            apart = [simulation.file_sharp(look, labels, samples) for look in sharp]
+            lights = [light + more for light, more in zip(lights, apart, strict=True)]
+        return sample.frames(simulation, lights)

@@ -21,6 +21,7 @@ import pydantic
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.scene.guard import limits
+from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply
 from mitsim.scene.guard.limits import Range
@@ -39,7 +40,7 @@ class CheckedScene:
     """A scene that Mitsuba may make objects of.
 
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
-    the name of the parameter, of the bitmap's file or of the attribute.
+    the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it.
     """
 
     outline: Outline
@@ -47,6 +48,7 @@ class CheckedScene:
     state: mi.parser.ParserState
     files: tuple[Path, ...]
     limits: Mapping[str, Range]
+    unfit: Unfit
 
 
 def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
@@ -77,7 +79,7 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
         mi.parser.transform_all(config, state)
     tree = _Tree(outline, files, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
-    return CheckedScene(outline, config, state, tuple(files.used), tree.limits)
+    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes))
 
 
 @contextmanager

@@ -23,7 +23,7 @@ def recorded(to: RunFolder | RunMemory, patterns: str = "hadamard:2") -> Capture
     family = parse_patterns(patterns, N)
     rng = np.random.default_rng(8)
     to.begin()
-    to.write_truth(rng.random((N, N)), 0.99)
+    to.write_truth(rng.random((N, N)), 0.99, np.full((N, N), 2e-3))
     for index, shot in enumerate(family.shots):
         electrons = rng.random((PIXELS, PIXELS), dtype=np.float32) * 1000
         dn = rng.poisson(electrons).astype(np.uint32)
@@ -72,6 +72,7 @@ def test_memory_and_disk_give_the_same_arrays(tmp_path: Path) -> None:
     for shots in (streamed, load_run(tmp_path / "run")):
         assert shots.dn.dtype == memory.dn.dtype == np.uint32 and np.array_equal(shots.dn, memory.dn)
         assert shots.electrons is not None and np.array_equal(shots.electrons, memory.electrons)
+        assert np.array_equal(shots.truth_standard_error, np.full((N, N), np.float32(2e-3)))
         assert np.array_equal(shots.truth, memory.truth) and shots.truth_board == memory.truth_board == 0.99
         assert shots.exposure_s == 0.02 and shots.plan == {"effects": []} and shots.warnings == ("too dark",)
         assert shots.manifest.camera == memory.manifest.camera, "an infinite well is null in both"
@@ -136,3 +137,12 @@ def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
         claimed(run, RunHead.of({**CONFIGURATION, "seed": 4}), resume=True),
     ):
         pass
+
+
+def test_a_truth_of_before_has_no_standard_error() -> None:
+    """Nor has a real camera's capture."""
+    record = RunMemory()
+    record.write_truth(np.full((N, N), 0.5), 0.99)
+    shots = Capture(recorded(RunMemory()).manifest, memory=record._files)
+    assert shots.truth is not None and shots.truth_standard_error is None
+    assert Capture(shots.manifest, memory={}).truth_standard_error is None

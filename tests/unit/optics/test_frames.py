@@ -17,6 +17,7 @@ from mitsim.optics.frames import (
     ExpectedFrames,
     Filed,
     FrameOptics,
+    _probes,
     monte_carlo_error,
 )
 from mitsim.optics.shadow import Directions
@@ -414,3 +415,17 @@ def test_one_group_has_no_variance_to_tell() -> None:
     frames = expected_frames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
     assert all(frame.variance == 0 and frame.irradiance.any() for frame in frames)
     assert monte_carlo_error(frames) == 0
+
+
+def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() -> None:
+    """sum |A v|^2 is ||A||^2 in the mean; for equal columns it is no estimate.
+
+    Of 400 draws of 8 signs the mean of an off-diagonal entry of sum v v^T has a deviation of 1/sqrt(3200); five of
+    those.
+    """
+    pixels = 12
+    probes = [_probes(pixels, seed) for seed in range(400)]
+    for one in probes[:5]:
+        assert np.square(np.ones(pixels) @ one).sum() == pytest.approx(pixels, rel=1e-12)
+    mean = np.mean([one @ one.T for one in probes], axis=0)
+    np.testing.assert_allclose(mean, np.eye(pixels), rtol=0, atol=5 / np.sqrt(3200))

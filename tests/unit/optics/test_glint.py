@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.glint import Beams, glint_frames
-from mitsim.optics.samplers import ProfileSampler, geometric_samplers
+from mitsim.optics.glint import Beams, _bilinear, _cuts, _gradients, glint_frames
+from mitsim.optics.samplers import ProfileSampler, geometric_samplers, wave_samplers
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3
@@ -106,6 +107,66 @@ def test_the_mask_is_magnified_as_from_the_virtual_source(depth: float) -> None:
     index = np.floor(s / mask.feature_mm + len(mask.bits) / 2).astype(int)
     profile = mask.bits[index].reshape(16, -1).mean(axis=1)
     assert np.allclose(frame, 2 / 0.82**2 * np.outer(profile, profile), rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2, 2.5])
+def test_the_virtual_source_is_found_however_a_beam_lies(angle: float) -> None:
+    """Tan-angles are linear in place, t = M u: dt_row/du_row and dt_column/du_column are M's diagonal.
+
+    An astigmatic mirror has two depths; what it adds across (off the diagonal) belongs to neither.
+    """
+    corners = turned(angle, 0.4) @ np.array([[1.0, 0.3], [0.0, 0.7]])
+    slopes = np.array([[1 / 500, 1 / 3000], [-1 / 4000, -1 / 200]])
+    found = beams(corners, tangent=-(corners @ slopes.T)[None]).inverse_depth
+    np.testing.assert_allclose(found, [[1 / 500, -1 / 200]], rtol=1e-12)
+
+
+def test_gradients_are_those_of_the_bilinear_map() -> None:
+    """Of a beam whose opposite sides are not parallel, by differences of 1e-6 (the map is quadratic at most)."""
+    corners = np.random.default_rng(4).normal(size=(2, 2, 2, 2))
+    a, b, step = np.array([0.1, 0.5, 0.9]), np.array([0.2, 0.7]), 1e-6
+    along, across = _gradients(corners, a, b)
+    by_a = (_bilinear(corners, a + step, b) - _bilinear(corners, a - step, b)) / (2 * step)
+    by_b = (_bilinear(corners, a, b + step) - _bilinear(corners, a, b - step)) / (2 * step)
+    np.testing.assert_allclose(np.broadcast_to(along, by_a.shape), by_a, atol=1e-8)
+    np.testing.assert_allclose(np.broadcast_to(across, by_b.shape), by_b, atol=1e-8)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.1, np.pi / 4, np.pi / 2])
+@pytest.mark.parametrize("side", [0.01, 0.06, 0.3, 7.7])
+def test_beams_are_cut_into_boxes_that_tile_them_and_are_small_enough(angle: float, side: float) -> None:
+    """No side above 0.025 mm, and no more boxes than that takes up to eight, or a quarter more above.
+
+    Askew beams get up to three times as many along each side.
+    """
+    box = 0.025
+    cuts = list(_cuts(beams(turned(angle, side)), np.array([0]), box))
+    sizes = {cut.size for cut in cuts}
+    assert len(sizes) == 1 and sum(len(cut.beams) * len(cut.a) * len(cut.b) for cut in cuts) == pytest.approx(
+        1 / np.prod(next(iter(sizes)))
+    )
+    places = np.unique(np.concatenate([cut.a for cut in cuts]))
+    np.testing.assert_allclose(places, (np.arange(len(places)) + 0.5) * cuts[0].size[0], atol=1e-12)
+    # How far from the axes: twice the smaller share of a side in one axis, up to 1.
+    finer = 1 + 2 * min(4 * min(abs(np.sin(angle)), abs(np.cos(angle))), 1)
+    need = max(side / box * finer, 1)
+    for size in cuts[0].size:
+        assert need - 1e-9 <= 1 / size <= max(np.ceil(need), 1.25 * need) + 1e-9
+
+
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_wave_samplers_hold_all_that_a_box_at_the_sensor_s_and_the_field_stop_s_edge_sees(kind: str) -> None:
+    """A box ends up to a pixel beyond the sensor's edge; a camera with a wider field has its numbers there too."""
+    spectrum = Spectrum(np.array([550.0]), np.array([1.0]))
+    narrow, wide = (geometry(kind, mask_order=8, fov=fov) for fov in (20, 40))
+    edge = narrow.half_width + narrow.mask_distance * narrow.tan_half_fov + PITCH / 2
+    ours, theirs = (wave_samplers(camera, spectrum, 400.0, (0.0, 0.0)) for camera in (narrow, wide))
+    for (weight, *samplers), (other_weight, *others) in zip(ours, theirs, strict=True):
+        assert weight == other_weight
+        for sampler, other in zip(samplers, others, strict=True):
+            at, width, tangent = np.array([-edge, edge]), np.full(2, PITCH), np.zeros(2)
+            np.testing.assert_allclose(sampler(at, width, tangent), other(at, width, tangent), atol=1e-9)
+            assert np.abs(other(at, width, tangent)).max() > 0.01, "there is light to lose"
 
 
 def test_flatcam_terms_add_up() -> None:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms, scene_factor, shadow_factor
-from mitsim.rig.camera import centred_edges
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry, centred_edges
 from mitsim.rig.mask import mls_mask
 
 ANCHOR = (0.06, centred_edges(512, 0.01172), centred_edges(128, 120 / 128), 2.0, 400.0)
@@ -106,6 +107,7 @@ def test_finer_cells_average_to_coarse_ones():
         {"profile": []},
         {"profile": [np.nan]},
         {"pixel_edges_mm": [1.0, 0.0]},
+        {"pixel_edges_mm": [0.0, 1.0, 0.5]},
         {"cell_edges_tan": [0.0]},
     ],
 )
@@ -162,3 +164,14 @@ def test_equal_edges_make_directions_and_unequal_ones_are_refused():
 def test_bad_directions_are_refused_in_one_line(centres, width):
     with pytest.raises(MitsimError, match=r"^[^\n]+$"):
         Directions(centres, width)
+
+
+def test_a_fill_factor_dims_both_axes_once_and_shades_each_by_its_own_directions():
+    """Pixels of a quarter of the area: the shadow over half the side, and a quarter of the light."""
+    camera = CameraGeometry(pixels=8, pixel_pitch=0.05, mask_order=5, pixel_fill_factor=0.25)
+    rows, columns = Directions([0.0, 0.01], 0.0), Directions([-0.02, 0.0, 0.03], 0.0)
+    ((left, right),) = shadow_terms(camera, rows, columns, 400.0)
+    ((plain_left, plain_right),) = geometric_terms(ShadowGeometry.of(camera, 400.0), rows, columns)
+    np.testing.assert_array_equal(left, 0.25 * plain_left)
+    np.testing.assert_array_equal(right, plain_right)
+    assert left.shape == (8, 2) and right.shape == (8, 3) and ShadowGeometry.of(camera, 400.0).active_mm == 0.025

@@ -6,7 +6,7 @@ from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import estimate_factors, predicted_error
+from mitsim.reconstruct.calibration import estimate_factors, predicted_error, squared_condition
 from mitsim.reconstruct.solver import prepare
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
@@ -139,6 +139,34 @@ def test_centred_flatcam_is_separable_and_recovers_the_image():
         H,
     )
     assert not plain.ok
+
+
+def test_centring_takes_out_whatever_rows_or_columns_share():
+    """Each response with an offset a row and one a column: the factors are those without, whose columns sum to zero."""
+    rng = np.random.default_rng(5)
+    horizontal, vertical = responses(*factors())
+    offset = [[rng.normal(size=(M, 1)) + rng.normal(size=(1, M + 5)) for _ in side] for side in (horizontal, vertical)]
+    plain = estimate_factors(horizontal, vertical, H, centre=True)
+    got = estimate_factors(
+        *(
+            [y + c for y, c in zip(side, c, strict=True)]
+            for side, c in zip((horizontal, vertical), offset, strict=True)
+        ),
+        H,
+        centre=True,
+    )
+    sign = np.sign(np.vdot(got.left, plain.left))  # of centred factors no sum tells which it is
+    for name in ("left", "right"):
+        estimate, truth = getattr(got, name), getattr(plain, name)
+        assert relative(sign * estimate, truth) < 1e-11
+        assert np.abs(estimate.sum(axis=0)).max() < 1e-11 * np.abs(estimate).sum()
+
+
+def test_a_factor_that_is_singular_to_rounding_has_no_condition():
+    """Rounding is 1e-16 of the largest singular value, not of the next."""
+    assert squared_condition(np.diag([1.0, 1e-8, 1e-17])) == np.inf
+    assert squared_condition(np.diag([1.0, 1e-8, 1e-8])) == pytest.approx(1e16, rel=1e-6)
+    assert squared_condition(np.ones((2, 3))) == np.inf
 
 
 def test_flatcam_leak_where_the_mask_does_not_cover_the_view():

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
+from mitsim.capture.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.reconstruct.calibration import estimate_factors
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.status import Status, Verdict
-from mitsim.rig.patterns import parse_patterns
+from mitsim.rig.patterns import PatternFamily, parse_patterns
 
 N, ROWS, COLUMNS = 12, 20, 17
 FAMILIES = ("uniform", "dots:3", "dots:5", "hadamard:4", "random:3")
@@ -52,6 +53,30 @@ def test_it_is_the_model_of_each_frame(patterns: str, centre: bool) -> None:
             if centre:
                 frame = frame - frame.mean(axis=0) - frame.mean(axis=1, keepdims=True) + frame.mean()
             np.testing.assert_allclose(frames[i, j], frame, rtol=1e-11, atol=1e-11)
+
+
+def test_a_scene_may_have_other_numbers_of_rows_and_columns() -> None:
+    rng = np.random.default_rng(9)
+    model = factors()
+    wide = Factors(model.left, rng.random((COLUMNS, 5)), model.manifest, model.status)
+    image, family = rng.normal(size=(N, 5)), PatternFamily("own", rng.random((N, 1)), rng.random((5, 2)))
+    frames = (wide.operator(family) @ image.ravel()).reshape(1, 2, ROWS, COLUMNS)
+    for j in range(2):
+        frame = wide.left @ (np.outer(family.left[:, 0], family.right[:, j]) * image) @ wide.right.T
+        np.testing.assert_allclose(frames[0, j], frame, rtol=1e-12)
+
+
+def test_random_patterns_by_name_are_those_of_a_capture_without_a_seed() -> None:
+    image = np.ones(N * N)
+    by_name, by_seed = factors().operator("random:3"), factors().operator(parse_patterns("random:3", N, Request().seed))
+    assert np.array_equal(by_name @ image, by_seed @ image)
+
+
+def test_factors_are_usable_with_a_good_status_and_no_warnings_alone() -> None:
+    good = factors()
+    warned = Factors(good.left, good.right, good.manifest.model_copy(update={"warnings": ("saturation",)}), good.status)
+    noisy = Factors(good.left, good.right, good.manifest, Status(Verdict.MOSTLY_NOISE, "Factors are mostly noise"))
+    assert (good.ok, warned.ok, noisy.ok) == (True, False, False)
 
 
 def test_patterns_of_another_projector_are_refused() -> None:

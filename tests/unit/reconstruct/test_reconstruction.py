@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,10 @@ import mitsim.reconstruct
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame
 from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHead, RunManifest
+from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, RunMemory, frame_name, load_run
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from mitsim.reconstruct.status import Status, Verdict
 from mitsim.rig.patterns import parse_patterns
 from mitsim.study.quality import reconstruct as reconstruct_folders
@@ -63,6 +65,32 @@ def test_memory_and_disk_give_the_same_image(shots: Capture, factors: Factors, t
     assert np.abs(memory.image - shots.truth).max() < 0.1
     quality = judged.quality
     assert quality is not None and quality.psnr_db > 20 and quality.ssim is None, "4 pixels are less than its window"
+
+
+def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors) -> None:
+    """Sizes fit, so that nothing else would say it."""
+    manifest = factors.manifest.model_copy(update={"camera": {"name": "other"}})
+    with pytest.raises(MitsimError, match=r"name is other, but .* has bench; calibrate this camera"):
+        reconstruct(shots, Factors(factors.left, factors.right, manifest, factors.status))
+
+
+def test_the_time_of_both_parts_is_stated(shots: Capture, factors: Factors) -> None:
+    begin = time.perf_counter()
+    result = reconstruct(shots, factors)
+    assert min(result.seconds.values()) > 0 and sum(result.seconds.values()) <= time.perf_counter() - begin
+    assert result.summary()["seconds"]["total"] == pytest.approx(sum(result.seconds.values()))
+
+
+def test_the_memory_that_is_asked_for_holds_the_factorised_model(
+    shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At least what the slabs and bases take, at most thirty times as much (of so few numbers)."""
+    asked: list[float] = []
+    monkeypatch.setattr(Cost, "check", lambda self, *_: asked.append(self.memory_bytes))
+    prepared = accumulated(shots, factors).prepared
+    sides = prepared.left, prepared.right
+    held = sum(side.basis.nbytes + sum(slab.matrix.nbytes for slab in side.slabs) for side in sides)
+    assert len(asked) == 1 and held <= asked[0] <= 30 * held
 
 
 def test_the_truth_is_not_looked_at(shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,13 @@ from skimage import data
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.regularisation import automatic_lambda, noise_variance, risk_score
+from mitsim.reconstruct.regularisation import (
+    RISK_POWER,
+    DiagonalProblem,
+    automatic_lambda,
+    noise_variance,
+    risk_score,
+)
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.tv import solve_tv
 from mitsim.rig.camera import centred_edges
@@ -71,6 +77,29 @@ def test_chosen_lambda_is_the_minimum_of_the_score(factor, photograph):
     noise = noise_variance(problem)
     others = [risk_score(problem, chosen * step, noise) for step in (0.5, 0.9, 1.1, 2.0)]
     assert risk_score(problem, chosen, noise) < min(others)
+
+
+def test_the_score_is_the_expected_squared_error_up_to_a_constant():
+    """Unbiased in closed form, to rounding: the score is linear in W^2, so its mean is the score of E W^2.
+
+    With x known, W = sigma x + noise has E W^2 = sigma^2 x^2 + noise, and the Tikhonov coefficient sigma W / (sigma^2 +
+    lambda) differs from x by lambda x / (sigma^2 + lambda) in the mean and by sigma^2 noise / (sigma^2 + lambda)^2 in
+    variance. (Planted: either noise term halved, doubled or dropped; the weight left out.)
+    """
+    rng = np.random.default_rng(3)
+    sigma, image, noise = np.logspace(0, -4, 30).reshape(5, 6), rng.normal(size=(5, 6)), 1e-3
+    sigma[-1, -1] = 0.0  # not measured: no lambda changes it, and neither does the score
+    mean_data = np.where(sigma > 0, np.sqrt(np.square(sigma * image) + noise), 0.0)
+    problem = DiagonalProblem(sigma, mean_data, float(np.square(mean_data).sum()), 1000)
+
+    def squared_error(lam):
+        bias, variance = lam * image / (sigma**2 + lam), noise * np.square(sigma / (sigma**2 + lam))
+        return np.sum((sigma**RISK_POWER * (np.square(bias) + variance))[sigma > 0])
+
+    lambdas = np.logspace(-9, 1, 11)
+    constant = [risk_score(problem, lam, noise) - squared_error(lam) for lam in lambdas]
+    # Terms of up to noise / sigma^2 x sigma^0.5 = 1e3 are added; their rounding is below 1e-12.
+    np.testing.assert_allclose(constant, constant[-1], rtol=0, atol=1e-10)
 
 
 def test_no_more_data_than_unknowns_or_no_signal_is_refused():

@@ -8,7 +8,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import Digital, Patterns, RunManifest, ShotFile
 from mitsim.core.runs import Capture
-from mitsim.study.metrics import Quality, psnr, relative_error, ssim, truth_for
+from mitsim.study.metrics import Quality, psnr, relative_error, ssim, truth_error_for, truth_for
 
 RNG = np.random.default_rng(11)
 TRUTH = RNG.uniform(0.05, 0.9, (24, 20))
@@ -56,12 +56,32 @@ def test_refusals_are_one_line_that_names_the_trouble() -> None:
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("truth_error", "text"),
+    [
+        (None, "PSNR 20.00 dB, SSIM 0.900"),
+        (1e-3, "PSNR 20.00 dB, SSIM 0.900, truth good to 60.0 dB"),
+        (0.04, "PSNR 20.00 dB, SSIM 0.900, truth good to 28.0 dB, which limits the PSNR"),
+        (0.0, "PSNR 20.00 dB, SSIM 0.900, truth good to inf dB"),
+    ],
+)
+def test_quality_says_how_good_the_truth_is(truth_error: float | None, text: str) -> None:
+    """It limits an image when it makes more than a tenth of the squared error: 0.04^2 of 0.1^2."""
+    quality = Quality(20.0, 0.9, truth_error)
+    assert str(quality) == text and quality.limited_by_truth == ("limits" in text)
+    assert Quality.of(TRUTH + 0.1, TRUTH, truth_error).truth_error == truth_error
+
+
 @pytest.mark.parametrize(("board", "expected"), [(None, 0.5), (0.9, 0.55)])
 def test_truth_follows_the_board_of_the_calibration(board: float | None, expected: float) -> None:
     """A sheet that is 0.5 of a 0.99 board is 0.55 of a 0.9 board."""
     values = np.full((3, 4), 0.5, dtype=np.float32)
     shots = Capture(manifest(), memory={"truth.exr": ({"reflectance": values}, {"board_reflectance": 0.99})})
     truth = truth_for(shots, board)
+    assert truth_error_for(shots, board) is None, "0.4.0 did not state it"
+    wrong = {"reflectance": values, "standard_error": np.full_like(values, 0.03)}
+    stated = Capture(manifest(), memory={"truth.exr": (wrong, {"board_reflectance": 0.99})})
+    assert truth_error_for(stated, board) == pytest.approx(0.03 * expected / values.max(), rel=1e-6)
     assert truth is not None and truth.dtype == np.float64 and truth == pytest.approx(expected)
 
 

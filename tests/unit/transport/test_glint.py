@@ -141,11 +141,13 @@ GLASS = fresnel(COSINE, 1.5)
         ({"type": "twosided", "front": {"type": "diffuse"}, "back": CONDUCTOR}, 0.0),
         ({"type": "blendbsdf", "weight": 0.25, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
         ({"type": "mask", "opacity": 0.25, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 0.25),
+        ({"type": "mask", "opacity": 1.0, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 1.0),
+        ({"type": "mask", "opacity": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}}, GLASS / 2),
         ({"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
         ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
         ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, 2 * GLASS / (1 + GLASS)),
     ],
-    ids=["grey", "front", "back", "blend", "mask", "plastic", "glass", "pane"],
+    ids=["grey", "front", "back", "blend", "mask", "whole mask", "half glass", "plastic", "glass", "pane"],
 )
 def test_each_material_sends_on_its_part(bsdf: dict, part: float) -> None:
     full = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
@@ -167,6 +169,27 @@ def test_light_through_a_pane_before_the_mirror(variant: str) -> None:
     assert len(found.ray) == 2 and len(set(found.chain.tolist())) == 2
     assert found.throughput[straight] == pytest.approx(passed**2, rel=1e-2)
     assert found.sensor[straight] == pytest.approx(expected.sensor[0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("opacity", "paint"),
+    [(0.0, {"type": "diffuse"}), (0.0, CONDUCTOR), (0.25, {"type": "diffuse"}), (1.0, {"type": "diffuse"})],
+)
+def test_light_through_a_card_before_the_mirror(variant: str, opacity: float, paint: dict) -> None:
+    """It crosses the card twice."""
+    card = plane(0, 300, {"type": "mask", "opacity": opacity, "bsdf": paint}, 60)
+    alone = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
+    assert flux(scene_with(sheet=plane(0, 400, CONDUCTOR), card=card)) == pytest.approx((1 - opacity) ** 2 * alone)
+
+
+def test_the_edge_of_a_card_that_is_not_there_cuts_no_beam(variant: str) -> None:
+    """A hole is no part of the chain of surfaces that bounds a beam: at a rim, half a sensor pixel would be lost."""
+    card = plane(3, 300, {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}}, 2)
+    scene = scene_with(sheet=plane(0, 400, CONDUCTOR), card=card)
+    beams = trace_glint(scene, scene.sensors()[0], projector(scene))
+    alone = scene_with(sheet=plane(0, 400, CONDUCTOR))
+    assert beams.unresolved == 0
+    assert len(beams) == len(trace_glint(alone, alone.sensors()[0], projector(alone)))
 
 
 def test_a_slab_of_glass_shifts_the_ray_by_snells_law(variant: str) -> None:

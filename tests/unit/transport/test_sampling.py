@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport.sampling import generator, stratified
+from mitsim.transport.sampling import generator, shuffled, stratified
 
 pytestmark = pytest.mark.usefixtures("variant")
 SIGMAS = 5.0
@@ -79,6 +79,29 @@ def test_an_average_over_a_step_converges_faster_than_random_points() -> None:
     inside = (found[..., 0] + 0.4 * found[..., 1] < 0.7).mean(axis=1)
     assert inside.mean() == pytest.approx(0.5, abs=SIGMAS * inside.std() / np.sqrt(512))
     assert inside.std() < 0.2 * np.sqrt(0.25 / 256)
+
+
+def test_two_pairs_of_dimensions_pad_to_four() -> None:
+    """Shuffled, 64 points of each stream are a net as before, and tell nothing of the unshuffled pair of dimensions.
+
+    Over 256 streams no product of one dimension of each pair has a mean beyond its five deviations. (Planted: the same
+    order for both pairs.)
+    """
+    streams, samples = 256, 64
+    lane = np.arange(streams * samples)
+    index, rng = mi.UInt32(lane % samples), generator(mi.UInt32(7), mi.UInt32(lane // samples))
+    first, second = stratified(index, rng), stratified(shuffled(index, rng), rng)
+    pairs = [np.stack([np.array(p.x), np.array(p.y)], axis=1).reshape(streams, samples, 2) for p in (first, second)]
+    for found in pairs[1]:
+        assert len(np.unique(np.floor(found * 8).astype(int) @ [8, 1])) == samples
+    for a in (0, 1):
+        for b in (0, 1):
+            for power in (1, 2, 4):  # coarse structure shared by both pairs
+                cells = [
+                    np.floor(part[..., axis] * 2**power) % 2 - 0.5 for part, axis in zip(pairs, (a, b), strict=True)
+                ]
+                product = (cells[0] * cells[1]).mean(axis=1)
+                assert abs(product.mean()) < SIGMAS * 0.25 / np.sqrt(streams * samples)
 
 
 def test_the_generator_is_its_seeds_and_streams() -> None:

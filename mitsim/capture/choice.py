@@ -1,0 +1,346 @@
+"""The cheapest settings that keep an accuracy: from what the pilot measured to settings, their error and their work.
+
+Every combination of effects, anchors, layers, cells and coarse cells is predicted: the error that all it leaves out or
+makes coarse adds up to, with its signs; the samples that keep the rest of the budget; and the work of both, at fixed
+paces. The cheapest that fits is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain, combinations, product
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.capture.effects import EFFECTS, names
+from mitsim.capture.evidence import COUNTED, GROUPS, SURE, Estimate, Evidence, Part, Settings
+from mitsim.capture.prices import FIXED, MIXING, Numbers, checking_seconds, efforts, optics_seconds, priced
+from mitsim.core.arrays import FloatArray
+
+_MARGIN = 0.92
+"""Part of the accuracy that is planned for: sampling knows its own error to a few percent, and the frames that the
+pilot looks at differ from the family's by as much."""
+_LEAST_SAMPLING = 0.7
+"""Part of the accuracy that sampling aims for where nothing fits, and precision would be lost on it."""
+_COARSE_CELLS = (1, 2, 4, 8)
+"""As for fine light."""
+_FEWEST_SAMPLES = 1.0
+"""Samples of each kind of light in a group: it sees every pixel."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Settings, and what they are predicted to leave and to take.
+
+    Attributes
+    ----------
+    settings
+        effects, numbers, and samples.
+    systematic
+        error that all that is left out or made coarse adds up to.
+    unsigned
+        by what leaves it, the part of that whose sign nobody knows, and which is added as it is.
+    target, noise
+        Monte Carlo error at which sampling may stop, and which the samples are predicted to leave.
+    fits
+        whether the total is within the accuracy, but for what nothing could make up for.
+    work
+        seconds at fixed paces.
+    """
+
+    settings: Settings
+    systematic: Estimate
+    unsigned: Mapping[str, float]
+    target: float
+    noise: float
+    fits: bool
+    work: float
+
+    @property
+    def total(self) -> Estimate:
+        """Predicted error of the frames, all in all."""
+        return Estimate(*(math.hypot(error, self.noise) for error in self.systematic))
+
+
+def parts_of(evidence: Evidence, settings: Settings) -> frozenset[Part]:
+    """What ``settings`` leave out or make coarse, of all that the ``evidence`` knows."""
+    counts = zip(COUNTED, (settings.anchors, len(settings.depths), settings.subdivision), strict=True)
+    off = (Part(name) for name in evidence.effects if name not in settings.effects)
+    return frozenset(chain((Part(*count) for count in counts), off))
+
+
+def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> Choice:
+    """The choice of least work whose predicted total error is below ``accuracy``; failing that, of least error.
+
+    What the user switched off, and light that is known to be missing, does not count for that: nothing could make up
+    for it.
+
+    Parameters
+    ----------
+    accuracy
+        relative rms error of the expected frames.
+    evidence
+        what the pilot measured.
+    switches
+        effects that the user switches on or off, by name.
+    sure
+        standard errors that are added to an estimate.
+    """
+    best: tuple[tuple[bool, float, float], _Table, int] | None = None
+    counts = [_allowed(evidence, name, switches) for name in COUNTED]
+    rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
+    for effects in _subsets(evidence, switches):
+        table = _Table(accuracy, evidence, effects, rows, _given(switches), sure)
+        index = table.best
+        if best is None or table.rank(index) < best[0]:
+            best = table.rank(index), table, index
+    assert best is not None
+    return best[1].choice(best[2])
+
+
+def predicted(
+    accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
+) -> Choice:
+    """What ``settings`` leave and take with samples of their own for the rest of the budget.
+
+    Parameters
+    ----------
+    accuracy, evidence, switches, sure
+        as for :func:`cheapest`.
+    settings
+        effects and numbers.
+    """
+    numbers = settings.anchors, len(settings.depths), settings.subdivision, settings.coarse_cells
+    row = np.array([[*numbers, settings.coarse_layers]], dtype=np.float64)
+    return _Table(accuracy, evidence, settings.effects, row, _given(switches), sure).choice(0)
+
+
+def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
+    """Work that knowing the evidence for certain could save, and the part that is known worst.
+
+    Parameters
+    ----------
+    accuracy, evidence, switches
+        as for :func:`cheapest`.
+    """
+    careful, hopeful = (cheapest(accuracy, evidence, switches, sure) for sure in (SURE, 0.0))
+    parts = [part for part in parts_of(evidence, hopeful.settings) if part in evidence.changes.parts]
+    errors = {part: evidence.error(part) for part in sorted(parts)}
+    worst = max(errors, key=lambda part: errors[part].bound ** 2 - errors[part].value ** 2, default=Part("cells", 1))
+    if careful.fits:
+        return careful.work - hopeful.work, worst
+    return hopeful.work if hopeful.fits else 0.0, worst
+
+
+class _Table:
+    """Predictions of many choices with the same effects.
+
+    Parameters
+    ----------
+    accuracy, evidence, sure
+        as for :func:`cheapest`.
+    effects
+        that are on.
+    rows
+        (m, 5) anchors, layers, cells, coarse cells, and whether coarse light has all layers.
+    given
+        parts that are left out whatever is chosen.
+    """
+
+    def __init__(
+        self,
+        accuracy: float,
+        evidence: Evidence,
+        effects: frozenset[str],
+        rows: FloatArray,
+        given: frozenset[Part],
+        sure: float,
+    ) -> None:
+        self.accuracy, self.evidence, self.effects, self.rows = accuracy, evidence, effects, rows
+        self.given, self.sure = given, sure
+        self.anchors, self.layers, self.cells, self.coarse, all_layers = rows.T
+        indirect = float("interreflection" in effects)
+        waves = float(bool(effects & names(lambda effect: effect.in_shadow)))
+        layered = np.where(all_layers > 0, self.layers, 1.0)
+        mixed = float(MIXING in effects)
+        self.numbers = Numbers(self.anchors, self.layers, self.cells, self.coarse, layered, waves, indirect, mixed)
+
+    def rank(self, index: int) -> tuple[bool, float, float]:
+        """What makes one choice better than another: that it fits, less work, less error."""
+        if not self.fits[index]:
+            return True, float(self._avoidable[index]), 0.0
+        return False, float(self.work[index]), float(self._avoidable[index])
+
+    @cached_property
+    def best(self) -> int:
+        """The best row."""
+        work = np.where(self.fits, self.work, 0.0)
+        return int(np.lexsort((self._avoidable, work, np.where(self.fits, 0.0, self._avoidable), ~self.fits))[0])
+
+    def choice(self, index: int) -> Choice:
+        """The choice of a row."""
+        anchors, layers, cells, coarse, all_layers = (int(number) for number in self.rows[index])
+        settings = Settings(
+            depth=self.evidence.depth,
+            anchors=anchors,
+            layers=self.evidence.layers[layers] if layers > 1 else (),
+            subdivision=cells,
+            effects=self.effects,
+            coarse_cells=coarse,
+            coarse_layers=bool(all_layers),
+            reach=self.evidence.reach,
+            sharp=self.evidence.sharp,
+            **{f"{name}_samples": float(count[index]) for name, count in self.samples.items()},
+        )
+        missing, centre = self.evidence.unresolved, np.add(*self._from_centre(SURE))
+        value, bound = (float(self._systematic(sure, frozenset())[index]) + missing for sure in (0.0, SURE))
+        return Choice(
+            settings=settings,
+            systematic=Estimate(value, bound),
+            unsigned={
+                "light over sharp lobes": missing,
+                "one anchor for other than direct light": float(centre[index]),
+            },
+            target=float(self.target[index]),
+            noise=float(self.noise[index]),
+            fits=bool(self.fits[index]),
+            work=float(self.work[index]),
+        )
+
+    # ---- errors
+
+    @cached_property
+    def _avoidable(self) -> FloatArray:
+        """(m,) systematic error without what is given."""
+        return self._systematic(self.sure, self.given)
+
+    def _systematic(self, sure: float, ignored: frozenset[Part]) -> FloatArray:
+        """(m,) what all that is left out or made coarse adds up to, but for parts that are ``ignored``."""
+        changes, apart = self.evidence.changes, self.evidence.apart
+        chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
+        drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
+        squared, spread = changes.squared(chosen)
+        beside, along = self._from_centre(sure)
+        return np.asarray(np.sqrt(np.maximum(squared, 0) + sure * spread + sum(drawn) + beside**2) + along)
+
+    def _weight(self, part: Part) -> FloatArray:
+        """(m,) how much of a part's change each row leaves."""
+        light, _, what = part.name.rpartition(" ")
+        if not part.count:
+            return np.full(len(self.rows), float(part.name not in self.effects))
+        if not light:
+            return np.asarray(getattr(self, part.name) == part.count, dtype=np.float64)
+        filed = self.anchors > 1 if light == "anchored" else np.full(len(self.rows), self.numbers.indirect > 0)
+        # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
+        return filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers)
+
+    @cached_property
+    def _left_by_layers(self) -> FloatArray:
+        """(m,) part of one layer's error that the layers of coarse light leave."""
+        ladder = self.evidence.ladders["layers"]
+        parts = np.zeros(max(ladder) + 1)
+        for count, error in ladder.items():
+            parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
+        return np.where(self.rows[:, 4] > 0, parts[self.layers.astype(int)], 1.0)
+
+    def _from_centre(self, sure: float) -> tuple[FloatArray, FloatArray]:
+        """(m,) errors of light that is seen from the sensor's centre alone: as one anchor leaves of direct light.
+
+        The first where direct light has several anchors: it varies over the sensor, unlike what cells and layers leave,
+        and is independent of that. The second where it has one, whose error has the same shape and adds up.
+        """
+        evidence = self.evidence
+
+        def size(error: Estimate) -> float:
+            return error.bound if sure else error.value
+
+        seen = self.effects & names(lambda effect: effect.from_centre)
+        share = sum(size(error) for name, error in evidence.effects.items() if name in seen)
+        error = min(share, 1.0) * size(evidence.ladders["anchors"][1]) / (evidence.direct_part or 1.0)
+        several = self.anchors > 1
+        return error * several, error * ~several
+
+    # ---- samples and work
+
+    @cached_property
+    def fits(self) -> npt.NDArray[np.bool_]:
+        """(m,) whether anything is left for sampling."""
+        return self._avoidable < _MARGIN * self.accuracy
+
+    @cached_property
+    def target(self) -> FloatArray:
+        """(m,) Monte Carlo error at which sampling may stop."""
+        left = np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
+        return np.where(self.fits, np.sqrt(np.maximum(left, 0)), _LEAST_SAMPLING * self.accuracy)
+
+    @cached_property
+    def _prices(self) -> dict[str, FloatArray]:
+        """(m,) work of one sample in every group, by kind of light."""
+        connections = self.anchors**2 * (self.anchors > 1)
+        return {
+            name: GROUPS * getattr(FIXED, name) * effort.paths * (connections if name == "anchored" else 1)
+            for name, effort in efforts(self.evidence, self.effects).items()
+        }
+
+    @cached_property
+    def samples(self) -> dict[str, FloatArray]:
+        """(m,) samples of a group by kind of light: the least work for a sum of variances."""
+        kinds = efforts(self.evidence, self.effects)
+        parts = {name: np.sqrt(kinds[name].variance * price) for name, price in self._prices.items()}
+        whole = sum(parts.values()) + np.zeros(len(self.rows))
+        single = self.target * math.sqrt(GROUPS)
+        found = {}
+        for name, effort in kinds.items():
+            # Light without noise takes no share; a share of one keeps the division defined.
+            part = parts[name] + np.zeros(len(whole))
+            share = np.sqrt(np.divide(part, whole, out=np.ones(len(whole)), where=part > 0))
+            found[name] = np.maximum(effort.noise.samples_for(single * share), _FEWEST_SAMPLES)
+        return found
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """(m,) Monte Carlo error that these samples leave."""
+        kinds, total = efforts(self.evidence, self.effects), np.zeros(len(self.rows))
+        for name, count in self.samples.items():
+            noise = kinds[name].noise
+            on = self.anchors > 1 if name == "anchored" else 1.0
+            total = total + on * np.square(noise.error) * (count / noise.samples) ** (-2 * noise.rate) / GROUPS
+        return np.sqrt(total)
+
+    @cached_property
+    def work(self) -> FloatArray:
+        """(m,) seconds at fixed paces."""
+        tracing = sum(self.samples[name] * price for name, price in self._prices.items())
+        forming = self.evidence.forming
+        shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
+        return np.asarray(tracing + shown)
+
+
+def _counts(evidence: Evidence, name: str) -> list[int]:
+    return list(evidence.ladders[name])
+
+
+def _allowed(evidence: Evidence, name: str, switches: Mapping[str, bool]) -> list[int]:
+    """Numbers of ``name`` that the user leaves to choose from."""
+    counts = _counts(evidence, name)
+    if name not in switches or len(counts) == 1:
+        return counts
+    return [count for count in counts if (count > 1) == switches[name]]
+
+
+def _given(switches: Mapping[str, bool]) -> frozenset[Part]:
+    """What is left out by the user's choice."""
+    return frozenset(Part(name, int(name in COUNTED)) for name, on in switches.items() if not on)
+
+
+def _subsets(evidence: Evidence, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:
+    """Effects that may be on together: those that take no time always are, unless the user switches them off."""
+    takes_time, present = priced(), frozenset(evidence.effects)
+    free = [name for name in EFFECTS if name in takes_time & present and name not in switches]
+    always = {name for name in EFFECTS if switches.get(name, name in present - takes_time)}
+    for several in chain.from_iterable(combinations(free, count) for count in range(len(free) + 1)):
+        yield frozenset(always | set(several))

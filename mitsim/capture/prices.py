@@ -1,0 +1,203 @@
+"""What simulating takes: from settings, what the pilot found and paces to seconds of each stage.
+
+The plan compares its choices at :data:`FIXED` paces, not at those of this machine and moment: the same seed must mean
+the same settings. What the pilot measured only scales the prediction that people read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from mitsim.capture.effects import names
+from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, Settings
+from mitsim.optics.frames import PROBES, formed_frames
+
+ROUNDS, CHECKED_SHOTS = 3.0, 8
+"""Rounds that sampling takes, most often two to four, and shots that are formed in each to see the error."""
+MIXING = "black-level"
+"""Effect that lights every pixel in every shot, so that shots are no longer single classes."""
+_GEOMETRIC_ENTRIES = 0.03
+"""An entry of a geometric shadow over one of a wave-optical one: a sum over features against samples of a field."""
+
+
+@dataclass(frozen=True)
+class Paces:
+    """Seconds of a path or connection of each kind, of a multiplication in forming frames, and of an entry of a
+    wave-optical shadow."""
+
+    direct: float
+    anchored: float
+    indirect: float
+    from_camera: float
+    sharp: float
+    product: float
+    entry: float
+
+
+FIXED = Paces(direct=1e-7, anchored=1e-7, indirect=2.5e-7, from_camera=7e-7, sharp=2e-7, product=3e-11, entry=7e-8)
+"""Measured over the shipped scenes on two cores, medians; only their ratios decide."""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The numbers of settings that cost depends on, one choice or (m,) of them at once."""
+
+    anchors: Number
+    layers: Number
+    cells: Number
+    coarse_cells: Number
+    coarse_layers: Number
+    waves: Number
+    indirect: Number
+    mixed: Number
+
+    @classmethod
+    def coarsest(cls) -> Numbers:
+        """One of everything, and a wave-optical shadow."""
+        return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, settings: Settings) -> Numbers:
+        """Those of ``settings``."""
+        layers = float(len(settings.depths))
+        return cls(
+            anchors=float(settings.anchors),
+            layers=layers,
+            cells=float(settings.subdivision),
+            coarse_cells=float(settings.coarse_cells),
+            coarse_layers=layers if settings.coarse_layers else 1.0,
+            waves=float(bool(settings.effects & names(lambda effect: effect.in_shadow))),
+            indirect=float("interreflection" in settings.effects),
+            mixed=float(MIXING in settings.effects),
+        )
+
+
+def paces_of(evidence: Evidence) -> Paces:
+    """Those that the ``evidence`` measured, where it measured any."""
+    one = _products(evidence.forming, evidence.forming.lit, 1.0, 1.0, 1.0, 1.0)
+    return Paces(
+        direct=evidence.direct.seconds or FIXED.direct,
+        anchored=evidence.anchored.seconds or FIXED.anchored,
+        indirect=evidence.indirect.seconds or FIXED.indirect,
+        from_camera=evidence.from_camera.seconds or FIXED.from_camera,
+        sharp=evidence.sharp_light.seconds or FIXED.sharp,
+        product=float(evidence.forming.seconds / one) if evidence.forming.seconds else FIXED.product,
+        entry=FIXED.entry,
+    )
+
+
+def priced() -> frozenset[str]:
+    """Names of effects that take time; to have the others on costs nothing."""
+    return names(lambda effect: effect.followed or effect.in_shadow) | {MIXING}
+
+
+def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
+    """What each kind of light that ``effects`` call for takes by the ``evidence``; connections to anchors: to one."""
+    found = {"direct": evidence.direct, "anchored": evidence.anchored}
+    if evidence.sharp:
+        found["sharp"] = evidence.sharp_light
+    if effects & names(lambda effect: effect.followed):
+        found |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera}
+    return found
+
+
+def _products(forming: Forming, lit: Number, cells: Number, layers: Number, anchors: Number, waves: Number) -> Number:
+    """Multiplications of one frame, ``lit`` of whose rows of cells hold light, and of the probes that tell its error.
+
+    Parameters
+    ----------
+    forming
+        what it depends on.
+    lit, cells, layers, anchors, waves
+        part of the rows, cells and layers, anchors, and whether the shadow is wave-optical.
+    """
+    rows = lit * forming.cells * cells * anchors
+    pixels = forming.pixels
+    probes = GROUPS * (PROBES + 1) * (np.minimum(rows, pixels) + pixels) * rows
+    terms = 1 + (forming.terms - 1) * waves
+    return cast(Number, terms * layers * (pixels * rows**2 + pixels**2 * rows + probes))
+
+
+def _entries(forming: Forming, numbers: Numbers) -> Number:
+    """Entries of all shadows that are prepared, as many as wave-optical ones take as long."""
+    coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
+    sides = numbers.cells * numbers.layers + coarse * numbers.coarse_cells * numbers.coarse_layers
+    terms = forming.terms * numbers.waves + _GEOMETRIC_ENTRIES * (1 - numbers.waves)
+    return cast(Number, 2 * forming.pixels * forming.cells * sides * terms)
+
+
+def forming_seconds(forming: Forming, numbers: Numbers, frames: float, paces: Paces) -> Number:
+    """Seconds of forming so many ``frames``.
+
+    Parameters
+    ----------
+    forming, numbers
+        what it depends on.
+    frames
+        to be formed.
+    paces
+        of this machine, or the fixed ones.
+    """
+    several = np.asarray(numbers.anchors) > 1
+    coarse = numbers.coarse_cells, numbers.coarse_layers
+    mixes = forming.classes <= forming.shots
+    # Shots that are mixed from frames of classes keep those; others hold light in all rows of cells.
+    lit = forming.lit if mixes else forming.lit + (1 - forming.lit) * numbers.mixed
+    products = (
+        _products(forming, lit, numbers.cells, numbers.layers, 1.0, numbers.waves)
+        + several * _products(forming, lit, *coarse, numbers.anchors, numbers.waves)
+        + numbers.indirect * _products(forming, 1.0, *coarse, 1.0, numbers.waves)
+    )
+    if mixes:
+        products = products + numbers.mixed * forming.classes * forming.pixels**2
+    return cast(Number, paces.product * frames * products)
+
+
+def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
+    """Seconds of all frames of the family, with the shadows that form them.
+
+    Parameters
+    ----------
+    forming, numbers, paces
+        as for :func:`forming_seconds`.
+    """
+    shadows = paces.entry * _entries(forming, numbers)
+    return shadows + forming_seconds(forming, numbers, formed_frames(forming.classes, forming.shots), paces)
+
+
+def checking_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
+    """Seconds of seeing how large the Monte Carlo error is, while light is traced.
+
+    Parameters
+    ----------
+    forming, numbers, paces
+        as for :func:`forming_seconds`.
+    """
+    return forming_seconds(forming, numbers, ROUNDS * min(CHECKED_SHOTS, forming.shots), paces)
+
+
+def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, float]:
+    """Seconds of tracing the samples in ``settings``, by kind of light.
+
+    Parameters
+    ----------
+    evidence
+        paths in a sample.
+    settings
+        the samples.
+    paces
+        as for :func:`forming_seconds`.
+    """
+    anchors = settings.anchors**2 * (settings.anchors > 1)
+    return {
+        name: GROUPS
+        * math.ceil(getattr(settings, f"{name}_samples"))
+        * effort.paths
+        * getattr(paces, name)
+        * (anchors if name == "anchored" else 1)
+        for name, effort in efforts(evidence, settings.effects).items()
+    }

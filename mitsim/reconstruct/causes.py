@@ -1,0 +1,201 @@
+"""Measurements, their residuals and the factors in; out comes which cause explains best what the model does not.
+
+Each cause leaves its own mark. Where a surface is not at the calibrated distance, parallax moves its light along the
+baseline: a few measurements of single groups of lit pixels are then explained by light of *any* pixel of the same rows
+(or the same columns). Ambient light is the same in every shot, and comes from all pixels. Gloss comes from the lit
+pixels, but changes over the sensor: the factors times a polynomial of the place explain it. Another rig explains
+nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.runs import Measurement
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.sides import IndexArray, group_pixels
+
+_PLACES = (0.1, 0.3), (0.4, 0.8), (0.7, 0.1), (0.9, 0.6)
+"""Which groups of lit rows and columns are looked at, as parts of their number: chosen, four spread over both."""
+_DEGREE = 2
+"""Of the polynomials that gloss is told by: chosen, a highlight is wider than half of the sensor."""
+_SATURATED = 1e-5
+"""Part of the readings at the end of their range that is no accident: 2.6 pixels of 512 x 512."""
+_MOST = 0.5
+"""Part of the unexplained energy that names a cause: more than all others together."""
+_COMMON = 0.15
+"""The same of what is common to all shots; less than half, as most of ambient light looks like an image and leaves the
+residual. Light that changes from shot to shot has 1 / shots."""
+_EVERYWHERE = 0.75
+"""The same of what light of all scene pixels explains: a lamp's own colours leave 0.06 to 0.2 of theirs."""
+_ALL = 0.3
+"""Unexplained part of the measurements above which neither depth nor ambient light is the cause, but another rig."""
+
+
+class Cause(Enum):
+    """Why measurements do not fit; the value is its sentence and the remedy."""
+
+    SATURATION = (
+        "readings at the full well or the ADC's end",
+        "expose for less",
+    )
+    AMBIENT = (
+        "ambient light, the same in every shot",
+        "darken the room, or take a dark frame off every shot",
+    )
+    DEPTH = (
+        "depth, light that lands beside where the calibration saw it",
+        "put the scene at the calibrated distance, or calibrate at the scene's",
+    )
+    INDIRECT = (
+        "light from scene pixels that are not lit, over other surfaces or from depths along both axes",
+        "cover shiny and near surfaces, or use patterns with more dots",
+    )
+    GLOSS = (
+        "gloss, light that changes over the sensor",
+        "turn the highlight away from the sensor, or take it as an image of the matt parts alone",
+    )
+    RIG = (
+        "another rig, mask or pattern than was calibrated, or light over mirrors",
+        "calibrate this camera with this projector",
+    )
+    UNKNOWN = (
+        "unknown: depth, gloss, indirect light or print much finer than a projector pixel",
+        "compare the map of the misfit with the scene",
+    )
+
+
+@dataclass(frozen=True)
+class Signatures:
+    """Parts of the unexplained energy, 1 is all; NaN where the patterns cannot tell.
+
+    ``rows``, ``columns``, ``everywhere``: explained by light of any scene row, of any column, of any pixel.
+    ``gloss``: explained by factors that change over the sensor. ``common``: the same in every shot. ``saturated``: part
+    of the readings at the end of their range.
+    """
+
+    rows: float
+    columns: float
+    everywhere: float
+    gloss: float
+    common: float
+    saturated: float
+
+
+class Evidence:
+    """Gathers what tells causes apart, from one measurement after the other.
+
+    Parameters
+    ----------
+    factors
+        of the model.
+    patterns
+        P_L (n, K) and P_R (n', K').
+    """
+
+    def __init__(self, factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> None:
+        self._factors = factors.sides
+        sides = [_lit_groups(side) for side in patterns]
+        places = {(int(row * len(sides[0])), int(column * len(sides[1]))) for row, column in _PLACES}
+        self._groups = [(sides[0][row], sides[1][column]) for row, column in sorted(places)]
+        shape = len(factors.left), len(factors.right)
+        self._frames: list[FloatArray] = [np.zeros(shape) for _ in self._groups]
+        self._variances = [0.0] * len(self._groups)
+        self._common: FloatArray = np.zeros(shape)
+        self._common_noise, self._shots = 0.0, 0
+
+    def add(self, measurement: Measurement, frame: FloatArray, residual: FloatArray, variance: float) -> None:
+        """Count in one measurement.
+
+        Parameters
+        ----------
+        measurement
+            which pattern it is of.
+        frame, residual
+            (rows, columns) as the solver takes it, and what the model leaves of it.
+        variance
+            mean noise variance of its data.
+        """
+        if measurement.shots == 1:  # the same light in both halves of a pair is gone
+            self._common += residual
+            self._common_noise += variance * residual.size
+            self._shots += 1
+        for k, (rows, columns) in enumerate(self._groups):
+            weight = rows.weights[measurement.row] * columns.weights[measurement.column]
+            if weight:
+                self._frames[k] += weight * frame
+                self._variances[k] += weight**2 * variance
+
+    def signatures(self, unexplained: float, saturated: float) -> Signatures:
+        """What was gathered; ``unexplained`` is the energy beyond all that is expected, ``saturated`` a part of all
+        readings."""
+        common = np.nan
+        if self._shots > 1 and unexplained > 0:
+            common = (float(np.square(self._common).sum()) - self._common_noise) / self._shots / unexplained
+        everything = [_orthonormal(side) for side in self._factors]
+        left = np.zeros(5)
+        for groups, frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
+            lit = [side[:, group.pixels] for side, group in zip(self._factors, groups, strict=True)]
+            own, glossy = [_orthonormal(side) for side in lit], [_orthonormal(_modulated(side)) for side in lit]
+            ranges = (own[0], own[1]), (everything[0], own[1]), (own[0], everything[1]), everything, glossy
+            left += [_beyond(frame, variance, *pair) for pair in ranges]
+        rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
+        return Signatures(*(float(value) for value in (rows, columns, everywhere, gloss, common, saturated)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Lit:
+    """Scene ``pixels`` of one side, and the ``weights`` (K,) with which measurements add up to light of these alone."""
+
+    pixels: IndexArray
+    weights: FloatArray
+
+
+def _lit_groups(patterns: FloatArray) -> list[_Lit]:
+    """Groups of one side that measurements can be added up for; each pattern's own lit pixels where there are none."""
+    groups = group_pixels(patterns, "block")
+    if all(group.shared is not None for group in groups):
+        lit = [(group.pixels, group.shared[1]) for group in groups if group.shared and group.shared[1].any()]
+        return [_Lit(pixels, psi / np.dot(psi, psi)) for pixels, psi in lit]
+    alone = np.eye(patterns.shape[1])
+    return [_Lit(np.flatnonzero(column), one) for column, one in zip(patterns.T, alone, strict=True) if column.any()]
+
+
+def likely_cause(signatures: Signatures, unexplained: float) -> Cause:
+    """The cause that the ``signatures`` point to; ``unexplained`` is a part of the measurements, rms."""
+    along, across = max(signatures.columns, signatures.rows), min(signatures.columns, signatures.rows)
+    if signatures.saturated > _SATURATED:
+        return Cause.SATURATION
+    # One axis explains what the other does not: a baseline. NaN compares as False throughout.
+    if along > _MOST and along > 2 * across:
+        return Cause.DEPTH
+    if signatures.common > _COMMON and signatures.everywhere > _EVERYWHERE:
+        return Cause.AMBIENT
+    if unexplained > _ALL:
+        return Cause.RIG
+    if signatures.everywhere > _MOST:
+        return Cause.INDIRECT
+    return Cause.GLOSS if signatures.gloss > _MOST else Cause.UNKNOWN
+
+
+def _beyond(frame: FloatArray, variance: float, left: FloatArray, right: FloatArray) -> float:
+    """Energy of a ``frame`` beyond its noise that two orthonormal ranges leave."""
+    seen = left.T @ frame @ right
+    beyond = np.square(frame).sum() - np.square(seen).sum() - (frame.size - seen.size) * variance
+    return float(beyond)
+
+
+def _modulated(factor: FloatArray) -> FloatArray:
+    """A factor's columns (m, c), and these times powers of the place along the sensor: (m, c (degree + 1))."""
+    place = np.linspace(-1, 1, len(factor))[:, None]
+    return np.concatenate([factor * place**power for power in range(_DEGREE + 1)], axis=1)
+
+
+def _orthonormal(matrix: FloatArray) -> FloatArray:
+    """Orthonormal columns that span those of ``matrix``, but for directions that are rounding."""
+    left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left[:, singular > singular[0] * max(matrix.shape) * np.finfo(np.float64).eps])

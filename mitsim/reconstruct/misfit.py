@@ -1,0 +1,219 @@
+"""Measurements and the factorised model in; out comes how much of them the model leaves unexplained, and where.
+
+Of data Y the model can explain what lies in its range, U_L W U_R^T, whatever the image: the residual R = Y - U_L W
+U_R^T hangs on no lambda. Its energy is held against what the sensor's stated noise, that of the calibrated factors and
+the error of simulated frames put there; what is more is *unexplained*: light that no flat, matt scene at the calibrated
+distance sends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.runs import Measurement
+from mitsim.reconstruct.accumulator import centred
+from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
+from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.status import Status, Verdict
+
+UNEXPLAINED = 3.5e-3
+"""Part of the measurements, rms, that a fitting scene may leave unexplained: print that is finer than a projector's
+pixel leaves up to 2.4e-3 (the resolution target, 49 dots); a sheet 2 mm off 400 leaves 4.2e-3 (16 dots) to 1.0e-2
+(49)."""
+UNEXPLAINED_TILE = 2e-2
+"""The same of a single tile, where such print is not averaged: above all that fitting scenes left
+(tests/physics/test_misfit.py)."""
+CHANCE = 6.0
+"""Standard deviations of the noise's own energy that are left to chance: with 64 tiles once in 10^7 images."""
+GROSS = 0.1
+"""Unexplained part from which an image is flagged where the noise was not stated; few photons leave as much, so that
+the part has to be four times the energy of their shot noise, too."""
+_GROSS_CHI_SQUARE = 4.0
+"""The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
+_TINY = 1e-300
+"""Stands for 0 in a denominator."""
+_TILES = 8
+"""Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """What the model leaves unexplained.
+
+    Attributes
+    ----------
+    chi_square
+        energy of the residual over what is expected of it; 1 where the model fits.
+    unexplained
+        square root of the energy beyond that, relative to the measurements; 0 where nothing is.
+    tiles
+        (rows, columns) the chi-square of each tile of the sensor.
+    worst_tile
+        largest unexplained part of a tile.
+    stated
+        whether the noise of sensor and calibration were stated; otherwise only gross misfit is flagged.
+    flagged
+        whether more is left than chance and a fitting scene leave.
+    cause
+        the likely one of a flagged image.
+    signatures
+        of a flagged image: the parts of the unexplained energy by which causes are told apart.
+    """
+
+    chi_square: float
+    unexplained: float
+    tiles: FloatArray
+    worst_tile: float
+    stated: bool
+    flagged: bool
+    cause: Cause | None
+    signatures: Signatures | None
+
+    def summary(self) -> dict[str, Any]:
+        """What result.json and the command line's JSON say of it."""
+        return {
+            "chi_square": self.chi_square,
+            "unexplained": self.unexplained,
+            "worst_tile": self.worst_tile,
+            "noise_stated": self.stated,
+            "flagged": self.flagged,
+            "cause": self.cause.name.lower() if self.cause else None,
+            "signatures": asdict(self.signatures) if self.signatures else None,
+            "map": self.tiles.tolist(),
+        }
+
+    def judged(self, status: Status) -> Status:
+        """The ``status`` of a solution with this misfit."""
+        if not self.flagged or self.cause is None:
+            return status
+        times = f", {self.chi_square:.3g} times what its noise makes" if self.stated else ""
+        sentence = (
+            f"{self.unexplained:.1%} of the measurements fit no image{times}; likely cause: {self.cause.value[0]}"
+        )
+        if not status.verdict.good:
+            return replace(status, flags=(*status.flags, f"Misfit: {sentence}; {self.cause.value[1]}."))
+        return replace(status, verdict=Verdict.MISFIT, sentence=f"Misfit: {sentence}", remedy=self.cause.value[1])
+
+
+class Residuals:
+    """Sums over what the model leaves of every measurement, by tile of the sensor.
+
+    Parameters
+    ----------
+    prepared
+        the factorised model.
+    weights
+        (r, r') W of all measurements.
+    noise
+        of the measurements.
+    evidence
+        empty; gathers what tells causes apart.
+
+    Attributes
+    ----------
+    residual, energy, power, variance
+        (tiles, tiles) sums of the squares of residuals, of measurements and of shots, and of the noise's variance.
+    pixels
+        (tiles, tiles) pixels of each tile.
+    """
+
+    def __init__(self, prepared: Prepared, weights: FloatArray, noise: FrameNoise, evidence: Evidence) -> None:
+        self._prepared, self._weights, self._noise, self.evidence = prepared, weights, noise, evidence
+        sizes = prepared.left.sensor_size, prepared.right.sensor_size
+        edges = [np.linspace(0, size, min(_TILES, size) + 1).astype(np.intp) for size in sizes]
+        self._starts = [edge[:-1] for edge in edges]
+        self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
+        self.residual, self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(4))
+
+    def add(self, measurement: Measurement) -> None:
+        """Count in one ``measurement``."""
+        prepared = self._prepared
+        frame = centred(measurement.frame) if prepared.centre else measurement.frame
+        left, right = prepared.left.slabs[measurement.row], prepared.right.slabs[measurement.column]
+        residual = frame - (left.matrix @ self._weights[left.columns][:, right.columns]) @ right.matrix.T
+        self.residual += self._sums(np.square(residual))
+        self.energy += self._sums(np.square(frame))
+        self.power += self._sums(measurement.power)
+        # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
+        light = self._sums(measurement.light) / self.pixels
+        variance = self._noise.of(light, measurement.shots) * self.pixels
+        self.variance += variance
+        self.evidence.add(measurement, frame, residual, float(variance.sum()) / frame.size)
+
+    def expected(self, factor_energy: float) -> FloatArray:
+        """(tiles, tiles) energy that is expected of the residual: the sensor's noise less what the fit takes up, the
+        error of simulated frames where the light is, and ``factor_energy`` evenly."""
+        spare = 1 - self._prepared.rank / (self._prepared.left.data_rows * self._prepared.right.data_rows)
+        rendering = self._noise.rendering * self.power / max(float(self.power.sum()), _TINY)
+        return np.asarray(self.variance * spare + rendering + factor_energy * self.pixels / self.pixels.sum())
+
+    def _sums(self, values: FloatArray) -> FloatArray:
+        rows = np.add.reduceat(values, self._starts[0], axis=0)
+        return np.asarray(np.add.reduceat(rows, self._starts[1], axis=1))
+
+
+def judge(
+    prepared: Prepared,
+    weights: FloatArray,
+    measured: Iterable[Measurement],
+    noise: FrameNoise,
+    factor_energy: float | None,
+    evidence: Evidence,
+) -> Misfit | None:
+    """Hold all measurements against the model; None where there are no more data than unknowns.
+
+    Parameters
+    ----------
+    prepared, weights
+        the factorised model, and W of all measurements.
+    measured
+        all of them once more.
+    noise
+        of them, summed up already.
+    factor_energy
+        what noisy factors add to the frames; None: not stated.
+    evidence
+        empty, of the same model.
+    """
+    if prepared.rank >= prepared.left.data_rows * prepared.right.data_rows:
+        return None
+    sums = Residuals(prepared, weights, noise, evidence)
+    for measurement in measured:
+        sums.add(measurement)
+    expected = sums.expected(factor_energy or 0.0)
+    energy, excess = float(sums.energy.sum()), float((sums.residual - expected).sum())
+    unexplained = float(np.sqrt(max(excess, 0.0) / max(energy, _TINY)))
+    tiles = np.sqrt(np.maximum(sums.residual - expected, 0.0) / np.maximum(sums.energy, _TINY))
+    chi_square = float(sums.residual.sum() / max(float(expected.sum()), _TINY))
+    chi_squares = sums.residual / np.maximum(expected, _TINY)
+    stated = noise.stated and factor_energy is not None
+    if stated:
+        flagged = unexplained > UNEXPLAINED and chi_square > 1 + _chance(noise, float(sums.pixels.sum()))
+        local = (tiles > UNEXPLAINED_TILE) & (chi_squares > 1 + _chance(noise, float(sums.pixels.min())))
+        flagged = flagged or bool(local.any())
+    else:
+        flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
+    signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1)) if flagged else None
+    return Misfit(
+        chi_square=chi_square,
+        unexplained=unexplained,
+        tiles=chi_squares,
+        worst_tile=float(tiles.max()),
+        stated=stated,
+        flagged=flagged,
+        cause=likely_cause(signatures, unexplained) if signatures else None,
+        signatures=signatures,
+    )
+
+
+def _chance(noise: FrameNoise, pixels: float) -> float:
+    """What chance may add to the chi-square of that many ``pixels`` in all measurements: the energy of normal noise of
+    variance v in n data varies by sqrt(2 n) v."""
+    total = max(float(noise.variance.sum()), _TINY)
+    return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total

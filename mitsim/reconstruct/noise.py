@@ -1,0 +1,108 @@
+"""Measurements in, how far noise and rendering may have moved them out: mean variance by pattern, and by source."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.manifests import FactorNoise, RunManifest
+from mitsim.core.runs import Measurement
+from mitsim.reconstruct.solver import Prepared
+
+
+class FrameNoise:
+    """Noise of all measurements of a run, as its manifest states the sensor.
+
+    Parameters
+    ----------
+    manifest
+        of the run.
+    dark_variance
+        mean noise variance of a pixel of the dark frame that was taken off every shot [(electrons/s)^2]: one draw,
+        common to all; 0 without one.
+
+    Attributes
+    ----------
+    variance
+        (K, K') mean noise variance of a datum of each pattern [(electrons/s)^2].
+    power
+        sum of the squares of all shots [(electrons/s)^2].
+    shots, saturated, readings
+        shots of a pattern; readings at the full well or the ADC's end, and all of them.
+
+    """
+
+    def __init__(self, manifest: RunManifest, dark_variance: float = 0.0) -> None:
+        self._digital = manifest.digital
+        self.dark_variance = dark_variance
+        self._rendering = np.hypot(manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error"))
+        counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
+        self.variance: FloatArray = np.zeros(counts)
+        self.power, self.shots, self.saturated, self.readings = 0.0, 1, 0, 0
+
+    @property
+    def stated(self) -> bool:
+        """Whether all of the sensor's noise is known; otherwise :attr:`variance` is that of its light alone."""
+        return self._digital.noise_is_stated
+
+    @property
+    def rendering(self) -> float:
+        """Energy of what simulated frames are off by, as they state it: Monte Carlo error and discretisation."""
+        return float(self._rendering**2 * self.power)
+
+    def of(self, light: FloatArray | float, shots: int) -> FloatArray:
+        """Noise variance [(electrons/s)^2] of a measurement.
+
+        Parameters
+        ----------
+        light, shots
+            sum of its shots [electrons/s], any shape, and their number.
+        """
+        dark = self.dark_variance if shots == 1 else 0.0  # the difference of a pair has no dark frame
+        return np.maximum(self._digital.variance(light, shots) + dark, 0.0)
+
+    def add(self, measurement: Measurement) -> None:
+        """Count in one ``measurement``."""
+        self.variance[measurement.row, measurement.column] = self.of(measurement.light.mean(), measurement.shots)
+        self.power += float(measurement.power.sum())
+        self.shots = measurement.shots
+        self.saturated += measurement.saturated
+        self.readings += measurement.shots * measurement.frame.size
+
+
+def factor_energy(
+    prepared: Prepared, patterns: tuple[FloatArray, FloatArray], noise: FactorNoise, image: FloatArray
+) -> float:
+    """Energy that noisy factors add to all frames of an image, less what the fit takes up.
+
+    Frames move by d_L (P_ij o X) Phi_R^T with d_L the error of Phi_L, independent numbers of variance s^2: in the mean
+    by m s^2 sum_ij ||(P_ij o X) Phi_R^T||^2 = m s^2 sum_p |P_L[p]|^2 ||X[p] V_R S_R||^2; and by the same of the other
+    side.
+
+    Parameters
+    ----------
+    prepared, patterns
+        the factorised model, and P_L (n, K) and P_R (n', K').
+    noise
+        of its factors.
+    image
+        (n, n').
+    """
+    left, right = prepared.left, prepared.right
+    total = 0.0
+    sides = (left, right, patterns[0], noise.left, image), (right, left, patterns[1], noise.right, image.T)
+    for own, other, lit, deviation, seen in sides:
+        spread = np.square(seen @ (other.basis * other.singular)).sum(axis=1)
+        spare = 1 - own.rank / own.data_rows
+        total += own.sensor_size * deviation**2 * spare * float(np.square(lit).sum(axis=1) @ spread)
+    return total
+
+
+def _number(plan: dict[str, Any] | None, name: str) -> float:
+    """A number of a ``plan``, which is others' and may say anything; 0 without it."""
+    value = (plan or {}).get(name)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        return 0.0
+    return float(value)

@@ -1,0 +1,82 @@
+"""What an estimator cannot render: the tree of a checked scene in; the refusal of each estimator out, if there is one.
+
+The factored estimator knows surfaces alone. The reference is the scene's own integrator, and of Mitsuba's only those
+for volumes see a light through what lets it straight on: the others take a hole that is cut out for opaque whenever
+they connect a surface to a lamp or projector, and lose that light without a word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mitsuba as mi
+
+from mitsim.core.errors import MitsimError
+from mitsim.scene.guard.vocabulary import PLUGINS
+
+if TYPE_CHECKING:
+    from mitsim.scene.guard.outline import Outline
+
+STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
+"""Materials that let light straight on."""
+_VOLUMETRIC = ("volpath", "volpathmis")
+
+
+@dataclass(frozen=True)
+class Unfit:
+    """Why an estimator must not be given a scene; None where it may."""
+
+    factored: MitsimError | None = None
+    reference: MitsimError | None = None
+
+    @classmethod
+    def of(cls, outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
+        """What is known from the ``nodes`` of a scene, the root first, whose tags the ``outline`` has."""
+        tree = _References(nodes)
+        medium = next(tree.to(PLUGINS["medium"].split()), None)
+        if medium is None:
+            factored = None
+        else:
+            node, name = medium
+            rule = (
+                "only the reference estimator follows light through media; remove it, or use render's reference with "
+                "the integrator volpath"
+            )
+            factored = outline.tag(node).refusal(name, "a medium", rule)
+        return cls(factored, _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)))
+
+
+def _lost_by_integrator(
+    outline: Outline, tree: _References, cause: tuple[mi.parser.SceneNode, str] | None
+) -> MitsimError | None:
+    """The refusal of an integrator that loses light at the ``cause``, a node and the name of its property."""
+    found = (node for node in tree.nodes if node.props.plugin_name() in PLUGINS["integrator"].split())
+    integrator = next(found, None)
+    plugin = integrator.props.plugin_name() if integrator is not None else "path"  # Mitsuba's own default
+    if cause is None or plugin in _VOLUMETRIC:
+        return None
+    place, what = outline.tag(cause[0]), tree.plugin(*cause)
+    rule = f"it loses light at {place.path.name}:{place.line} ({what}); use volpath"
+    return outline.tag(integrator or tree.nodes[0]).refusal("integrator", repr(plugin), rule)
+
+
+@dataclass(frozen=True)
+class _References:
+    """The tree's nodes, and what they refer to."""
+
+    nodes: Sequence[mi.parser.SceneNode]
+
+    def to(self, plugins: Sequence[str]) -> Iterator[tuple[mi.parser.SceneNode, str]]:
+        """Nodes, and names of their properties, that refer to one of the ``plugins``; the scene itself only lists."""
+        for node in self.nodes[1:]:
+            for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
+                if self.plugin(node, name) in plugins:
+                    yield node, name
+
+    def plugin(self, node: mi.parser.SceneNode, name: str) -> str:
+        """What the property refers to; nothing unless it is an object."""
+        if node.props.type(name) != mi.Properties.Type.ResolvedReference:
+            return ""
+        return str(self.nodes[node.props[name].index()].props.plugin_name())

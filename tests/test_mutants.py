@@ -1,0 +1,100 @@
+"""The mutation tester's own parts: what a mutant is, which are drawn, and that its list covers the rooms."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+BENCHMARKS = ROOT / "benchmarks"
+SOURCE = '''"""Text."""
+
+LIMIT = 3
+
+
+def clipped(values: list[float], low: float = 0.5) -> float:
+    """Text with numbers: 1."""
+    total = max(LIMIT, low)
+    for value in values:
+        if value > LIMIT and not value == 7:
+            total += round(value, low)
+    return total
+
+
+@property
+def same(a: int = 1) -> bool:
+    if a:
+        raise ValueError(f"{a + 1} is wrong", 5)
+    return a < 2
+'''
+CHANGES = """
+3 -> 4
+0.5 -> 1.0
+max -> min
+if not (value > LIMIT and (not value == 7)):
+value > LIMIT or not value == 7
+value > LIMIT -> value >= LIMIT
+value > LIMIT -> value <= LIMIT
+not value == 7 -> value == 7
+value == 7 -> value != 7
+7 -> 8
+total += round(value, low) -> pass
+total += round(value, low) -> total -= round(value, low)
+round(value, low) -> round(low, value)
+return total -> return 2 * total
+1 -> 2
+if a: -> if not a:
+return a < 2 -> return not a < 2
+a < 2 -> a <= 2
+a < 2 -> a >= 2
+2 -> 3
+"""
+
+
+@pytest.fixture(scope="module")
+def mutations() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("mutations", BENCHMARKS / "mutations.py")
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:  # dataclasses look their module up by name
+        patch.setitem(sys.modules, "mutations", module)
+        spec.loader.exec_module(module)
+    return module
+
+
+def test_a_mutant_is_one_change_that_its_words_name(mutations: ModuleType) -> None:
+    """Operators, boundaries, conditions, constants, statements, arguments; no message, docstring or annotation."""
+    found = mutations.mutants("module.py", SOURCE)
+    for words in filter(None, CHANGES.splitlines()):
+        assert any(mutant.key.endswith(words) for mutant in found), words
+    assert len(found) == len(CHANGES.strip().splitlines()), [mutant.key for mutant in found]
+    plain = ast.unparse(ast.parse(SOURCE))
+    texts = [mutations.mutated(SOURCE, mutant.place) for mutant in found]
+    assert len({plain, *texts}) == 1 + len(found), "none is another, and none is the code as it is"
+    assert all(ast.parse(text) for text in texts) and all('"""Text with numbers: 1."""' in text for text in texts)
+    assert all(sum(a != b for a, b in zip(plain.split(), text.split(), strict=False)) for text in texts)
+
+
+def test_an_edit_moves_only_the_mutants_of_its_own_lines(mutations: ModuleType) -> None:
+    before = mutations.mutants("module.py", SOURCE)
+    after = mutations.mutants("module.py", SOURCE.replace("LIMIT = 3", "# a comment\nOTHER = 8\nLIMIT = 3"))
+    drawn = [{mutant.key for mutant in mutations.drawn(found, 8, 0)} for found in (before, after)]
+    assert len(drawn[0]) == 8 and len(drawn[0] - drawn[1]) <= 1, "the new constant may take one place"
+    assert drawn[0] != {mutant.key for mutant in mutations.drawn(before, 8, 1)}, "another seed draws others"
+
+
+def test_the_list_names_modules_and_tests_that_are_there() -> None:
+    settings = json.loads((BENCHMARKS / "mutants.json").read_text(encoding="utf-8"))
+    listed = {module: names for room in settings["rooms"].values() for module, (_, names) in room.items()}
+    assert {module.partition("/")[0] for module in listed} == {"sensor", "optics", "reconstruct", "capture"}
+    assert sum(count for room in settings["rooms"].values() for count, _ in room.values()) >= 300
+    for module, names in listed.items():
+        assert (ROOT / "mitsim" / module).is_file()
+        for name in names:
+            assert all((ROOT / "tests" / test).exists() for test in settings["tests"].get(name, [name])), name
+    assert all(len(reason) > 20 for reason in settings["explained"])

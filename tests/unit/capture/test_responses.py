@@ -1,0 +1,268 @@
+"""A calibration's responses and factors in light that is given: no scene is loaded and nothing traced.
+
+The camera is a toy of random factors, whose frames under any light are known in closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from mitsim.capture.calibrate import estimate
+from mitsim.capture.checkpoint import Checkpoint
+from mitsim.capture.exposer import Exposer
+from mitsim.capture.session import SIDES, LitSession, Response, Session
+from mitsim.core.arrays import FloatArray
+from mitsim.core.job import Job
+from mitsim.optics.frames import Frame
+from mitsim.reconstruct.calibration import Estimate
+from mitsim.rig.patterns import Lighting
+from mitsim.rig.recipe import load_recipe
+from mitsim.rig.rig import Rig
+from mitsim.rig.sensor import SensorModel
+
+SENSOR = SensorModel(
+    name="bare",
+    pixel_pitch_um=10.0,
+    full_well_e=float("inf"),
+    read_noise_e=20.0,
+    dark_current_e_per_s=5000.0,
+    quantum_efficiency=0.5,
+    gain_dn_per_e=1.0,
+    source="chosen",
+)
+PIXELS = 24
+EXPOSURE_S = 0.02
+RIG = Rig(
+    camera=SimpleNamespace(mask="separable"),
+    sensor=SENSOR,
+    projector=SimpleNamespace(effective_wavelength_nm=550.0),
+    camera_file="none",
+)
+
+
+class ToyLight:
+    """Light of a camera Y = L X R^T, in electrons a second; ``left`` and ``right`` have different shapes and norms."""
+
+    def __init__(self, n: int) -> None:
+        rng = np.random.default_rng(n)
+        self.left, self.right = 30 * rng.random((PIXELS, n)), 20 * rng.random((PIXELS + 3, n))
+        self.unit = float(Exposer(RIG, 1.0, 0).electrons(Frame(np.ones(1), 0.0, 0.0, 0.0))[0])
+
+    def frames(self, lighting: Lighting, _: int) -> list[Frame]:
+        n = self.left.shape[1]
+        pictures = [weights[lighting.labels].reshape(n, n) for weights in lighting.weights]
+        return [Frame(self.left @ picture @ self.right.T / self.unit, 0.0, 0.0, 0.0) for picture in pictures]
+
+
+def lit_session(n: int = 7, mode: str = "pair", mask: str = "separable") -> LitSession:
+    recipe = load_recipe().model_copy(update={"signed_capture": mode})
+    bench = SimpleNamespace(n=n, rig=RIG, sensor=SENSOR, geometry=SimpleNamespace(mask=mask))
+    light = ToyLight(n)
+    white = light.frames(Lighting.uniform(n), 0)[0]
+    return LitSession(Session(bench, recipe, seed=4), light, white, EXPOSURE_S, 0.0)  # type: ignore[arg-type]
+
+
+def relative_error(ours: FloatArray, truth: FloatArray) -> float:
+    """After the best common scale: the two factors share one unknown number."""
+    scale = np.vdot(ours, truth) / np.vdot(truth, truth)
+    return float(np.linalg.norm(ours / scale - truth) / np.linalg.norm(truth))
+
+
+# ---- factors ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+@pytest.mark.parametrize("n", [1, 4, 7])
+def test_expected_frames_give_the_camera_itself(n: int, mode: str) -> None:
+    """To rounding: 7 is no Hadamard order, so 8 patterns of 7 rows each are shown. Both factors have one norm."""
+    lit = lit_session(n, mode)
+    found, saturated = estimate(lit, Job(), noise_free=True)
+    assert saturated == 0 and found.separability_residual < 1e-12
+    assert relative_error(found.left, lit.light.left) < 1e-12 and relative_error(found.right, lit.light.right) < 1e-12
+    left, right = found.left.sum(axis=1), found.right.sum(axis=1)
+    assert np.linalg.norm(left) == pytest.approx(np.linalg.norm(right), rel=1e-12)
+    uniform = lit.light.left.sum(axis=1)[:, None] * lit.light.right.sum(axis=1)
+    np.testing.assert_allclose(np.outer(left, right), uniform, rtol=1e-10)
+
+
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_noisy_frames_give_the_camera_within_the_error_that_is_predicted(mode: str) -> None:
+    """The stated noise of a response is the one that its frames have, and the factors err as it predicts.
+
+    8 responses of 648 numbers tell their noise to 1/sqrt(2 x 5184) = 1 %; 168 and 189 numbers of the factors their
+    error to 5 %. Five deviations each. Noise is light plus dark current (half of it) plus read noise.
+    """
+    lit = lit_session(7, mode)
+    stream, clean = (
+        [response.rate for response in responses]
+        for responses in (lit.noisy("vertical", Job()), lit.noise_free("vertical"))
+    )
+    off = np.array(stream) - np.array(clean)
+    assert off.std() == pytest.approx(lit.response_noise, rel=0.05)
+    found, _ = estimate(lit, Job())
+    assert found.noise == pytest.approx(lit.response_noise, rel=0.05)
+    for ours, truth, predicted in zip(
+        (found.left, found.right), (lit.light.left, lit.light.right), found.predicted_error, strict=True
+    ):
+        assert relative_error(ours, truth) == pytest.approx(predicted, rel=0.3)
+    assert found.unexplained < 0.3 * found.separability_residual, "the stated noise is all there is"
+
+
+def test_a_flatcam_s_responses_are_centred() -> None:
+    found, _ = estimate(lit_session(4, mask="flatcam"), Job(), noise_free=True)
+    for factor in (found.left, found.right):
+        assert np.abs(factor.sum(axis=0)).max() < 1e-10 * np.abs(factor).sum()
+
+
+def test_progress_of_each_side_rises_to_the_whole() -> None:
+    told: list[tuple[str, float]] = []
+    estimate(lit_session(13), Job(progress=lambda stage, part: told.append((stage, part))))
+    for side in SIDES:  # 16 of 32 shots at once
+        assert [part for stage, part in told if stage == f"{side} stripes"] == [0.5, 1.0]
+
+
+# ---- shots -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("mode", "shots"), [("pair", 2 * 16), ("uniform", 2 * 9)])
+def test_every_signed_pattern_is_shown_by_shots_of_light_that_is_there(mode: str, shots: int) -> None:
+    """Power is 0 or 1, pairs add up to the uniform light, and differences are the columns of H."""
+    session = lit_session(7, mode).session
+    assert session.shots == shots and session.signs.shape == (7, 8)
+    assert set(np.unique(session.weights)) == {0.0, 1.0}
+    if mode == "pair":
+        positive, negative = session.weights[::2], session.weights[1::2]
+        assert np.array_equal(positive + negative, np.ones((8, 7)))
+    else:
+        positive, negative = session.weights[1:], session.weights[0] - session.weights[1:]
+    assert np.array_equal((positive - negative).T, session.signs)
+
+
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_no_two_shots_of_a_session_share_noise(mode: str) -> None:
+    """Not of the two sides, not the two shots of a pair: shot noise of the same light, frame by frame."""
+    lit = lit_session(4, mode)
+    rates = [response.rate for side in SIDES for response in lit._exposed(side, Job(), 0)]
+    clean = [lit._second.electrons(frame) for side in SIDES for frame in lit._expected(side, lit.session.weights)]
+    noise = np.array([(rate - mean).ravel() for rate, mean in zip(rates, clean, strict=True)])
+    # Of 648 numbers each: correlations of independent noise are below 5 / sqrt(648) = 0.2.
+    correlations = np.corrcoef(noise) - np.eye(len(noise))
+    assert np.abs(correlations).max() < 0.2
+
+
+# ---- resumed ---------------------------------------------------------------------------------------------------------
+
+
+class Kept(Checkpoint):
+    """A checkpoint in memory that ends the session after so many parts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.parts: dict[str, dict[str, npt.NDArray[np.float64]]] = {}
+        self.left = 0
+
+    def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
+        self.parts[name] = {key: np.array(value) for key, value in arrays.items()}
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+    def load(self, name: str) -> dict[str, npt.NDArray[np.float64]] | None:
+        return self.parts.get(name)
+
+
+@pytest.mark.parametrize("noise_free", [False, True])
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, noise_free: bool) -> None:
+    """16 responses a side are kept after 8 and after 16: interrupted after each of the four parts, and finished."""
+    lit = lit_session(13, mode)
+    whole, _ = estimate(lit, Job(), noise_free)
+    kept = Kept()
+    for life in range(4):
+        kept.left = 1
+        with pytest.raises(KeyboardInterrupt):
+            estimate(lit, Job(), noise_free, kept)
+        done = [kept.parts["noise_free" if noise_free else "noisy"][f"{side}_vectors"].shape[1] for side in SIDES]
+        assert done == [[8, 1], [16, 1], [16, 8], [16, 16]][life]
+    again, _ = estimate(lit, Job(), noise_free, kept)
+    for name in ("left", "right", "noise", "separability_residual", "unexplained", "predicted_error", "status"):
+        assert np.array_equal(getattr(again, name), getattr(whole, name)), name
+
+
+def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All shots, the uniform one of each side too: 2 x (1 + 16)."""
+    monkeypatch.setattr(Exposer, "saturated", lambda *_: True)
+    lit, kept = lit_session(13, "uniform"), Kept()
+    assert estimate(lit, Job())[1] == lit.session.shots == 34
+    kept.left = 3
+    with pytest.raises(KeyboardInterrupt):
+        estimate(lit, Job(), checkpoint=kept)
+    assert estimate(lit, Job(), checkpoint=kept)[1] == 34
+
+
+def test_the_error_of_factors_is_that_of_both_whatever_their_common_sign() -> None:
+    from mitsim.capture.calibrate import _factor_error
+
+    def factors(left: list[float], right: list[float]) -> Estimate:
+        return SimpleNamespace(left=np.array([left]), right=np.array([right]))  # type: ignore[return-value]
+
+    clean = factors([3.0, 4.0], [0.0, 10.0])
+    assert _factor_error(factors([3.0, 4.5], [0.0, 10.0]), clean) == pytest.approx(0.1)
+    assert _factor_error(factors([3.0, 4.0], [1.0, 10.0]), clean) == pytest.approx(0.1)
+    assert _factor_error(factors([-3.3, -4.4], [0.0, -11.0]), clean) == pytest.approx(np.hypot(0.1, 0.1))
+
+
+# ---- differences -----------------------------------------------------------------------------------------------------
+
+
+class Played(LitSession):
+    """A session whose noisy frames are given, the uniform one first where it has one."""
+
+    def _exposed(self, side: str, job: Job, first: int) -> Iterator[Response]:
+        yield from (Response(rate, index) for index, rate in enumerate(RATES, start=1))
+
+
+RATES = [np.array([[value, 7.0]]) for value in (100.0, 60.0, 30.0, 90.0)]
+
+
+def played(pairs: bool) -> LitSession:
+    return Played(SimpleNamespace(pairs=pairs), None, None, 1.0, 0.0)  # type: ignore[arg-type]
+
+
+def test_a_calibration_pair_is_the_plain_difference_of_its_two_frames() -> None:
+    """(Planted: the -1 frame weighted 0.999.) So what both frames share is gone, to the last bit."""
+    responses = list(played(pairs=True).noisy("horizontal", Job()))
+    assert [response.rate.tolist() for response in responses] == [[[40.0, 0.0]], [[-60.0, 0.0]]]
+    assert [response.saturated for response in responses] == [1 + 2, 3 + 4]
+
+
+def test_a_calibration_with_a_uniform_shot_takes_it_from_twice_the_other() -> None:
+    """2 Y((1 + P)/2) - Y(1) = Y(P): what a +1 and a -1 pixel share is gone. The uniform shot counts once."""
+    responses = list(played(pairs=False).noisy("horizontal", Job()))
+    assert [response.rate.tolist() for response in responses] == [[[20.0, 7.0]], [[-40.0, 7.0]], [[80.0, 7.0]]]
+    assert [response.saturated for response in responses] == [1 + 2, 3, 4]
+    resumed = list(played(pairs=False).noisy("horizontal", Job(), first=1))
+    assert [response.saturated for response in resumed] == [2, 3, 4], "it was counted before"
+
+
+def test_a_noise_free_response_is_that_of_the_signed_pattern() -> None:
+    """Expected frames hold no noise to hide in: light of the +1 pixels less that of the -1 pixels, exactly."""
+    signs = np.array([[1, 1], [1, -1]])
+    pixels = np.array([[3.0, 5.0], [2.0, 11.0]])  # light that each of two stripes casts on two sensor pixels
+
+    class Expected(LitSession):
+        @property
+        def _second(self) -> Exposer:
+            return SimpleNamespace(electrons=lambda light: light)  # type: ignore[return-value]
+
+        def _expected(self, side: str, weights: FloatArray) -> FloatArray:
+            return weights @ pixels
+
+    lit = Expected(SimpleNamespace(signs=signs), None, None, 1.0, 0.0)  # type: ignore[arg-type]
+    assert np.array_equal([response.rate for response in lit.noise_free("vertical")], signs.T @ pixels)
+    assert np.array_equal([response.rate for response in lit.noise_free("vertical", 1)], [[1.0, -6.0]])

@@ -1,0 +1,183 @@
+"""Misfit: 1 where the model fits, whatever the patterns; and each cause by its own mark, in sessions drawn by numpy.
+
+The camera is `tests.ideal_sessions`: 96 x 96 pixels, a scene of 16 x 16, 20 000 electrons at the brightest pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsim.core.manifests import Digital
+from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit
+from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
+from mitsim.reconstruct.status import Verdict
+from tests.ideal_sessions import PIXELS, Bench, N, bench, picture, shadow
+
+DATA = PIXELS**2
+"""Data of a frame."""
+SHIFT = 0.3
+"""Projector pixels that light moves by when a sheet is 2 mm off 400 mm, seen from 60 mm beside."""
+PLACE = np.linspace(-1, 1, PIXELS)
+
+
+def recovered(
+    camera: Bench, patterns: str = "dots:4", seed: int = 0, calibrated: Bench | None = None
+) -> Reconstruction:
+    return reconstruct(camera.run(patterns, picture(seed), seed), (calibrated or bench()).calibrated(seed))
+
+
+def misfit(image: Reconstruction) -> Misfit:
+    assert image.misfit is not None
+    return image.misfit
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:3", "dots:4", "hadamard:4", "random:4"])
+def test_a_fitting_session_has_a_chi_square_of_one(patterns: str) -> None:
+    """sqrt(2 / data) is one standard deviation of the energy of normal noise that is the same everywhere; shot noise
+    is not, and 5 deviations of it are 6. (Planted: the variance of the -1 half forgotten, 1.85 for hadamard:4.)"""
+    for seed in range(2):
+        image = recovered(bench(), patterns, seed)
+        found = misfit(image)
+        frames = np.prod([side.shape[1] for side in bench().run(patterns, picture(), seed).patterns])
+        assert abs(found.chi_square - 1) < 6 * np.sqrt(2 / (frames * DATA)), patterns
+        assert image.ok and not found.flagged and found.cause is None and found.stated
+        assert found.tiles.shape == (8, 8) and 0.5 < found.tiles.min() < found.tiles.max() < 2
+
+
+def test_noisy_factors_are_counted() -> None:
+    """A calibration of a tenth of the light moves the frames by more than their own noise, and is no misfit.
+
+    (Planted: their energy left out, a chi-square of 5.)"""
+    camera = bench(peak=3.8e4)
+    shots = camera.run("dots:3", picture(), 0)
+    for error in (0.02, 0.05):
+        factors = camera.calibrated(0, error)
+        found = misfit(reconstruct(shots, factors))
+        # The error of the factors is one draw of 2 x 1536 numbers: its energy varies by sqrt(2 / 1536), 4 %.
+        assert abs(found.chi_square - 1) < 0.15, error
+        unaware = factors.manifest.model_copy(update={"noise": factors.manifest.noise.model_copy(update={"left": 0.0})})
+        assert misfit(reconstruct(shots, replace(factors, manifest=unaware))).chi_square > found.chi_square + 0.15
+
+
+@pytest.mark.parametrize("patterns", ["dots:3", "dots:4", "hadamard:4"])
+@pytest.mark.parametrize("rows", [False, True], ids=["beside", "above"])
+def test_depth_is_flagged_and_named(patterns: str, rows: bool) -> None:
+    camera = bench(SHIFT)
+    if rows:
+        camera = replace(camera, left=camera.right, right=camera.left)
+    image = recovered(camera, patterns)
+    found = misfit(image)
+    assert not image.ok and image.status.verdict is Verdict.MISFIT and found.cause is Cause.DEPTH
+    assert found.unexplained > UNEXPLAINED and "fit no image" in str(image.status) and "depth" in str(image.status)
+    assert found.signatures is not None
+    along, across = found.signatures.columns, found.signatures.rows
+    # Pixels as wide as in this small scene leave a third of the light between the columns that are known.
+    assert (across > 0.5 and across > 5 * along) if rows else (along > 0.5 and along > 5 * across)
+
+
+def test_ambient_light_is_named() -> None:
+    """A lamp's light comes from all scene pixels, and is the same in every shot."""
+    lamp = 0.1 * shadow() @ np.ones((N, N)) @ shadow().T
+    scale = lamp / lamp.max() * 1e3
+    image = recovered(bench(optics=lambda light: light + scale))
+    assert not image.ok and misfit(image).cause is Cause.AMBIENT
+    # The difference of two shots does not see it.
+    assert recovered(bench(optics=lambda light: light + scale), "hadamard:4").ok
+
+
+def test_gloss_is_named_and_found_on_the_map() -> None:
+    """A highlight brightens one side of the sensor's view of every scene pixel."""
+    found = misfit(recovered(bench(optics=lambda light: light * (1 + 0.1 * np.outer(PLACE, PLACE)))))
+    assert found.flagged and found.cause is Cause.GLOSS
+    corners, middle = found.tiles[[0, 0, -1, -1], [0, -1, 0, -1]], found.tiles[3:5, 3:5]
+    assert corners.min() > 3 * middle.max(), "the map shows where"
+
+
+def test_a_spot_on_one_tile_is_flagged() -> None:
+    """Light on half of 1 of 64 tiles 5 % brighter: less than 3.5e-3 of all measurements."""
+    spot = np.ones((PIXELS, PIXELS))
+    spot[12:18, 12:18] = 1.05
+    image = recovered(bench(optics=lambda light: light * spot))
+    found = misfit(image)
+    assert not image.ok and found.unexplained < UNEXPLAINED
+    assert np.unravel_index(found.tiles.argmax(), found.tiles.shape) == (1, 1)
+
+
+def test_saturation_is_named() -> None:
+    found = misfit(recovered(bench(peak=6e4)))
+    assert found.flagged and found.cause is Cause.SATURATION
+    assert found.signatures is not None and found.signatures.saturated > 1e-3
+
+
+def test_another_rig_is_named() -> None:
+    """Factors of another camera that goes by the same name: the mask the other way round."""
+    image = recovered(bench(), calibrated=Bench(shadow()[::-1] * np.linspace(1, 3, N), shadow()[::-1]))
+    assert not image.ok and misfit(image).cause is Cause.RIG
+
+
+def test_without_stated_noise_only_gross_misfit_is_flagged() -> None:
+    plain = bench(stated=False)
+    image = recovered(bench(SHIFT / 3, stated=False), calibrated=plain)
+    found = misfit(image)
+    assert image.ok and not found.stated and found.chi_square > 2
+    gross = recovered(plain, calibrated=Bench(shadow()[::-1] * np.linspace(1, 3, N), shadow()[::-1], stated=False))
+    assert not gross.ok and misfit(gross).cause is Cause.RIG
+    # Few photons leave more than a tenth of the frames unexplained, and are no misfit.
+    assert recovered(bench(peak=40.0, stated=False), calibrated=plain).ok
+
+
+def test_a_bad_verdict_of_the_solver_stays() -> None:
+    image = reconstruct(bench(SHIFT).run("dots:4", picture(), 0), bench().calibrated(0), method="tv")
+    assert image.status.verdict is Verdict.MISFIT and "depth" in str(image.status)
+    twin = bench().calibrated(0)
+    twin.left[:, 1] = twin.left[:, 0]
+    lost = reconstruct(bench(SHIFT).run("uniform", picture(), 0), twin, 0)
+    assert lost.status.verdict is Verdict.RANK_DEFICIENT
+
+
+def test_no_more_data_than_unknowns_tell_no_misfit() -> None:
+    square = Bench(shadow(n=PIXELS), shadow(n=PIXELS))
+    image = reconstruct(square.run("uniform", picture(n=PIXELS), 0), square.calibrated(0), 1.0)
+    assert image.misfit is None and image.summary()["misfit"] is None
+
+
+def test_variance_of_digital_numbers() -> None:
+    """Against drawn shots: shot noise of light and dark current, read noise, rounding; of one shot and of a pair.
+
+    200 000 draws tell a variance to 0.3 % (one deviation); five of these.
+    """
+    digital = Digital(
+        exposure_s=0.1, gain_dn_per_e=0.5, black_level_dn=50, dark_current_e_per_s=300, read_noise_e=3.0, step_dn=1.0
+    )
+    rng = np.random.default_rng(3)
+
+    def shot(rate: float) -> np.ndarray:
+        electrons = rng.poisson((rate + 300) * 0.1, 200_000) + 3.0 * rng.standard_normal(200_000)
+        return digital.rate(np.rint(0.5 * electrons + 50))
+
+    one, two = shot(1000.0), shot(200.0)
+    assert digital.variance(one).mean() == pytest.approx(one.var(), rel=0.016)
+    assert digital.variance(one + two, 2).mean() == pytest.approx((one - two).var(), rel=0.016)
+
+
+def test_chance_is_rare() -> None:
+    """The limit on a tile of a single frame: CHANCE deviations of chi-square with as many degrees of freedom."""
+    assert CHANCE * np.sqrt(2 / (DATA / 64)) < 1
+
+
+def test_both_halves_of_a_pair_count_alike() -> None:
+    """To the last bit: a half that weighs 0.999 leaves a thousandth of the uniform light in every measurement, which is
+    less than its noise. (Planted in Capture.measured.)"""
+    shots = bench().run("hadamard:4", picture(), 0)
+    rate = {
+        (shot.row, shot.column, shot.sign): shots.manifest.digital.rate(dn)
+        for shot, dn in zip(shots.manifest.patterns.captures, shots.dn, strict=True)
+    }
+    for each in shots.measured():
+        positive, negative = rate[each.row, each.column, 1], rate[each.row, each.column, -1]
+        assert np.array_equal(each.frame, positive - negative) and np.array_equal(each.light, positive + negative)
+        assert each.shots == 2 and each.power == pytest.approx(positive**2 + negative**2, rel=1e-12)

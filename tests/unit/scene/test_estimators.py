@@ -1,0 +1,79 @@
+"""Scenes that an estimator cannot render are refused by it, with the place and the remedy; all others are not."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mitsim.capture.bench import open_bench
+from mitsim.core.errors import MitsimError
+
+pytestmark = pytest.mark.usefixtures("variant")
+Write = Callable[..., Path]
+MEDIUM = '<medium name="{name}" type="homogeneous"><float name="sigma_t" value="0.05"/></medium>'
+FOG = f"""<shape type="cube" id="fog"><transform name="to_world"><scale value="30"/><translate z="300"/></transform>
+    <bsdf type="null"/>{MEDIUM.format(name="interior")}</shape>"""
+AIR = f"""<shape type="sphere"><float name="radius" value="5"/><point name="center" x="0" y="0" z="300"/>
+    <bsdf type="dielectric"/>{MEDIUM.format(name="exterior")}</shape>"""
+SHARED = '<medium id="mist" type="homogeneous"/>'
+BEHIND = '<transform name="to_world"><translate z="-50"/></transform></shape>'
+CARD = """<shape type="rectangle"><transform name="to_world"><scale x="25" y="25"/><translate z="350"/></transform>
+    <bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf></shape>"""
+PANE = '<shape type="disk"><bsdf type="thindielectric"/></shape>'
+VOLPATH = {"integrator": "volpath"}
+
+
+def message(action: Callable[[], object]) -> str:
+    with pytest.raises(MitsimError) as caught:
+        action()
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("extra", "name", "tag"),
+    [
+        (FOG, "interior", "<shape type='cube' id='fog'>"),
+        (AIR, "exterior", "<shape type='sphere'>"),
+        (SHARED + '<shape type="disk"><ref name="interior" id="mist"/>' + BEHIND, "interior", "<shape type='disk'>"),
+    ],
+)
+def test_media_are_for_the_reference_alone(small_scene: Write, extra: str, name: str, tag: str) -> None:
+    """Loading for work refuses, and so does the factored estimator of a bench that was opened to render."""
+    path = small_scene(extra=extra, **VOLPATH)
+    bench = open_bench(path, for_render=True)
+    for action in (lambda: open_bench(path), lambda: bench.render("factored"), lambda: bench.plan("uniform")):
+        said = message(action)
+        line = path.read_text().split(tag.split(" id")[0].replace("'", '"'))[0].count("\n") + 1
+        assert said.startswith(f"{path}:{line}: {name}: got a medium in {tag}; only the reference") and "\n" not in said
+    assert bench.render("reference", spp=4).mean.any()
+
+
+def test_a_medium_of_the_air_before_the_camera(small_scene: Write) -> None:
+    text = small_scene(**VOLPATH).read_text()
+    path = small_scene("air", **VOLPATH)
+    path.write_text(text.replace("<film", MEDIUM.format(name="medium") + "<film").replace("small_", "air_"))
+    assert "medium: got a medium in <sensor type='mitsim_lensless'>" in message(lambda: open_bench(path))
+
+
+def test_a_medium_that_nothing_refers_to_is_none(small_scene: Write) -> None:
+    bench = open_bench(small_scene(extra=SHARED))
+    assert bench.render("reference", spp=4).mean.any()
+
+
+@pytest.mark.parametrize("integrator", ["path", "direct"])
+@pytest.mark.parametrize(("extra", "cause"), [(FOG, "homogeneous"), (CARD, "mask"), (PANE, "thindielectric")])
+def test_integrators_that_lose_light_are_refused(small_scene: Write, integrator: str, extra: str, cause: str) -> None:
+    """`path` sees no light through a hole (-17.8 % of a wall behind a card that is not there) and no medium."""
+    options = {"integrator": integrator, "integrator_options": ""}
+    path = small_scene(extra=extra, **options)
+    said = message(lambda: open_bench(path, for_render=True).render("reference", spp=4))
+    line = path.read_text().split(extra)[0].count("\n") + 1
+    assert f"{path}:3: integrator: got '{integrator}' in <integrator type='{integrator}'>" in said
+    assert f"it loses light at small.xml:{line} ({cause}); use volpath" in said
+
+
+def test_other_scenes_go_their_way(small_scene: Write) -> None:
+    glass = '<shape type="sphere"><float name="radius" value="5"/><bsdf type="dielectric"/></shape>'
+    unused = '<bsdf type="mask" id="unused"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf>'
+    bench = open_bench(small_scene(extra=glass + unused))
+    assert bench.loaded.unfit.factored is None and bench.loaded.unfit.reference is None

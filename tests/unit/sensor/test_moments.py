@@ -1,0 +1,65 @@
+"""Closed forms of the sensor's noise, where a wrong term is smaller than the tolerances of measured frames."""
+
+import mpmath
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from mitsim.rig.sensor import SensorModel
+from mitsim.sensor import moments
+from mitsim.sensor.chain import poisson_quantile
+
+
+@pytest.mark.parametrize("mean", [1e4, 1e8, 1e12])
+def test_the_quantile_has_a_poisson_count_s_mean_variance_and_skewness(mean: float) -> None:
+    """Over all deviates: mean mu exactly, variance mu + 1/18, third moment mu + 1/27; Poisson's are mu, mu, mu.
+
+    Gauss and Hermite's 20 nodes integrate these polynomials exactly. The count is rounded by 1e-16 mu, which times
+    the weights' share of mu is what the tolerances allow.
+    """
+    z, weights = special.roots_hermitenorm(20)
+    weights = weights / weights.sum()
+    off = (poisson_quantile(np.full(20, mean), z) - mean) / np.sqrt(mean)
+    rounding = 1e-15 * np.sqrt(mean)
+    assert weights @ off == pytest.approx(0, abs=1e-13 + rounding)
+    assert weights @ off**2 == pytest.approx(1 + 1 / 18 / mean, rel=1e-12 + 2 * rounding)
+    assert weights @ off**3 * np.sqrt(mean) == pytest.approx(1 + 1 / 27 / mean, rel=1e-9 + 100 * rounding * mean**0.5)
+
+
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 60, 1000])
+def test_a_poisson_probability_has_twelve_digits_on_both_sides_of_the_change_of_form(count: int) -> None:
+    """At 32 counts the remainder's next term is 1/(1680 count^7) = 2e-14; logarithms of 1e2 to 1e3 round by 1e-13."""
+    means = count * np.array([0.7, 1.0, 1.3])
+    exact = [float(mpmath.exp(count * mpmath.log(mean) - mean - mpmath.loggamma(count + 1))) for mean in means]
+    np.testing.assert_allclose(moments._poisson(count, means), exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("black", [0.0, 0.25, 0.5])
+def test_electrons_that_fill_the_well_are_one_code_and_not_dithered(black: float) -> None:
+    """Half of the light's distribution lies at the full well, where 0.1 DN of read noise does not dither the rounding.
+
+    The other half spreads over 20 codes, so shot noise seems to dither all: a well's worth of 1000.25 DN that is read
+    as 1000 moves the mean by 0.12 DN. Compared with the sum over all counts; 129 points stand for them to 2e-3 DN.
+    """
+    well, gain, read = 10_000, 0.1, 1.0
+    model = SensorModel(
+        name="coarse",
+        pixel_pitch_um=5,
+        full_well_e=well,
+        read_noise_e=read,
+        quantum_efficiency=0.5,
+        gain_dn_per_e=gain,
+        black_level_dn=black,
+        bits=12,
+        source="chosen",
+    )
+    counts = np.arange(9000, 11_000)
+    weights = stats.poisson.pmf(counts, well)
+    signal, codes = np.minimum(counts, well) * gain + black, np.arange(850, 1060)
+    edges = special.ndtr((codes[None, :] + 0.5 - signal[:, None]) / (read * gain))
+    share = weights @ np.diff(edges, axis=1)
+    mean = share @ codes[1:]
+    variance = share @ np.square(codes[1:] - mean)
+    ours = moments.frame_moments(np.array([float(well)]), 0.0, model)
+    assert ours[0][0] == pytest.approx(mean, abs=0.01)
+    assert ours[1][0] == pytest.approx(variance, rel=0.01)
