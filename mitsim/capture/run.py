@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.capture.ambient import AmbientFrame, is_taken, shots_for
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.evidence import GROUPS, Settings
@@ -22,10 +23,10 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.core.framefile import Channel
 from mitsim.core.job import Job
+from mitsim.core.manifests import AmbientFile, Patterns, RunHead, RunManifest
 from mitsim.core.manifests import Digital as DigitalScale
-from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.core.runs import Capture, RunFolder, RunMemory, claimed, frame_name
+from mitsim.core.runs import AMBIENT, Capture, RunFolder, RunMemory, claimed, frame_name
 from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.rig.patterns import Lighting, PatternFamily, Shot
@@ -37,6 +38,9 @@ _FIREFLIES = 0.8
 
 Normal noise gives 0.8 once in 600 runs if it is the same in all pixels of all frames (Grubbs' test), else never.
 """
+_DROWNED = 1.0
+"""Noise over the projector's light at which ambient light has ended the dynamic range: 49 dots of lamp_bench give 29 dB
+at 0.03, 17 dB at 0.3, and 12 dB, next to no image, at 3."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
@@ -157,7 +161,11 @@ def capture(
         digital = digital_scale(bench, exposure_s)
         recorder.begin()
         recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
-        shooting = _Shooting(family, recorder, exposer)
+        with job.clock.stage("ambient frame"):
+            ambient = _ambient(request, family, expected, exposer)
+        if ambient:
+            _record_ambient(recorder, ambient, exposer)
+        shooting = _Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
         shooting.shoot(expected, job)
         total = light.plan.total(totals.mc_error)
         manifest = RunManifest(
@@ -166,6 +174,7 @@ def capture(
             camera=bench.identity(),
             digital=digital,
             patterns=patterns,
+            ambient_frame=shooting.ambient_file,
             plan=plan.block(),
             mc_error=totals.mc_error,
             total_error=total.value,
@@ -243,15 +252,55 @@ class _Exposed:
 class _Shooting:
     """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept."""
 
-    def __init__(self, family: PatternFamily, recorder: RunFolder | RunMemory, exposer: Exposer) -> None:
+    def __init__(
+        self,
+        family: PatternFamily,
+        recorder: RunFolder | RunMemory,
+        exposer: Exposer,
+        ambient: AmbientFrame | None,
+        always: FloatArray,
+    ) -> None:
+        """Nothing is exposed yet.
+
+        Parameters
+        ----------
+        family, recorder, exposer
+            the shots, where they are kept, and the camera.
+        ambient
+            what is taken off the frames.
+        always
+            (pixels, pixels) expected electrons of ambient light, which is in every frame.
+        """
         self.family, self.recorder, self.exposer = family, recorder, exposer
+        self.ambient, self.always = ambient, always
         self.saturated, self.noise_ratio = 0, 0.0
-        self._noise_energy = self._energy = 0.0
+        self._noise_energy = self._energy = self._signal = self._light = 0.0
 
     @property
     def sensor_noise(self) -> float:
         """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, from its closed form."""
         return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
+
+    @property
+    def ambient_part(self) -> float:
+        """Ambient light in all light of the frames."""
+        return float(self.always.sum()) * len(self.family.shots) / self._light if self._light else 0.0
+
+    @property
+    def noise_to_signal(self) -> float:
+        """Noise of the frames less the ambient frame, ||noise|| / ||light of the projector||, over all frames."""
+        own = 0.0
+        if self.ambient is not None and not self.family.signed:
+            own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
+            own *= self.always.size * len(self.family.shots)
+        return math.sqrt((self._noise_energy + own) / self._signal) if self._signal else math.inf
+
+    @property
+    def ambient_file(self) -> AmbientFile | None:
+        """What the manifest says of the ambient frame."""
+        if self.ambient is None:
+            return None
+        return AmbientFile(file=AMBIENT, shots=self.ambient.shots, part=self.ambient_part, noise=self.noise_to_signal)
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
         """Expose and record in chunks, one thread a processor; stages are timed on the wall clock."""
@@ -272,6 +321,8 @@ class _Shooting:
                 self.saturated += self.exposer.saturated(shot.digital, shot.electrons)
                 self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
                 self._energy += float(np.square(shot.electrons).sum())
+                self._signal += float(np.square(shot.electrons - self.always).sum())
+                self._light += float(shot.electrons.sum())
             job.progress("frames", (chunk[-1][0] + 1) / len(expected))
 
     def _expose(self, item: tuple[int, tuple[Shot, Frame]]) -> _Exposed:
@@ -304,6 +355,20 @@ class _Shooting:
         self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)
 
 
+def _ambient(
+    request: Request, family: PatternFamily, expected: ExpectedFrames, exposer: Exposer
+) -> AmbientFrame | None:
+    if not is_taken(request.ambient_frame, family, expected):
+        return None
+    return AmbientFrame.exposed(exposer, expected, request.ambient_shots or shots_for(family))
+
+
+def _record_ambient(recorder: RunFolder | RunMemory, ambient: AmbientFrame, exposer: Exposer) -> None:
+    single = {"DN": ambient.digital, "electrons": ambient.electrons}
+    channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
+    recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposer.exposure_s, "seed": exposer.seed})
+
+
 def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
     sensor = bench.sensor
@@ -331,5 +396,20 @@ def _warnings(light: Light, totals: _Totals, shooting: _Shooting) -> Iterator[st
             f"one of {GROUPS} groups of the light brings {totals.heaviest:.1%} of the Monte Carlo variance: a few "
             "heavy paths (fireflies) make it, so mc_error may be far off; frames keep them unclipped, try another seed"
         )
+    if shooting.ambient is not None and shooting.ambient.saturated:
+        yield "saturation: the ambient frame has pixels at the full well or the ADC's end; expose for less"
+    if shooting.always.any():
+        yield from _of_ambient_light(shooting)
     if shooting.saturated:
         yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
+
+
+def _of_ambient_light(shooting: _Shooting) -> Iterator[str]:
+    part = f"{shooting.ambient_part:.1%} of the frames' light is ambient"
+    if shooting.ambient is None and not shooting.family.signed:
+        yield f"{part} and is not taken off (ambient_frame is no): an image of them shows it, and is wrong"
+    if shooting.noise_to_signal > _DROWNED:
+        yield (
+            f"{part}: noise is {shooting.noise_to_signal:.2g} times the projector's light in the frames, so little of "
+            "an image will be left; darken the room, or expose longer on a sensor of a larger full well"
+        )

@@ -263,6 +263,24 @@ class ExpectedFrames:
     def __len__(self) -> int:
         return int(self._weights.shape[0])
 
+    @property
+    def has_ambient(self) -> bool:
+        """Whether there is light of other emitters than the projector in every frame."""
+        return bool(self._ambient)
+
+    @property
+    def projector_off(self) -> Frame:
+        """The frame of ambient light alone, dark where there is none; its Monte Carlo error is that of all frames."""
+        pixels = self._lights[0].optics.pixels
+        light = np.zeros((pixels, pixels)) if self._ambient_formed is None else self._ambient_formed[0][0]
+        return Frame(np.maximum(light, 0.0), 0.0, 0.0, 0.0)
+
+    @property
+    def _ambient_formed(self) -> tuple[FloatArray, FloatArray] | None:
+        if self._ambient and self._always is None:
+            self._always = _formed(self._ambient, sparse.csr_array(np.ones((1, 1))), self._seed)
+        return self._always
+
     def __iter__(self) -> Iterator[Frame]:
         if not self._mixed:
             for start in range(0, len(self), _AT_ONCE):
@@ -304,13 +322,12 @@ class ExpectedFrames:
         return frames, deviations
 
     def _frames(self, irradiance: FloatArray, deviation: FloatArray) -> Iterator[Frame]:
-        if self._ambient and self._always is None:
-            self._always = _formed(self._ambient, sparse.csr_array(np.ones((1, 1))), self._seed)
+        ambient = self._ambient_formed
         count = len(self._lights[0].groups)
         pairs = count * (count - 1)
         for frame, probed in zip(irradiance, deviation, strict=True):
-            if self._always is not None:
-                frame, probed = frame + self._always[0][0], probed + self._always[1][0]
+            if ambient is not None:
+                frame, probed = frame + ambient[0][0], probed + ambient[1][0]
             # Not a product of vectors: BLAS adds up in an order that hangs on its threads.
             squared = np.square(probed.reshape(frame.shape[0], count, -1)).sum(axis=(0, 2)) if pairs else np.zeros(1)
             spread = float(squared.sum())

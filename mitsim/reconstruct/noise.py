@@ -19,14 +19,14 @@ class FrameNoise:
     ----------
     manifest
         of the run.
-    dark_variance
-        mean noise variance of a pixel of the dark frame that was taken off every shot [(electrons/s)^2]: one draw,
+    ambient_variance
+        mean noise variance of a pixel of the ambient frame that was taken off every shot [(electrons/s)^2]: one draw,
         common to all; 0 without one.
 
     Attributes
     ----------
     variance
-        (K, K') mean noise variance of a datum of each pattern [(electrons/s)^2].
+        (K, K') mean noise variance of a datum of each pattern by its own shots [(electrons/s)^2].
     power
         sum of the squares of all shots [(electrons/s)^2].
     shots, saturated, readings
@@ -34,9 +34,9 @@ class FrameNoise:
 
     """
 
-    def __init__(self, manifest: RunManifest, dark_variance: float = 0.0) -> None:
+    def __init__(self, manifest: RunManifest, ambient_variance: float = 0.0) -> None:
         self._digital = manifest.digital
-        self.dark_variance = dark_variance
+        self.ambient_variance = ambient_variance
         self._rendering = np.hypot(manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error"))
         counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
         self.variance: FloatArray = np.zeros(counts)
@@ -53,23 +53,26 @@ class FrameNoise:
         return float(self._rendering**2 * self.power)
 
     def of(self, light: FloatArray | float, shots: int) -> FloatArray:
-        """Noise variance [(electrons/s)^2] of a measurement.
+        """Noise variance [(electrons/s)^2] of a measurement, with that of the frame that was taken off it.
 
         Parameters
         ----------
         light, shots
             sum of its shots [electrons/s], any shape, and their number.
         """
-        dark = self.dark_variance if shots == 1 else 0.0  # the difference of a pair has no dark frame
-        return np.maximum(self._digital.variance(light, shots) + dark, 0.0)
+        ambient = self.ambient_variance if shots == 1 else 0.0  # the difference of a pair has no ambient frame
+        return self._own(light, shots) + ambient
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
-        self.variance[measurement.row, measurement.column] = self.of(measurement.light.mean(), measurement.shots)
+        self.variance[measurement.row, measurement.column] = self._own(measurement.light.mean(), measurement.shots)
         self.power += float(measurement.power.sum())
         self.shots = measurement.shots
         self.saturated += measurement.saturated
         self.readings += measurement.shots * measurement.frame.size
+
+    def _own(self, light: FloatArray | float, shots: int) -> FloatArray:
+        return np.maximum(self._digital.variance(light, shots), 0.0)
 
 
 def factor_energy(

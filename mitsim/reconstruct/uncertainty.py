@@ -49,7 +49,7 @@ NO_UNCERTAINTY = {"uncertainty": None, "uncertainty_budget": None}
 """Entries of result.json where it is not known."""
 
 
-RANDOM = ("frame_noise", "dark_frame", "rendering")
+RANDOM = ("frame_noise", "ambient_frame", "rendering")
 """Sources that another capture draws anew; the others are the same in all captures with one calibration."""
 
 
@@ -133,7 +133,7 @@ class Propagation:
         left, right = (_column_energies(side) for side in self._sides)
         return self._spread(left.T @ variance @ right)
 
-    def of_dark_frame(self, variance: float) -> FloatArray:
+    def of_ambient_frame(self, variance: float) -> FloatArray:
         """(n, n') variance of the image by one noisy frame, of this mean ``variance``, taken off every measurement."""
         left, right = (_common_energy(side) for side in self._sides)
         return self._spread(variance * np.outer(left, right))
@@ -194,7 +194,7 @@ def uncertainty(
     rendering = np.full(noise.variance.shape, noise.rendering / problem.data_count)
     variances = {
         "frame_noise": propagation.of_frames(noise.variance),
-        "dark_frame": propagation.of_dark_frame(noise.dark_variance) if noise.dark_variance else zero,
+        "ambient_frame": propagation.of_ambient_frame(noise.ambient_variance) if noise.ambient_variance else zero,
         "rendering": propagation.of_frames(rendering) if noise.rendering else zero,
         "calibration_noise": propagation.of_factors(factors, image) if factors else zero,
         "print_detail": propagation.of_print(image),

@@ -83,11 +83,11 @@ def test_noise_of_factors(patterns: str) -> None:
 
 
 @pytest.mark.parametrize("patterns", FAMILIES[:3])
-def test_noise_of_a_dark_frame(patterns: str) -> None:
+def test_noise_of_a_ambient_frame(patterns: str) -> None:
     """One draw in all frames alike; pairs of signed patterns do not see it, so theirs is judged as if they did."""
     small = Small(patterns)
     frames = small.solver.reshape(N * N, -1, PIXELS**2).sum(axis=1)
-    assert small.propagation.of_dark_frame(2.0).ravel() == pytest.approx(
+    assert small.propagation.of_ambient_frame(2.0).ravel() == pytest.approx(
         2 * np.square(frames).sum(axis=1), rel=1e-9, abs=1e-12
     )
 
