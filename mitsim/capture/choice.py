@@ -193,6 +193,7 @@ class _Table:
             coarse_cells=coarse,
             coarse_layers=bool(all_layers),
             reach=self.evidence.reach,
+            sharp=self.evidence.sharp,
             **{f"{name}_samples": float(count[index]) for name, count in self.samples.items()},
         )
         missing, centre = self.evidence.unresolved, np.add(*self._from_centre(SURE))

@@ -296,7 +296,7 @@ class _Group:
         self.done: dict[str, int] = {}
         self.paths = 0
         self._sums: dict[str, FiledLight] = {}
-        self._flux = np.zeros(simulation.bench.n**2)
+        self._flux = {name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")}
 
     def sample(self, rounds: float) -> None:
         """Trace until this many times the samples that the plan predicted are done."""
@@ -307,8 +307,8 @@ class _Group:
                 deposits = stage.tracer.trace(seed, done, count)
                 light = stage.file(deposits, self.labels, 1)
                 self._sums[name] = self._sums[name] + light if name in self._sums else light
-                if name == "direct":
-                    self._flux += self.simulation.flux(deposits, 1)
+                if name in self._flux:
+                    self._flux[name] += self.simulation.flux(deposits, 1)
                 self.done[name] = done + count
                 self.paths += count * stage.tracer.lanes
 
@@ -320,7 +320,7 @@ class _Group:
     @property
     def flux(self) -> FloatArray:
         """(n^2,) mean over the samples."""
-        return self._flux / self.done["direct"]
+        return np.asarray(sum(self._flux[name] / done for name, done in self.done.items() if name in self._flux))
 
 
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:

@@ -37,6 +37,10 @@ _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
 _NORMAL = 1.645
 """Standard deviations above which a normal deviate is in 5 % of cases."""
+_HELD = 8
+"""Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
+_MOST_COLUMNS = 2**22
+"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all."""
 _shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 
@@ -100,9 +104,10 @@ class FrameOptics:
         self.cells = (len(rows.centres), len(columns.centres))
         self.shape = (anchors * self.cells[0], anchors * self.cells[1])
         # Stored with the light's index first, so that picking lit rows copies contiguous memory.
+        stack = _Stack if anchors > _HELD else _stack
         self._layers = [
             [
-                (_stack(left, weights), _stack(right, weights))
+                (stack(left, weights), stack(right, weights))
                 for left, right in _shadow(geometry, rows, columns, depth, spectrum)
             ]
             for depth in depths
@@ -347,7 +352,7 @@ def _formed(lights: Sequence[Filed], basis: sparse.csr_array, seed: int) -> tupl
     """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and deviations of the groups as signs see them."""
     pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
     probes = _probes(pixels, seed)
-    mixed = [(light.optics, [basis @ group for group in light.groups]) for light in lights]
+    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     means = [_mean_of(parts) for _, parts in mixed]
     frames = np.zeros((basis.shape[0], pixels, pixels))
     deviations = np.zeros((basis.shape[0], pixels * groups * probes.shape[1] if groups > 1 else 1))
@@ -365,12 +370,23 @@ def _formed(lights: Sequence[Filed], basis: sparse.csr_array, seed: int) -> tupl
     return frames, deviations
 
 
+def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_array:
+    """``basis @ light``."""
+    if light.shape[1] <= _MOST_COLUMNS:
+        return basis @ light
+    places, indices = np.unique(light.indices, return_inverse=True)
+    lit = sparse.csr_array((light.data, indices, light.indptr), shape=(light.shape[0], max(len(places), 1)))
+    product = (basis @ lit).tocsr()
+    wide = places[product.indices] if len(places) else product.indices
+    return sparse.csr_array((product.data, wide, product.indptr), shape=(basis.shape[0], light.shape[1]))
+
+
 def _seen(lights: Sequence[Filed], basis: sparse.csr_array, columns: IntArray) -> FloatArray:
     """(groups, b, pixels, c) frames of mixtures ``basis`` (b, rows) of each group's light, at c ``columns``."""
     pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
     chosen = np.zeros((pixels, len(columns)))
     chosen[columns, np.arange(len(columns))] = 1
-    mixed = [(light.optics, [basis @ group for group in light.groups]) for light in lights]
+    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     frames = np.zeros((groups, basis.shape[0], pixels, len(columns)))
 
     def form(row: int) -> None:
@@ -450,6 +466,17 @@ def _aligned(flat: IntArray, parts: Sequence[tuple[IntArray, FloatArray]]) -> Fl
     for line, (places, light) in zip(values, parts, strict=True):
         line[order[np.searchsorted(flat[order], places)]] = light
     return values
+
+
+class _Stack:
+    """The same as :func:`_stack`, whose rows are made when they are asked for."""
+
+    def __init__(self, factor: FloatArray, weights: FloatArray) -> None:
+        self._factor, self._weights = np.ascontiguousarray(factor.T), np.ascontiguousarray(weights.T)
+
+    def __getitem__(self, rows: IntArray) -> FloatArray:
+        anchor, cell = np.divmod(rows, len(self._factor))
+        return np.asarray(self._weights[anchor] * self._factor[cell])
 
 
 def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:
