@@ -24,7 +24,7 @@ from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import Misfit, judge
-from mitsim.reconstruct.noise import FrameNoise, factor_energy
+from mitsim.reconstruct.noise import FrameNoise, factor_energy, print_energy
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.tv import solve_tv
@@ -255,6 +255,7 @@ class Accumulated:
             self.kept or shots.measured(),
             self.noise,
             factor_energy(self.prepared, shots.patterns, stated, image) if stated else None,
+            print_energy(self.prepared, factors.sides, shots.patterns, image),
             Evidence(factors, shots.patterns),
         )
 
