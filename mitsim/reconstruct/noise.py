@@ -9,7 +9,12 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import FactorNoise, RunManifest
 from mitsim.core.runs import Measurement
+from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
+
+EDGES = 2.9
+"""Energy of hard edges at any place within a pixel over that of the ramp that their image shows: the dipole of an edge
+at t is t (1 - t) / 2 with a mean square of 1/120; the slopes that the image shows around it bring 1/346."""
 
 
 class FrameNoise:
@@ -19,14 +24,14 @@ class FrameNoise:
     ----------
     manifest
         of the run.
-    dark_variance
-        mean noise variance of a pixel of the dark frame that was taken off every shot [(electrons/s)^2]: one draw,
+    ambient_variance
+        mean noise variance of a pixel of the ambient frame that was taken off every shot [(electrons/s)^2]: one draw,
         common to all; 0 without one.
 
     Attributes
     ----------
     variance
-        (K, K') mean noise variance of a datum of each pattern [(electrons/s)^2].
+        (K, K') mean noise variance of a datum of each pattern by its own shots [(electrons/s)^2].
     power
         sum of the squares of all shots [(electrons/s)^2].
     shots, saturated, readings
@@ -34,9 +39,9 @@ class FrameNoise:
 
     """
 
-    def __init__(self, manifest: RunManifest, dark_variance: float = 0.0) -> None:
+    def __init__(self, manifest: RunManifest, ambient_variance: float = 0.0) -> None:
         self._digital = manifest.digital
-        self.dark_variance = dark_variance
+        self.ambient_variance = ambient_variance
         self._rendering = np.hypot(manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error"))
         counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
         self.variance: FloatArray = np.zeros(counts)
@@ -53,23 +58,26 @@ class FrameNoise:
         return float(self._rendering**2 * self.power)
 
     def of(self, light: FloatArray | float, shots: int) -> FloatArray:
-        """Noise variance [(electrons/s)^2] of a measurement.
+        """Noise variance [(electrons/s)^2] of a measurement, with that of the frame that was taken off it.
 
         Parameters
         ----------
         light, shots
             sum of its shots [electrons/s], any shape, and their number.
         """
-        dark = self.dark_variance if shots == 1 else 0.0  # the difference of a pair has no dark frame
-        return np.maximum(self._digital.variance(light, shots) + dark, 0.0)
+        ambient = self.ambient_variance if shots == 1 else 0.0  # the difference of a pair has no ambient frame
+        return self._own(light, shots) + ambient
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
-        self.variance[measurement.row, measurement.column] = self.of(measurement.light.mean(), measurement.shots)
+        self.variance[measurement.row, measurement.column] = self._own(measurement.light.mean(), measurement.shots)
         self.power += float(measurement.power.sum())
         self.shots = measurement.shots
         self.saturated += measurement.saturated
         self.readings += measurement.shots * measurement.frame.size
+
+    def _own(self, light: FloatArray | float, shots: int) -> FloatArray:
+        return np.maximum(self._digital.variance(light, shots), 0.0)
 
 
 def factor_energy(
@@ -97,6 +105,52 @@ def factor_energy(
         spread = np.square(seen @ (other.basis * other.singular)).sum(axis=1)
         spare = 1 - own.rank / own.data_rows
         total += own.sensor_size * deviation**2 * spare * float(np.square(lit).sum(axis=1) @ spread)
+    return total
+
+
+def print_energy(
+    prepared: Prepared,
+    factors: tuple[FloatArray, FloatArray],
+    patterns: tuple[FloatArray, FloatArray],
+    image: FloatArray,
+) -> float:
+    """Energy outside the model's range of print that changes within a projector pixel.
+
+    Light of slope g a pixel moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T, Phi_R' being the slope of Phi_R along
+    its columns. With C = S_L V_L^T g / 12 that is sum_pq (C^T C o P_R P_R^T o Phi_R'^T Phi_R')[p, q] in all, of which
+    |C T|^2 is in the range, T being :func:`moved_responses`; and the same of the other side.
+
+    Parameters
+    ----------
+    prepared, factors, patterns
+        the factorised model, its factors, and P_L (n, K) and P_R (n', K').
+    image
+        (n, n').
+    """
+    total = 0.0
+    left, right = prepared.left, prepared.right
+    sides = (left, right, factors[1], patterns[1], image), (right, left, factors[0], patterns[0], image.T)
+    for other, own, factor, lit, seen in sides:
+        if seen.shape[1] > 1:
+            slope = np.gradient(factor, axis=1)
+            along = (other.basis * other.singular).T @ np.gradient(seen, axis=1) / 12
+            everything = np.sum((along.T @ along) * (lit @ lit.T) * (slope.T @ slope))
+            total += float(everything - np.square(along @ moved_responses(own, factor, lit)).sum())
+    return EDGES * max(total, 0.0)
+
+
+def moved_responses(side: Side, factor: FloatArray, patterns: FloatArray) -> FloatArray:
+    """(n, r) sum_j diag(p_j) Phi'^T U_j: what coefficients see of light one pixel beside the centre of its own.
+
+    Parameters
+    ----------
+    side, factor, patterns
+        one side of the model, its factor Phi (m, n), and its patterns (n, K).
+    """
+    slope = np.gradient(factor, axis=1) if factor.shape[1] > 1 else np.zeros_like(factor)
+    total = np.zeros((factor.shape[1], len(side.singular)))
+    for column, slab in zip(patterns.T, side.slabs, strict=True):
+        total[:, slab.columns] += column[:, None] * (slope.T @ slab.matrix)
     return total
 
 

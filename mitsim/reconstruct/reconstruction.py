@@ -24,7 +24,7 @@ from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import Misfit, judge
-from mitsim.reconstruct.noise import FrameNoise, factor_energy
+from mitsim.reconstruct.noise import FrameNoise, factor_energy, print_energy
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.tv import solve_tv
@@ -34,8 +34,8 @@ METHODS = ("tikhonov", "tv")
 IMAGE_FILE, UNCERTAINTY_FILE, RESULT_FILE = "image.exr", "uncertainty.exr", "result.json"
 _BYTES_A_NUMBER = 32.0
 """Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
-_KEPT_NUMBERS = 1 << 25
-"""Pixels of all measurements up to which they are kept for a second look: 128 of 512 x 512, at most 512 MiB."""
+_KEPT_NUMBERS = 1 << 24
+"""Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +255,7 @@ class Accumulated:
             self.kept or shots.measured(),
             self.noise,
             factor_energy(self.prepared, shots.patterns, stated, image) if stated else None,
+            print_energy(self.prepared, factors.sides, shots.patterns, image),
             Evidence(factors, shots.patterns),
         )
 
@@ -288,7 +289,8 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     numbers = sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides)
     Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{shots.name}: factorising its patterns", Limits())
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
-    frames, noise, kept = prepared.accumulator(), FrameNoise(shots.manifest), list[Measurement]()
+    noise = FrameNoise(shots.manifest, _ambient_variance(shots))
+    frames, kept = prepared.accumulator(), list[Measurement]()
     few = left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= _KEPT_NUMBERS
     for measurement in shots.measured((len(factors.left), len(factors.right))):
         frames.add(measurement.frame, measurement.row, measurement.column)
@@ -296,6 +298,13 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
         if few:
             kept.append(measurement)
     return Accumulated(prepared, frames, noise, tuple(kept))
+
+
+def _ambient_variance(shots: Capture) -> float:
+    """Mean variance of the frame that is taken off all others; 0 where none is."""
+    if shots.ambient is None or any(shot.sign for shot in shots.manifest.patterns.captures):
+        return 0.0
+    return float(shots.ambient.variance.mean())
 
 
 def inputs(shots: Capture, factors: Factors, lam: float | str, method: str) -> dict[str, str | float]:

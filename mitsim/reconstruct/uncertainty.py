@@ -36,7 +36,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.framefile import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.noise import FrameNoise, moved_responses
 from mitsim.reconstruct.regularisation import DiagonalProblem
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
@@ -49,7 +49,7 @@ NO_UNCERTAINTY = {"uncertainty": None, "uncertainty_budget": None}
 """Entries of result.json where it is not known."""
 
 
-RANDOM = ("frame_noise", "dark_frame", "rendering")
+RANDOM = ("frame_noise", "ambient_frame", "rendering")
 """Sources that another capture draws anew; the others are the same in all captures with one calibration."""
 
 
@@ -133,7 +133,7 @@ class Propagation:
         left, right = (_column_energies(side) for side in self._sides)
         return self._spread(left.T @ variance @ right)
 
-    def of_dark_frame(self, variance: float) -> FloatArray:
+    def of_ambient_frame(self, variance: float) -> FloatArray:
         """(n, n') variance of the image by one noisy frame, of this mean ``variance``, taken off every measurement."""
         left, right = (_common_energy(side) for side in self._sides)
         return self._spread(variance * np.outer(left, right))
@@ -151,7 +151,7 @@ class Propagation:
         left, right = self._sides
         gain = self.gain
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
-        moved = [_moved(*side) for side in zip(self._sides, self.factors, self.patterns, strict=True)]
+        moved = [moved_responses(*side) for side in zip(self._sides, self.factors, self.patterns, strict=True)]
         seen = moved[0].T @ rows @ (right.basis * right.singular), (left.basis * left.singular).T @ columns @ moved[1]
         return sum((np.square(self.prepared.image(gain * each)) for each in seen), np.zeros_like(image))
 
@@ -194,7 +194,7 @@ def uncertainty(
     rendering = np.full(noise.variance.shape, noise.rendering / problem.data_count)
     variances = {
         "frame_noise": propagation.of_frames(noise.variance),
-        "dark_frame": propagation.of_dark_frame(noise.dark_variance) if noise.dark_variance else zero,
+        "ambient_frame": propagation.of_ambient_frame(noise.ambient_variance) if noise.ambient_variance else zero,
         "rendering": propagation.of_frames(rendering) if noise.rendering else zero,
         "calibration_noise": propagation.of_factors(factors, image) if factors else zero,
         "print_detail": propagation.of_print(image),
@@ -282,16 +282,6 @@ def _responses(side: Side, patterns: FloatArray) -> FloatArray:
         part[:, slab.columns] = slab.matrix
     products = np.einsum("ima,jma->aij", stack, stack, optimize=True)
     return np.asarray(np.einsum("pi,aij,pj->ap", patterns, products, patterns, optimize=True))
-
-
-def _moved(side: Side, factor: FloatArray, patterns: FloatArray) -> FloatArray:
-    """(n, r) sum_j diag(p_j) Phi'^T U_j: what coefficients see of light that is one pixel beside the centre of its
-    own."""
-    slope = np.gradient(factor, axis=1) if factor.shape[1] > 1 else np.zeros_like(factor)
-    total = np.zeros((factor.shape[1], len(side.singular)))
-    for column, slab in zip(patterns.T, side.slabs, strict=True):
-        total[:, slab.columns] += column[:, None] * (slope.T @ slab.matrix)
-    return total
 
 
 def _together(parts: list[FloatArray]) -> FloatArray:

@@ -11,6 +11,7 @@ import pytest
 
 from mitsim.core.framefile import read_frame
 from mitsim.core.manifests import Digital, FactorNoise
+from mitsim.reconstruct.noise import EDGES, print_energy
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem
 from mitsim.reconstruct.solver import prepare
@@ -83,11 +84,11 @@ def test_noise_of_factors(patterns: str) -> None:
 
 
 @pytest.mark.parametrize("patterns", FAMILIES[:3])
-def test_noise_of_a_dark_frame(patterns: str) -> None:
+def test_noise_of_a_ambient_frame(patterns: str) -> None:
     """One draw in all frames alike; pairs of signed patterns do not see it, so theirs is judged as if they did."""
     small = Small(patterns)
     frames = small.solver.reshape(N * N, -1, PIXELS**2).sum(axis=1)
-    assert small.propagation.of_dark_frame(2.0).ravel() == pytest.approx(
+    assert small.propagation.of_ambient_frame(2.0).ravel() == pytest.approx(
         2 * np.square(frames).sum(axis=1), rel=1e-9, abs=1e-12
     )
 
@@ -101,6 +102,24 @@ def test_print_within_a_pixel() -> None:
     exact += np.square(small.solver @ small.matrix(left, np.gradient(right, axis=1)) @ columns.ravel())
     assert small.propagation.of_print(small.image).ravel() == pytest.approx(exact, rel=1e-9)
     assert not small.propagation.of_print(np.ones((N, N))).any(), "an even print has nothing within its pixels"
+
+
+@pytest.mark.parametrize("patterns", FAMILIES)
+def test_energy_of_print_within_a_pixel(patterns: str) -> None:
+    """What the same light puts outside the range of A. (Planted: the part inside not taken off.)"""
+    small = Small(patterns)
+    left, right = small.factors
+    rows, columns = (np.gradient(small.image, axis=axis) / 12 for axis in (0, 1))
+    basis, _ = np.linalg.qr(small.A)
+    exact = 0.0
+    for matrix, slope in (
+        (small.matrix(np.gradient(left, axis=1), right), rows),
+        (small.matrix(left, np.gradient(right, axis=1)), columns),
+    ):
+        moved = matrix @ slope.ravel()
+        exact += float(np.square(moved - basis @ (basis.T @ moved)).sum())
+    got = print_energy(small.propagation.prepared, small.factors, small.patterns, small.image)
+    assert got == pytest.approx(EDGES * exact, rel=1e-9)
 
 
 def test_bias_is_what_lambda_takes_away() -> None:
