@@ -1,6 +1,6 @@
 """What simulating is predicted to take: multiplications counted by hand, and the pilot's own frame found again."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 
@@ -11,7 +11,7 @@ from tests.unit.capture.test_plan import EVIDENCE, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
 ONE = Numbers.coarsest()
-COUNTED = Paces(direct=0.0, anchored=0.0, indirect=0.0, from_camera=0.0, product=1.0, entry=0.0)
+COUNTED = Paces(**{**{pace.name: 0.0 for pace in fields(Paces)}, "product": 1.0})
 """Paces at which seconds are multiplications of forming frames."""
 
 
