@@ -43,6 +43,8 @@ SETTINGS = json.loads(Path(__file__).with_name("mutants.json").read_text(encodin
 PRELOADED = ("numpy", "pydantic", "mpmath", "skimage.data")
 PRELOADED += tuple(f"scipy.{part}" for part in ("special", "stats", "optimize", "signal", "sparse.linalg"))
 """What else takes long to import and is no part of mitsim: each mutant's process is forked off one that has it."""
+WHOLE = ("sensor", "optics", "reconstruct")
+"""Rooms of which every module must be listed."""
 MEMORY = 8 * 2**30
 """Address space of a mutant [bytes]: a wrong size must not take the machine's memory."""
 SLOWER, LATER_S = 4, 30
@@ -260,7 +262,11 @@ def _report(results: list[dict[str, object]], path: Path, complete: bool) -> int
         print(f"survived, not explained: {survived[key]}  {key}")
     for key in sorted(gone):
         print(f"explained, but killed or not drawn: {key}")
-    return 1 if left or gone else 0
+    listed = {module for modules in SETTINGS["rooms"].values() for module in modules}
+    there = {f"{room}/{path.name}" for room in WHOLE for path in (ROOT / "mitsim" / room).glob("[a-z]*.py")}
+    for module in sorted(there - listed):
+        print(f"no mutants are drawn of {module}: list it in mutants.json")
+    return 1 if left or gone or there - listed else 0
 
 
 if __name__ == "__main__":

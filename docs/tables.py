@@ -14,7 +14,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, Patterns, RunManifest, ShotFile
+from mitsim.core.manifests import (
+    AmbientFile,
+    CalibrationManifest,
+    Digital,
+    FactorNoise,
+    Patterns,
+    RunManifest,
+    ShotFile,
+)
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import ProjectorModel
 from mitsim.rig.recipe import SessionRecipe
@@ -23,7 +31,7 @@ from mitsim.rig.sensor import SensorModel
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
     *(CameraGeometry, SensorModel, ProjectorModel, SessionRecipe),
-    *(RunManifest, Digital, Patterns, ShotFile, CalibrationManifest, FactorNoise),
+    *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise),
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 

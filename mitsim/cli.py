@@ -178,8 +178,12 @@ def plan(
     quiet: Quiet = False,
 ) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
+    from mitsim.core.resources import running_seconds
+
     request = _request(patterns=patterns, accuracy=accuracy, seed=seed, effects=effects)
-    plan = _open(scene, variant, camera, projector, define, outside).plan(**request)
+    bench = _open(scene, variant, camera, projector, define, outside)
+    starting = running_seconds()
+    plan = bench.plan(**request).taking(start=starting)
     if not as_json:
         _print_plan(plan)
     return _finish(as_json, plan.payload(), [], plan.warnings)
@@ -198,6 +202,12 @@ def capture(
     effects: Effects = "",
     noise_fraction: Annotated[
         float | None, typer.Option(help="stop sampling at this part of the sensor's noise", metavar="PART")
+    ] = None,
+    ambient_frame: Annotated[
+        str, typer.Option(help="take a frame with the projector off and lamps on", metavar="auto|yes|no")
+    ] = "auto",
+    ambient_shots: Annotated[
+        int | None, typer.Option(help="shots of that frame; by the patterns if not given", metavar="N")
     ] = None,
     seed: Seed = 0,
     define: Defines = None,
@@ -218,6 +228,8 @@ def capture(
         exposure_fraction=exposure_fraction,
         effects=effects,
         noise_fraction=noise_fraction,
+        ambient_frame=ambient_frame,
+        ambient_shots=ambient_shots,
     )
     advise(RESUME)
     with _job(quiet or as_json, max_seconds, max_memory) as job:
@@ -232,6 +244,12 @@ def capture(
         f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
         f"exposure {payload['exposure_s']:.3g} s a frame",
     ]
+    if payload["ambient_frame"]:
+        ambient = payload["ambient_frame"]
+        lines.append(
+            f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
+            f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's"
+        )
     return _finish(as_json, payload, lines, shots.warnings)
 
 

@@ -12,6 +12,7 @@ from mitsim.capture.effects import check_switches, parse_switches
 from mitsim.capture.plan import check_accuracy
 from mitsim.core.configuration import validated
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.manifests import MOST_SHOTS
 from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 from mitsim.sensor.chain import exposure_for_peak
 
@@ -67,6 +68,8 @@ class Request(BaseModel):
     exposure_fraction: float = Field(0.8, description="brightest pixel, as a part of full well")
     effects: dict[str, bool] = Field({}, description="effects switched on or off, whatever they are worth")
     noise_fraction: float | None = Field(None, description="stop sampling at this part of the sensor's noise")
+    ambient_frame: Literal["auto", "yes", "no"] = Field("auto", description="whether a frame of ambient light is taken")
+    ambient_shots: int | None = Field(None, description="shots of that frame; None: by the patterns")
 
     @classmethod
     def of(cls, **values: object) -> Request:
@@ -103,6 +106,15 @@ class Request(BaseModel):
                 "noise_fraction", f"{fraction}: give a part of the sensor's noise from {_LEAST_NOISE:g} to 1"
             )
         return fraction
+
+    @field_validator("ambient_shots")
+    @classmethod
+    def _a_number_of_shots(cls, shots: int | None) -> int | None:
+        if shots is not None and not 1 <= shots <= MOST_SHOTS:
+            raise ArgumentError(
+                "ambient_shots", f"{shots}: give 1 to {MOST_SHOTS} shots, or none for the patterns' own"
+            )
+        return shots
 
     def model_post_init(self, _: object) -> None:
         """MitsimError for an exposure that no camera has."""

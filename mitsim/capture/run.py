@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.capture.ambient import AmbientFrame, is_taken, shots_for
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
-from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.evidence import GROUPS, Estimate, Settings
 from mitsim.capture.exposer import Exposer, NoiseTarget, in_chunks
 from mitsim.capture.light import Light, Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan
@@ -22,12 +23,12 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.core.framefile import Channel
 from mitsim.core.job import Job
+from mitsim.core.manifests import AmbientFile, Patterns, RunHead, RunManifest
 from mitsim.core.manifests import Digital as DigitalScale
-from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.core.runs import Capture, RunFolder, RunMemory, claimed, frame_name
+from mitsim.core.runs import AMBIENT, Capture, RunFolder, RunMemory, claimed, frame_name
 from mitsim.core.versions import DECIDING, versions
-from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.optics.frames import ExpectedFrames, Frame, bound_of
 from mitsim.rig.patterns import Lighting, PatternFamily, Shot
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import Digital
@@ -37,6 +38,9 @@ _FIREFLIES = 0.8
 
 Normal noise gives 0.8 once in 600 runs if it is the same in all pixels of all frames (Grubbs' test), else never.
 """
+_DROWNED = 1.0
+"""Noise over the projector's light at which ambient light has ended the dynamic range: 49 dots of lamp_bench give 29 dB
+at 0.03, 17 dB at 0.3, and 12 dB, next to no image, at 3."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
@@ -157,15 +161,20 @@ def capture(
         digital = digital_scale(bench, exposure_s)
         recorder.begin()
         recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
-        shooting = _Shooting(family, recorder, exposer)
+        with job.clock.stage("ambient frame"):
+            ambient = _ambient(request, family, expected, exposer)
+        if ambient:
+            _record_ambient(recorder, ambient, exposer)
+        shooting = _Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
         shooting.shoot(expected, job)
-        total = light.plan.total(totals.mc_error)
+        total = light.plan.total(totals.noise)
         manifest = RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
             camera=bench.identity(),
             digital=digital,
             patterns=patterns,
+            ambient_frame=shooting.ambient_file,
             plan=plan.block(),
             mc_error=totals.mc_error,
             total_error=total.value,
@@ -177,7 +186,7 @@ def capture(
             paths=light.paths,
             lost_light=light.lost,
             seconds=job.clock.seconds(),
-            warnings=light.warnings + tuple(_warnings(light, totals, shooting)),
+            warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
             versions=versions(),
         )
         return recorder.finish(manifest)
@@ -207,25 +216,34 @@ def _sampling(bench: Bench, request: Request) -> Sampling:
 class _Totals:
     """Over all expected frames: brightest pixel [W m^-2], relative Monte Carlo error, most light below zero.
 
-    ``heaviest``: the largest part of the Monte Carlo variance that one group of the light brings.
+    ``heaviest``: the largest part of the Monte Carlo variance that one group of the light brings; ``mc_bound``: what
+    that error is below, at 95 %.
     """
 
     peak: float
     mc_error: float
     removed: float
     heaviest: float
+    mc_bound: float
+
+    @property
+    def noise(self) -> Estimate:
+        """The Monte Carlo error, and its bound."""
+        return Estimate(self.mc_error, self.mc_bound)
 
     @classmethod
     def of(cls, expected: ExpectedFrames) -> _Totals:
         peak = energy = variance = removed = heaviest = 0.0
+        parts = np.zeros(GROUPS)
         for frame in expected:
             removed = max(removed, frame.removed)
             peak = max(peak, float(frame.irradiance.max()))
             energy += float(np.square(frame.irradiance).sum())
             variance += frame.variance * frame.irradiance.size
             heaviest += frame.heaviest * frame.variance * frame.irradiance.size
+            parts += np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
         mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
-        return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0)
+        return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,15 +261,55 @@ class _Exposed:
 class _Shooting:
     """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept."""
 
-    def __init__(self, family: PatternFamily, recorder: RunFolder | RunMemory, exposer: Exposer) -> None:
+    def __init__(
+        self,
+        family: PatternFamily,
+        recorder: RunFolder | RunMemory,
+        exposer: Exposer,
+        ambient: AmbientFrame | None,
+        always: FloatArray,
+    ) -> None:
+        """Nothing is exposed yet.
+
+        Parameters
+        ----------
+        family, recorder, exposer
+            the shots, where they are kept, and the camera.
+        ambient
+            what is taken off the frames.
+        always
+            (pixels, pixels) expected electrons of ambient light, which is in every frame.
+        """
         self.family, self.recorder, self.exposer = family, recorder, exposer
+        self.ambient, self.always = ambient, always
         self.saturated, self.noise_ratio = 0, 0.0
-        self._noise_energy = self._energy = 0.0
+        self._noise_energy = self._energy = self._signal = self._light = 0.0
 
     @property
     def sensor_noise(self) -> float:
         """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, from its closed form."""
         return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
+
+    @property
+    def ambient_part(self) -> float:
+        """Ambient light in all light of the frames."""
+        return float(self.always.sum()) * len(self.family.shots) / self._light if self._light else 0.0
+
+    @property
+    def noise_to_signal(self) -> float:
+        """Noise of the frames less the ambient frame, ||noise|| / ||light of the projector||, over all frames."""
+        own = 0.0
+        if self.ambient is not None and not self.family.signed:
+            own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
+            own *= self.always.size * len(self.family.shots)
+        return math.sqrt((self._noise_energy + own) / self._signal) if self._signal else math.inf
+
+    @property
+    def ambient_file(self) -> AmbientFile | None:
+        """What the manifest says of the ambient frame."""
+        if self.ambient is None:
+            return None
+        return AmbientFile(file=AMBIENT, shots=self.ambient.shots, part=self.ambient_part, noise=self.noise_to_signal)
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
         """Expose and record in chunks, one thread a processor; stages are timed on the wall clock."""
@@ -272,6 +330,8 @@ class _Shooting:
                 self.saturated += self.exposer.saturated(shot.digital, shot.electrons)
                 self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
                 self._energy += float(np.square(shot.electrons).sum())
+                self._signal += float(np.square(shot.electrons - self.always).sum())
+                self._light += float(shot.electrons.sum())
             job.progress("frames", (chunk[-1][0] + 1) / len(expected))
 
     def _expose(self, item: tuple[int, tuple[Shot, Frame]]) -> _Exposed:
@@ -304,6 +364,20 @@ class _Shooting:
         self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)
 
 
+def _ambient(
+    request: Request, family: PatternFamily, expected: ExpectedFrames, exposer: Exposer
+) -> AmbientFrame | None:
+    if not is_taken(request.ambient_frame, family, expected):
+        return None
+    return AmbientFrame.exposed(exposer, expected, request.ambient_shots or shots_for(family))
+
+
+def _record_ambient(recorder: RunFolder | RunMemory, ambient: AmbientFrame, exposer: Exposer) -> None:
+    single = {"DN": ambient.digital, "electrons": ambient.electrons}
+    channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
+    recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposer.exposure_s, "seed": exposer.seed})
+
+
 def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
     sensor = bench.sensor
@@ -320,10 +394,12 @@ def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     )
 
 
-def _warnings(light: Light, totals: _Totals, shooting: _Shooting) -> Iterator[str]:
-    accuracy = light.plan.accuracy
+def _warnings(light: Light, totals: _Totals, shooting: _Shooting, request: Request) -> Iterator[str]:
+    accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
     if not light.reached:
         yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
+    elif total.bound > accuracy and not light.plan.warnings and request.noise_fraction is None:
+        yield f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"
     if totals.removed > accuracy:
         yield f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for more"
     if totals.heaviest > _FIREFLIES and totals.mc_error > _NEGLIGIBLE * accuracy:
@@ -331,5 +407,20 @@ def _warnings(light: Light, totals: _Totals, shooting: _Shooting) -> Iterator[st
             f"one of {GROUPS} groups of the light brings {totals.heaviest:.1%} of the Monte Carlo variance: a few "
             "heavy paths (fireflies) make it, so mc_error may be far off; frames keep them unclipped, try another seed"
         )
+    if shooting.ambient is not None and shooting.ambient.saturated:
+        yield "saturation: the ambient frame has pixels at the full well or the ADC's end; expose for less"
+    if shooting.always.any():
+        yield from _of_ambient_light(shooting)
     if shooting.saturated:
         yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
+
+
+def _of_ambient_light(shooting: _Shooting) -> Iterator[str]:
+    part = f"{shooting.ambient_part:.1%} of the frames' light is ambient"
+    if shooting.ambient is None and not shooting.family.signed:
+        yield f"{part} and is not taken off (ambient_frame is no): an image of them shows it, and is wrong"
+    if shooting.noise_to_signal > _DROWNED:
+        yield (
+            f"{part}: noise is {shooting.noise_to_signal:.2g} times the projector's light in the frames, so little of "
+            "an image will be left; darken the room, or expose longer on a sensor of a larger full well"
+        )

@@ -60,6 +60,7 @@ def _texts(checksums: dict[str, Any]) -> dict[str, str]:
 
 
 Checksums = Annotated[dict[str, Any], AfterValidator(_texts)]
+FileName = Annotated[str, Field(pattern=r"^[^/\\\x00]+$", max_length=255)]
 
 
 class _Part(BaseModel):
@@ -124,9 +125,7 @@ class Digital(_Part):
 class ShotFile(_Part):
     """One shot: pattern (row, column), whole (sign 0) or the +1 or -1 half of a signed pattern."""
 
-    file: str = Field(
-        pattern=r"^[^/\\\x00]+$", max_length=255, description="name of the frame in the run's folder, without a path"
-    )
+    file: FileName = Field(description="name of the frame in the run's folder, without a path")
     row: int = Field(ge=0, description="column i of P_L")
     column: int = Field(ge=0, description="column j of P_R")
     sign: int = Field(ge=-1, le=1, description="0, or the half (1 + P)/2 or (1 - P)/2 of a signed pattern P")
@@ -228,6 +227,17 @@ class _Head(_Part):
     versions: dict[str, str] = Field(default={}, description="of mitsim, Python and packages")
 
 
+class AmbientFile(_Part):
+    """The ambient frame: what a camera sees with the projector off, taken off frames that are not one of a pair."""
+
+    file: FileName = Field(description="name of the frame in the run's folder, without a path")
+    shots: int = Field(ge=1, le=MOST_SHOTS, description="shots that it is the mean of, each exposed as the frames")
+    part: float | None = Field(default=None, description="ambient light in all light of the frames")
+    noise: float | None = Field(
+        default=None, description="noise of the frames less the ambient frame, over the projector's light; closed form"
+    )
+
+
 class RunHead(_Head):
     """What an unfinished run's manifest says, and a finished one's begins with."""
 
@@ -249,6 +259,9 @@ class RunManifest(RunHead):
     camera: Plain = Field(description="identity that a calibration must share; anything, as long as both are equal")
     digital: Digital = Field(description="how digital numbers become electrons a second")
     patterns: Patterns = Field(description="what was projected, and in which file it is seen")
+    ambient_frame: AmbientFile | None = Field(
+        default=None, description="the frame of ambient light alone; none: nothing is taken off the frames"
+    )
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
     plan: Plain | None = Field(default=None, description="the effect plan, see Plan")
     mc_error: float | None = Field(default=None, description="relative Monte Carlo error of the expected frames")

@@ -25,7 +25,7 @@ from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, rea
 from mitsim.core.output import output_folder, sweep
 from mitsim.core.pictures import card, scaled, span
 
-TRUTH = "truth.exr"
+TRUTH, AMBIENT = "truth.exr", "ambient.exr"
 Channels = Mapping[str, Channel]
 Metadata = Mapping[str, Value]
 _SHOWN = 3
@@ -38,13 +38,34 @@ def frame_name(index: int) -> str:
 
 
 @dataclass(frozen=True, eq=False)
+class Ambient:
+    """What a camera sees with the projector off, as it is taken off every frame of a run.
+
+    Attributes
+    ----------
+    rate
+        (rows, columns) mean over the shots [electrons/s].
+    variance
+        (rows, columns) of that mean [(electrons/s)^2], of what the manifest states of the sensor's noise. It is one
+        draw, the same in all frames.
+    shots
+        that were averaged.
+    """
+
+    rate: FloatArray
+    variance: FloatArray
+    shots: int
+
+
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """What was measured under one pattern.
 
     Attributes
     ----------
     frame
-        (rows, columns) [electrons/s], of a signed pattern the difference of its halves.
+        (rows, columns) [electrons/s], of a signed pattern the difference of its halves; of others without ambient
+        light.
     row, column
         indices (i, j) of the pattern.
     light
@@ -71,7 +92,7 @@ class Measurement:
     def power(self) -> FloatArray:
         """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
         # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
-        return np.square(self.frame) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
+        return np.square(self.light) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
 
 
 class Capture:
@@ -155,6 +176,15 @@ class Capture:
         return self.manifest.warnings
 
     @cached_property
+    def ambient(self) -> Ambient | None:
+        """What is taken off every frame but those of signed pairs; None where no ambient frame was taken."""
+        if self.manifest.ambient_frame is None:
+            return None
+        block, digital = self.manifest.ambient_frame, self.manifest.digital
+        rate = digital.rate(self._channel(block.file, "DN"))
+        return Ambient(rate, np.maximum(digital.variance(rate), 0.0) / block.shots, block.shots)
+
+    @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
         """P_L (n, K) and P_R (n', K')."""
         return self.manifest.patterns.matrices
@@ -166,8 +196,8 @@ class Capture:
 
     def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """What was measured under every pattern, read one at a time; the halves of a signed one come as their
-        difference. MitsimError for a frame that is missing, damaged, not finite or of another ``shape`` than is asked
-        for."""
+        difference, others without the ambient frame, if one was taken. MitsimError for a frame that is missing,
+        damaged, not finite or of another ``shape`` than is asked for."""
         digital = self.manifest.digital
         waiting: dict[tuple[int, int], Measurement] = {}
         for shot in self.manifest.patterns.captures:
@@ -180,11 +210,23 @@ class Capture:
                 )
             light = digital.rate(dn)
             full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
-            half = Measurement(light * shot.sign if shot.sign else light, *index, light, 1, full)
+            half = Measurement(light * shot.sign if shot.sign else self._lit(light), *index, light, 1, full)
             if shot.sign and index not in waiting:
                 waiting[index] = half
                 continue
             yield waiting.pop(index) + half if shot.sign else half
+
+    def _lit(self, light: FloatArray) -> FloatArray:
+        """The projector's part of a shot's ``light``."""
+        if self.ambient is None:
+            return light
+        ambient = self.ambient.rate
+        if ambient.shape != light.shape:
+            raise MitsimError(
+                f"{self.name}: the ambient frame is {_size(ambient.shape)}, but the frames are {_size(light.shape)}; "
+                "take it with the same camera"
+            )
+        return light - ambient
 
     @cached_property
     def fingerprint(self) -> str:
@@ -193,10 +235,14 @@ class Capture:
         # What is not stated is left out: folders of 0.4.0 keep their fingerprints.
         digest = hashlib.sha256(manifest.digital.model_dump_json(exclude_defaults=True).encode())
         digest.update(manifest.patterns.model_dump_json().encode() + manifest.configuration_sha256.encode())
-        for shot in manifest.patterns.captures:
-            if self.folder and not (manifest.configuration_sha256 and shot.file in manifest.checksums):
-                verify(self.folder, shot.file, {}, "")  # no link out of it
-                digest.update(checksum(self.folder / shot.file).encode())
+        files = [shot.file for shot in manifest.patterns.captures]
+        if manifest.ambient_frame is not None:
+            digest.update(manifest.ambient_frame.model_dump_json().encode())
+            files.append(manifest.ambient_frame.file)
+        for file in files:
+            if self.folder and not (manifest.configuration_sha256 and file in manifest.checksums):
+                verify(self.folder, file, {}, "")  # no link out of it
+                digest.update(checksum(self.folder / file).encode())
         return digest.hexdigest()
 
     def summary(self) -> dict[str, Any]:
@@ -221,6 +267,7 @@ class Capture:
             "seed": manifest.configuration.get("seed"),
             "output": None if self.folder is None else str(self.folder),
             "exposure_s": self.exposure_s,
+            "ambient_frame": None if manifest.ambient_frame is None else manifest.ambient_frame.model_dump(),
             **{name: getattr(manifest, name) for name in known},
         }
 
@@ -231,15 +278,18 @@ class Capture:
         """
         with claimed(Path(folder), self.manifest, resume=False) as run:
             if self.folder is not None:
-                for name in (*(shot.file for shot in self.manifest.patterns.captures), TRUTH, MANIFEST):
+                ambient = self.manifest.ambient_frame
+                also = () if ambient is None else (ambient.file,)
+                for name in (*(shot.file for shot in self.manifest.patterns.captures), *also, TRUTH, MANIFEST):
                     if (self.folder / name).is_file():
                         shutil.copyfile(self.folder / name, run.path / name)
             else:
                 run.begin()
                 for index, shot in enumerate(self.manifest.patterns.captures):
                     run.write_frame(index, *self._memory[shot.file])
-                if TRUTH in self._memory:
-                    run.write(TRUTH, *self._memory[TRUTH])
+                for name in (TRUTH, AMBIENT):
+                    if name in self._memory:
+                        run.write(name, *self._memory[name])
                 run.finish(self.manifest)
         return run.path
 
@@ -365,6 +415,18 @@ class RunMemory:
             of its file, (rows, columns) each.
         """
         self._files[frame_name(index)] = channels, metadata
+
+    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        """Keep a file of the run.
+
+        Parameters
+        ----------
+        name
+            of the file.
+        channels, metadata
+            of it, (rows, columns) each.
+        """
+        self._files[name] = channels, metadata
 
     def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
         """Keep the truth.

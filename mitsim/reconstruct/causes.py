@@ -45,7 +45,7 @@ class Cause(Enum):
     )
     AMBIENT = (
         "ambient light, the same in every shot",
-        "darken the room, or take an ambient frame off every shot",
+        "darken the room, or capture with ambient_frame=yes",
     )
     DEPTH = (
         "depth, light that lands beside where the calibration saw it",

@@ -31,7 +31,7 @@ class FrameNoise:
     Attributes
     ----------
     variance
-        (K, K') mean noise variance of a datum of each pattern [(electrons/s)^2].
+        (K, K') mean noise variance of a datum of each pattern by its own shots [(electrons/s)^2].
     power
         sum of the squares of all shots [(electrons/s)^2].
     shots, saturated, readings
@@ -58,7 +58,7 @@ class FrameNoise:
         return float(self._rendering**2 * self.power)
 
     def of(self, light: FloatArray | float, shots: int) -> FloatArray:
-        """Noise variance [(electrons/s)^2] of a measurement.
+        """Noise variance [(electrons/s)^2] of a measurement, with that of the frame that was taken off it.
 
         Parameters
         ----------
@@ -66,15 +66,18 @@ class FrameNoise:
             sum of its shots [electrons/s], any shape, and their number.
         """
         ambient = self.ambient_variance if shots == 1 else 0.0  # the difference of a pair has no ambient frame
-        return np.maximum(self._digital.variance(light, shots) + ambient, 0.0)
+        return self._own(light, shots) + ambient
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
-        self.variance[measurement.row, measurement.column] = self.of(measurement.light.mean(), measurement.shots)
+        self.variance[measurement.row, measurement.column] = self._own(measurement.light.mean(), measurement.shots)
         self.power += float(measurement.power.sum())
         self.shots = measurement.shots
         self.saturated += measurement.saturated
         self.readings += measurement.shots * measurement.frame.size
+
+    def _own(self, light: FloatArray | float, shots: int) -> FloatArray:
+        return np.maximum(self._digital.variance(light, shots), 0.0)
 
 
 def factor_energy(

@@ -289,7 +289,8 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     numbers = sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides)
     Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{shots.name}: factorising its patterns", Limits())
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
-    frames, noise, kept = prepared.accumulator(), FrameNoise(shots.manifest), list[Measurement]()
+    noise = FrameNoise(shots.manifest, _ambient_variance(shots))
+    frames, kept = prepared.accumulator(), list[Measurement]()
     few = left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= _KEPT_NUMBERS
     for measurement in shots.measured((len(factors.left), len(factors.right))):
         frames.add(measurement.frame, measurement.row, measurement.column)
@@ -297,6 +298,13 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
         if few:
             kept.append(measurement)
     return Accumulated(prepared, frames, noise, tuple(kept))
+
+
+def _ambient_variance(shots: Capture) -> float:
+    """Mean variance of the frame that is taken off all others; 0 where none is."""
+    if shots.ambient is None or any(shot.sign for shot in shots.manifest.patterns.captures):
+        return 0.0
+    return float(shots.ambient.variance.mean())
 
 
 def inputs(shots: Capture, factors: Factors, lam: float | str, method: str) -> dict[str, str | float]:

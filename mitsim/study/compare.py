@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from mitsim.capture.ambient import taken_off
 from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer, peak_irradiance
 from mitsim.capture.light import Light
@@ -126,7 +127,7 @@ def peak_time(bench: Bench, expected: ExpectedFrames) -> float:
 def accumulate(
     exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared]
 ) -> list[Accumulator]:
-    """One noisy exposure of a family's frames, added up for each model.
+    """One noisy exposure of a family's frames, ambient light taken off where there is some, added up for each model.
 
     Parameters
     ----------
@@ -135,7 +136,8 @@ def accumulate(
     """
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
+        ambient = taken_off(exposer, family, expected)
         for measurement, row, column in exposer.measurements(family, expected):
             for each in sums:
-                each.add(measurement, row, column)
+                each.add(measurement - ambient, row, column)
     return sums

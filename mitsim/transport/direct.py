@@ -95,12 +95,12 @@ class DirectTracer(Tracer):
         ) -> tuple[object, ...]:
             si = self.scene.ray_intersect(ray, active)
             active &= si.is_valid()
-            part = passage.straight(si, active)
-            onward = passage.onward(si, ray.d)
+            passed = passage.through(si, ray.d, active)
+            onward = passage.onward(si, passed.direction)
             reception = self.receiver.receive(si, -ray.d, sensor, active)
             light = panchromatic(reception.irradiance * flux)
             seen = seen.joined_by(reception.sightings(light, pixel), rng)
-            flux = flux * part
+            flux = flux * passed.part
             return active & (dr.max(flux) > 0), onward, flux, seen, rng
 
         state = mi.Bool(True), ray, flux, Sightings.none(), rng

@@ -62,17 +62,17 @@ def read_noise_side() -> int:
 
 def test_the_slope_of_variance_over_mean_is_the_gain(camera: SensorModel, record_property: Record) -> None:
     side = gain_side()
-    dark_mean, ambient_variance = pair(camera, 0.0, side, 0.0, "dark")
+    dark_mean, dark_variance = pair(camera, 0.0, side, 0.0, "dark")
     slopes = []
     for level in LEVELS:
         mean, variance = pair(camera, level * camera.superpixel_full_well_e, side, EXPOSURE_S, f"level {level}")
-        slopes.append((variance - ambient_variance) / (mean - dark_mean))
+        slopes.append((variance - dark_variance) / (mean - dark_mean))
     error = np.mean(slopes) / camera.gain_dn_per_e - 1
     record_property("gain error", float(error))
     assert abs(error) < GAIN_GATE, f"gain off by {error:.2%} at {side} x {side}"
 
 
-def test_the_ambient_variance_is_the_read_noise(camera: SensorModel, record_property: Record) -> None:
+def test_the_dark_variance_is_the_read_noise(camera: SensorModel, record_property: Record) -> None:
     side = read_noise_side()
     _, variance = pair(camera, 0.0, side, 0.0, "read noise")
     # EMVA 1288 4.0: sigma_d^2 = (sigma_y.dark^2 - sigma_q^2) / K^2 with the ADC's 1/12 DN^2.

@@ -83,8 +83,8 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     found = call("reconstruct", lab.run, "--calibration", lab.calibration, *options).payload
     keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "seconds", "output"}
     assert found.keys() == keys | {
-        *("rank_sides", "condition_whole", "condition_sides"),
-        *("truth_error", "misfit", "uncertainty", "uncertainty_budget"),
+        *("truth_error", "rank_sides", "condition_whole", "condition_sides"),
+        *("misfit", "uncertainty", "uncertainty_budget"),
     }
     assert number(found["uncertainty"], 1e-6, 0.1) and all(map(number, found["uncertainty_budget"].values()))
     assert found["misfit"].keys() == {

@@ -19,7 +19,7 @@ def test_an_integrator_without_a_camera_side_is_refused(small_scene: Callable[..
         open_bench(scene, for_render=True).render(spp=4)
 
 
-def test_a_ambient_frame_is_flagged(small_scene: Callable[..., Path]) -> None:
+def test_a_dark_frame_is_flagged(small_scene: Callable[..., Path]) -> None:
     scene = small_scene()
     text = scene.read_text()
     start = text.index("<shape")

@@ -1,0 +1,71 @@
+"""What a plan says: of devices that the model does not cover, of effects, and as JSON; benches are plain numbers."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import Part
+from mitsim.capture.plan import SceneFacts
+from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows
+
+
+def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
+    geometry = SimpleNamespace(wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature)
+    return SimpleNamespace(  # type: ignore[return-value]
+        field_stop_cuts=cuts,
+        geometry=geometry,
+        spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
+        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("device", "words"),
+    [
+        (bench(), []),
+        (bench(cuts=True), ["field stop (fov) cuts into the projector's window"]),
+        (bench(shift=0.99), []),
+        (bench(shift=1.0), ["0.5 mm shifts the far face by 1.0 features"]),
+        (bench(feature=6.2e-4), []),
+        (bench(feature=6.1e-4), ["below the wavelength of 620 nm"]),
+    ],
+)
+def test_devices_are_flagged_where_their_model_ends(
+    monkeypatch: pytest.MonkeyPatch, device: Bench, words: list[str]
+) -> None:
+    """At a wall's shift of one feature, and a feature of the longest wavelength."""
+    monkeypatch.setattr("mitsim.capture.plan.EFFECTS", {})
+    facts = SceneFacts.of(device)
+    assert facts.keystone == 2.5 and len(facts.warnings) == len(words)
+    for warning, part in zip(facts.warnings, words, strict=True):
+        assert part in warning
+
+
+def test_a_plan_as_json_leaves_out_what_it_was_decided_without() -> None:
+    block = plan().block()
+    assert "request" not in block and "cost" not in block and None not in block.values()
+    assert block["accuracy"] == 1e-3 and block["settings"]["effects"] == sorted(plan().settings.effects)
+    assert set(block) >= {"effects", "predicted_seconds", "settings", "sampling_target", "warnings"}
+
+
+def test_only_effects_that_are_on_by_choice_say_what_would_be_without_them() -> None:
+    """Those that are off, or that the user switched, had no choice to explain; what takes no time has no seconds."""
+    found = rows(plan(effects="+ambient,-interreflection"))
+    for name, row in found.items():
+        explained = "without it the error would be" in row.reason or "it takes no time" in row.reason
+        assert not (explained and (row.state == "off" or name in ("ambient", "interreflection"))), name
+        assert row.seconds == 0 or row.state != "off", name
+        assert row.seconds == 0 or "it takes no time" not in row.reason, name
+    assert "without it the error would be" in found["diffraction"].reason and found["diffraction"].seconds > 0
+    assert "it takes no time" in found["blur"].reason and found["blur"].state == "exact"
+
+
+def test_where_nothing_fits_sampling_still_aims_below_the_accuracy() -> None:
+    """Every number of anchors leaves 5 %: the plan is flagged, and sampling is no finer than it need be."""
+    coarse = {**SIZES, **{Part("anchors", count): 0.05 for count in (1, 2, 3, 5)}}
+    found = plan(1e-2, replace(EVIDENCE, changes=changes(coarse)))
+    assert found.warnings and found.systematic_bound > 1e-2
+    assert 0.5e-2 < found.sampling_target < 1e-2

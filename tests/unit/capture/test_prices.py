@@ -1,0 +1,73 @@
+"""What simulating is predicted to take: multiplications counted by hand, and the pilot's own frame found again."""
+
+from dataclasses import replace
+
+import pytest
+
+from mitsim.capture.evidence import GROUPS, Forming
+from mitsim.capture.prices import FIXED, Numbers, Paces, forming_seconds, optics_seconds, paces_of
+from mitsim.optics.frames import PROBES
+from tests.unit.capture.test_plan import EVIDENCE
+
+FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
+ONE = Numbers.coarsest()
+COUNTED = Paces(direct=0.0, anchored=0.0, indirect=0.0, from_camera=0.0, product=1.0, entry=0.0)
+"""Paces at which seconds are multiplications of forming frames."""
+
+
+def products(rows: float, terms: float = 1.0) -> float:
+    """Of left (50, rows) times light (rows, rows) times right (rows, 50), and of the groups' probes in the same way."""
+    probes = GROUPS * (PROBES + 1) * (min(rows, 50) + 50) * rows
+    return terms * (50 * rows * rows + 50 * 50 * rows + probes)
+
+
+def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
+    measured = replace(EVIDENCE, forming=replace(EVIDENCE.forming, seconds=0.125))
+    assert forming_seconds(measured.forming, ONE, 1.0, paces_of(measured)) == pytest.approx(0.125, rel=1e-12)
+    none = replace(
+        EVIDENCE, direct=replace(EVIDENCE.direct, seconds=0.0), forming=replace(EVIDENCE.forming, seconds=0.0)
+    )
+    assert paces_of(none).direct == FIXED.direct and paces_of(none).product == FIXED.product
+    other = replace(EVIDENCE, direct=replace(EVIDENCE.direct, seconds=5e-6))
+    assert paces_of(other).direct == 5e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "multiplications"),
+    [
+        ({"waves": 0.0}, products(5)),
+        ({}, products(5, 3)),
+        ({"layers": 2.0}, 2 * products(5, 3)),
+        ({"cells": 4.0}, products(20, 3)),
+        ({"anchors": 2.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
+        ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 3.0}, 3 * products(5, 3) + 3 * products(10, 3)),
+        ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
+        ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
+    ],
+)
+def test_forming_a_frame_is_as_many_products_as_its_matrices_have(
+    change: dict[str, float], multiplications: float
+) -> None:
+    """Half of the ten rows of cells hold light; coarse light of several anchors and indirect light add frames."""
+    assert forming_seconds(FORMING, replace(ONE, **change), 7.0, COUNTED) == pytest.approx(7 * multiplications)
+
+
+def test_shots_that_are_no_mixtures_hold_light_in_all_rows_once_every_pixel_is_lit() -> None:
+    """More classes than shots: frames are formed shot by shot."""
+    forming = replace(FORMING, classes=9)
+    assert forming_seconds(forming, ONE, 1.0, COUNTED) == pytest.approx(products(5, 3))
+    assert forming_seconds(forming, replace(ONE, mixed=1.0), 1.0, COUNTED) == pytest.approx(products(10, 3))
+
+
+def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
+    """Two sides of pixels times cells, for fine light, and once more where light is coarse."""
+    entries = replace(COUNTED, product=0.0, entry=1.0)
+    one = 2 * 50 * 10
+    for change, count in (
+        ({}, 3 * one),
+        ({"waves": 0.0}, 0.03 * one),
+        ({"cells": 2.0, "layers": 2.0}, 4 * 3 * one),
+        ({"anchors": 2.0, "coarse_cells": 2.0}, (1 + 2) * 3 * one),
+        ({"anchors": 2.0, "indirect": 1.0}, (1 + 2) * 3 * one),
+    ):
+        assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
