@@ -16,7 +16,7 @@ from mitsim.capture.plan import Plan
 from mitsim.capture.request import Exposure
 from mitsim.capture.run import digital_scale
 from mitsim.capture.session import SIDES, LitSession, Session
-from mitsim.capture.simulation import FiledLight, Simulation
+from mitsim.capture.simulation import TRAYS, FiledLight, Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
@@ -27,7 +27,6 @@ from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 _SAVED_EVERY = 8
 """Responses between two checkpoints: the 16 shots that are exposed at once, or 32 of a noise-free check."""
-_TRAYS = ("fine", "coarse", "smooth")
 
 
 def calibrate(
@@ -169,10 +168,10 @@ def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> Li
                 tuple(arrays[f"{name}_{part}"] for part in ("data", "indices", "indptr")),
                 shape=tuple(arrays[f"{name}_shape"]),
             )
-            for name in _TRAYS
+            for name in TRAYS
         }
         return Light(
-            groups=(FiledLight(**trays, outside=float(arrays["outside"])),),
+            groups=(FiledLight(**trays, received=float(arrays["received"]), outside=float(arrays["outside"])),),
             simulation=Simulation(session.board, plan.settings),
             plan=plan,
             seed=session.seed,
@@ -187,8 +186,8 @@ def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> Li
     facts = {
         name: getattr(light, name) for name in ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
     }
-    facts["outside"] = light.groups[0].outside
-    for name in _TRAYS:
+    facts |= {name: getattr(light.groups[0], name) for name in ("received", "outside")}
+    for name in TRAYS:
         matrix = getattr(light.groups[0], name)
         facts |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
     checkpoint.save("light", facts)

@@ -193,10 +193,13 @@ class _Table:
             coarse_cells=coarse,
             coarse_layers=bool(all_layers),
             reach=self.evidence.reach,
+            sharp=self.evidence.sharp,
             **{f"{name}_samples": float(count[index]) for name, count in self.samples.items()},
         )
         missing, centre = self.evidence.unresolved, np.add(*self._from_centre(SURE))
-        value, bound = (float(self._systematic(sure, frozenset())[index]) + missing for sure in (0.0, SURE))
+        # Errors of the light that is there count for its part of all.
+        rest = (float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE))
+        value, bound = (missing + (1 - missing) * error for error in rest)
         return Choice(
             settings=settings,
             systematic=Estimate(value, bound),

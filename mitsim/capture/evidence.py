@@ -28,6 +28,25 @@ SURE = 2.35
 
 
 @dataclass(frozen=True)
+class SharpPixels:
+    """Projector pixels whose direct light comes over lobes too sharp for the anchors of all others.
+
+    Attributes
+    ----------
+    pixels
+        their numbers, increasing.
+    anchors
+        points a side of the sensor that their light is connected to.
+    window
+        first and last tan-angle of their light along rows, then along columns.
+    """
+
+    pixels: tuple[int, ...]
+    anchors: int
+    window: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
 class Settings:
     """What is simulated, and how finely.
 
@@ -52,6 +71,8 @@ class Settings:
     reach
         largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None: no more
         than of light at ``depth``.
+    sharp, sharp_samples
+        pixels whose direct light is traced apart, and samples that each group is predicted to need of it.
     """
 
     depth: float
@@ -66,6 +87,8 @@ class Settings:
     coarse_cells: int = 1
     coarse_layers: bool = False
     reach: float | None = None
+    sharp: SharpPixels | None = None
+    sharp_samples: float = 1.0
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -224,8 +247,10 @@ class Evidence:
         effects that are no part of the expected frames, with the independent error of leaving each out.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
-    reach
-        as :attr:`Settings.reach`.
+    reach, sharp
+        as in :class:`Settings`.
+    sharp_light
+        what that light takes.
     """
 
     depth: float
@@ -240,6 +265,8 @@ class Evidence:
     apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
     reach: float | None = None
+    sharp: SharpPixels | None = None
+    sharp_light: Effort = field(default_factory=lambda: Effort.none())
 
     def error(self, *parts: Part) -> Estimate:
         """Relative change of the frames by all ``parts`` together."""

@@ -33,11 +33,12 @@ class Paces:
     anchored: float
     indirect: float
     from_camera: float
+    sharp: float
     product: float
     entry: float
 
 
-FIXED = Paces(direct=1e-7, anchored=1e-7, indirect=2.5e-7, from_camera=7e-7, product=3e-11, entry=7e-8)
+FIXED = Paces(direct=1e-7, anchored=1e-7, indirect=2.5e-7, from_camera=7e-7, sharp=2e-7, product=3e-11, entry=7e-8)
 """Measured over the shipped scenes on two cores, medians; only their ratios decide."""
 
 
@@ -83,6 +84,7 @@ def paces_of(evidence: Evidence) -> Paces:
         anchored=evidence.anchored.seconds or FIXED.anchored,
         indirect=evidence.indirect.seconds or FIXED.indirect,
         from_camera=evidence.from_camera.seconds or FIXED.from_camera,
+        sharp=evidence.sharp_light.seconds or FIXED.sharp,
         product=float(evidence.forming.seconds / one) if evidence.forming.seconds else FIXED.product,
         entry=FIXED.entry,
     )
@@ -96,6 +98,8 @@ def priced() -> frozenset[str]:
 def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
     """What each kind of light that ``effects`` call for takes by the ``evidence``; connections to anchors: to one."""
     found = {"direct": evidence.direct, "anchored": evidence.anchored}
+    if evidence.sharp:
+        found["sharp"] = evidence.sharp_light
     if effects & names(lambda effect: effect.followed):
         found |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera}
     return found

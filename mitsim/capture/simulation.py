@@ -23,6 +23,7 @@ from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Spectrum
+from mitsim.transport.aimed import AimedTracer
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import FromCameraTracer, Paths
@@ -32,6 +33,10 @@ from mitsim.transport.indirect import IndirectTracer
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which
 a shadow's fringes hardly move."""
+TRAYS = ("fine", "coarse", "smooth", "sharp")
+"""Parts of an :class:`FiledLight`."""
+_MOST_ROWS = 2**12
+"""Rows of anchors times cells of sharp light: a class that lights them all is a matrix of 128 MiB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +44,16 @@ class FiledLight:
     """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
 
     ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees beyond
-    that, and ``smooth`` is indirect light: small or smooth, so coarse cells hold them well. ``outside`` is light that
-    came from beyond all cells, a mean over the sensor without its mask: it is in no frame.
+    that, and ``smooth`` is indirect light: small or smooth, so coarse cells hold them well. ``sharp`` is direct light
+    of the pixels that are traced apart. Of all light ``received``, a mean over the sensor without its mask,
+    ``outside`` came from beyond all cells: it is in no frame.
     """
 
     fine: sparse.csr_array
     coarse: sparse.csr_array
     smooth: sparse.csr_array
+    sharp: sparse.csr_array
+    received: float = 0.0
     outside: float = 0.0
 
     def __add__(self, other: FiledLight) -> FiledLight:
@@ -57,8 +65,7 @@ class FiledLight:
     @property
     def lost(self) -> float:
         """Part of the light that is in no frame."""
-        filed = float(self.fine.sum() + self.smooth.sum())
-        return self.outside / (filed + self.outside) if self.outside else 0.0
+        return self.outside / self.received if self.outside else 0.0
 
 
 @dataclass(frozen=True)
@@ -125,7 +132,7 @@ class Simulation:
     ----------
     physics
         what is simulated of the bench.
-    fine, coarse, smooth
+    fine, coarse, smooth, sharp
         trays for the parts of an :class:`FiledLight`; ``ambient`` for lamps' light in the cells of ``fine``.
     """
 
@@ -141,6 +148,7 @@ class Simulation:
         self.fine = self._tray(fine)
         self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
         self.smooth = self._tray(Bundle(coarse, 1, depths))
+        self.sharp = self._tray(self._apart(pixels))
         self.ambient = self._tray(fine, _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
 
     def _tray(self, bundle: Bundle, light: Spectrum | None = None) -> Tray:
@@ -161,6 +169,19 @@ class Simulation:
         depth, reach = self.settings.depth, max(self.reach, reach or 0.0)
         return aligned_grid(*self.bench.windows_at(depth), pixels, subdivision, reach)
 
+    def _apart(self, pixels: int) -> Bundle:
+        """Cells of the sharp pixels' light: their part of the fine ones, or coarser where the anchors are too many."""
+        settings, sharp = self.settings, self.settings.sharp
+        if sharp is None:
+            return Bundle(self._grid(pixels, 1, None), 1, (settings.depth,))
+
+        def part(subdivision: int) -> CellGrid:
+            whole, window = self._grid(pixels, subdivision, settings.reach), sharp.window
+            return CellGrid(whole.rows.part(*window[:2]), whole.columns.part(*window[2:]))
+
+        most = max(1, _MOST_ROWS // (sharp.anchors * max(part(1).shape)))
+        return Bundle(part(min(settings.subdivision, most)), sharp.anchors, settings.depths, between=True)
+
     @cached_property
     def direct(self) -> DirectTracer:
         """Follows direct light from the projector to the sensor's centre, or to all of it where anchors are used."""
@@ -176,9 +197,20 @@ class Simulation:
         """The same to every anchor."""
         return self._direct(self.settings.anchors) if self.settings.anchors > 1 else None
 
+    @cached_property
+    def apart(self) -> AimedTracer | None:
+        """Follows direct light of the sharp pixels to their anchors; none where there are none."""
+        loaded, physics, sharp = self.bench.loaded, self.physics, self.settings.sharp
+        if sharp is None:
+            return None
+        parts = loaded.scene, loaded.camera, physics.projector, sharp.anchors, physics.geometry
+        return AimedTracer(*parts, np.array(sharp.pixels))
+
     def _direct(self, anchors: int, spread: bool = False) -> DirectTracer:
-        loaded = self.bench.loaded
-        return DirectTracer(loaded.scene, loaded.camera, self.physics.projector, anchors, self.physics.geometry, spread)
+        """Of all pixels that are not traced apart."""
+        loaded, physics, sharp = self.bench.loaded, self.physics, self.settings.sharp
+        pixels = np.setdiff1d(np.arange(self.bench.n**2), sharp.pixels) if sharp else None
+        return DirectTracer(loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry, spread, pixels)
 
     @cached_property
     def indirect(self) -> IndirectTracer | None:
@@ -206,8 +238,16 @@ class Simulation:
     @cached_property
     def mean_weights(self) -> FloatArray:
         """(anchors,) weight of each anchor in the mean over the sensor."""
+        return self._mean_weights(self.settings.anchors)
+
+    @cached_property
+    def sharp_weights(self) -> FloatArray:
+        """The same of the sharp pixels' anchors."""
+        return self._mean_weights(self.sharp.bundle.anchors)
+
+    def _mean_weights(self, anchors: int) -> FloatArray:
         edges = self.physics.geometry.pixel_edges
-        positions = anchor_positions(self.settings.anchors, self.physics.geometry.half_width)
+        positions = anchor_positions(anchors, self.physics.geometry.half_width)
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
 
     def file_direct(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
@@ -218,8 +258,7 @@ class Simulation:
         deposits, labels, samples
             as for :meth:`Tray.file`.
         """
-        light = self._light(fine=self.fine.file(deposits, labels, samples))
-        return replace(light, outside=self.fine.bundle.outside(deposits) / samples)
+        return self._light(deposits, samples, fine=self.fine.file(deposits, labels, samples))
 
     def file_anchored(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`anchored` beyond its mean over the sensor, per sample.
@@ -231,7 +270,7 @@ class Simulation:
         """
         mean = self.smooth.file(deposits.averaged(self.mean_weights), labels, samples)
         coarse = self.coarse.file(deposits, labels, samples)
-        return self._light(coarse=coarse - self.coarse.bundle.repeated(mean))
+        return self._light(None, 1, coarse=coarse - self.coarse.bundle.repeated(mean))
 
     def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`indirect` or :attr:`from_camera`, per sample.
@@ -243,13 +282,31 @@ class Simulation:
         """
         indirect = deposits.kind == INDIRECT
         fine = self.fine.file(deposits.where(~indirect), labels, samples)
-        light = self._light(fine=fine, smooth=self.smooth.file(deposits.where(indirect), labels, samples))
-        return replace(light, outside=self.fine.bundle.outside(deposits) / samples)
+        smooth = self.smooth.file(deposits.where(indirect), labels, samples)
+        return self._light(deposits, samples, fine=fine, smooth=smooth)
 
-    def _light(self, **parts: sparse.csr_array) -> FiledLight:
+    def file_sharp(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`apart`, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        light = self._light(None, 1, sharp=self.sharp.file(deposits, labels, samples))
+        mean = deposits.averaged(self.sharp_weights)
+        outside = self.sharp.bundle.outside(mean) / samples
+        return replace(light, received=float(mean.value.sum()) / samples, outside=outside)
+
+    def _light(self, deposits: Deposits | None, samples: int, **parts: sparse.csr_array) -> FiledLight:
+        """Light in ``parts``; of ``deposits`` in so many ``samples`` it is told what is received, and what lost."""
         rows = next(iter(parts.values())).shape[0]
-        sizes = {name: getattr(self, name).bundle.size for name in ("fine", "coarse", "smooth")}
-        return FiledLight(**{name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()})
+        sizes = {name: getattr(self, name).bundle.size for name in TRAYS}
+        filed = {name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()}
+        if deposits is None:
+            return FiledLight(**filed)
+        received, outside = float(deposits.value.sum()), self.fine.bundle.outside(deposits)
+        return FiledLight(**filed, received=received / samples, outside=outside / samples)
 
     def tracers(self) -> dict[str, Stage]:
         """What is traced: samples a group is predicted to need, and how the light is filed, by name."""
@@ -257,6 +314,8 @@ class Simulation:
         stages = {"direct": Stage(self.direct, settings.direct_samples, self.file_direct, "direct")}
         if self.anchored is not None:
             stages["anchored"] = Stage(self.anchored, settings.anchored_samples, self.file_anchored, "anchored")
+        if self.apart is not None:
+            stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp")
         if self.indirect is not None:
             stages["indirect"] = Stage(self.indirect, settings.indirect_samples, self.file_followed, "indirect")
         if self.from_camera is not None:
@@ -268,8 +327,10 @@ class Simulation:
     def flux(self, deposits: Deposits, samples: int) -> FloatArray:
         """(n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask.
 
-        ``deposits`` are those of :attr:`direct` in so many ``samples``.
+        ``deposits`` are those of :attr:`direct` or :attr:`apart` in so many ``samples``.
         """
+        if self.settings.sharp and len(deposits.pixel) and deposits.anchor_row.any():
+            deposits = deposits.averaged(self.sharp_weights)
         value = deposits.value * (deposits.kind == DIRECT) / samples
         return np.asarray(np.bincount(deposits.pixel, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
@@ -302,6 +363,8 @@ class Simulation:
         lights, ambient = [Filed(self.fine.optics, tuple(group.fine[:first] for group in groups))], []
         if self.settings.anchors > 1:
             lights.append(Filed(self.coarse.optics, tuple(group.coarse[:first] for group in groups)))
+        if self.settings.sharp:
+            lights.append(Filed(self.sharp.optics, tuple(group.sharp[:first] for group in groups)))
         if self.physics.interreflection:
             lights.append(Filed(self.smooth.optics, tuple(group.smooth[:first] for group in groups)))
         if self.physics.lamps:

@@ -18,6 +18,8 @@ LOCK = ".mitsim.lock"
 """Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock."""
 _LONGEST_HEAD = 1 << 20
 """An unfinished manifest is a few kB; what is larger is not looked into."""
+_NO_SHOTS = {"truth.exr", "ambient.exr"}
+"""Images of a run that are none of its shots."""
 
 
 @contextmanager
@@ -143,7 +145,7 @@ def _unfinished(folder: Path) -> str:
         return ""
     if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
         return ""
-    frames = len(list(folder.glob("frame_*.exr")))
+    frames = len({path.name for path in folder.glob("*.exr")} - _NO_SHOTS)
     return f": an unfinished {manifest.get('kind')} with {frames} finished frames; go on with resume=True"
 
 

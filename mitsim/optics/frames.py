@@ -35,6 +35,12 @@ PROBES = 8
 """Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`_probes`."""
 _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+_NORMAL = 1.645
+"""Standard deviations above which a normal deviate is in 5 % of cases."""
+_HELD = 8
+"""Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
+_MOST_COLUMNS = 2**22
+"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all."""
 _shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 
@@ -55,12 +61,15 @@ class Frame:
     heaviest
         largest part of the variance that one group of the light brings: with one heavy path among G groups,
         (G - 1) / G.
+    by_group
+        (G,) parts of the variance that each group of the light brings.
     """
 
     irradiance: FloatArray
     variance: float
     removed: float
     heaviest: float
+    by_group: tuple[float, ...] = ()
 
 
 class FrameOptics:
@@ -95,9 +104,10 @@ class FrameOptics:
         self.cells = (len(rows.centres), len(columns.centres))
         self.shape = (anchors * self.cells[0], anchors * self.cells[1])
         # Stored with the light's index first, so that picking lit rows copies contiguous memory.
+        stack = _Stack if anchors > _HELD else _stack
         self._layers = [
             [
-                (_stack(left, weights), _stack(right, weights))
+                (stack(left, weights), stack(right, weights))
                 for left, right in _shadow(geometry, rows, columns, depth, spectrum)
             ]
             for depth in depths
@@ -330,7 +340,8 @@ class ExpectedFrames:
             heaviest = float(squared.max()) / spread if spread else 0.0
             seen = np.maximum(frame, 0)
             total = float(seen.sum())
-            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest)
+            by_group = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
+            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, by_group)
 
 
 def _mean_of(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
@@ -341,7 +352,7 @@ def _formed(lights: Sequence[Filed], basis: sparse.csr_array, seed: int) -> tupl
     """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and deviations of the groups as signs see them."""
     pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
     probes = _probes(pixels, seed)
-    mixed = [(light.optics, [basis @ group for group in light.groups]) for light in lights]
+    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     means = [_mean_of(parts) for _, parts in mixed]
     frames = np.zeros((basis.shape[0], pixels, pixels))
     deviations = np.zeros((basis.shape[0], pixels * groups * probes.shape[1] if groups > 1 else 1))
@@ -359,12 +370,23 @@ def _formed(lights: Sequence[Filed], basis: sparse.csr_array, seed: int) -> tupl
     return frames, deviations
 
 
+def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_array:
+    """``basis @ light``."""
+    if light.shape[1] <= _MOST_COLUMNS:
+        return basis @ light
+    places, indices = np.unique(light.indices, return_inverse=True)
+    lit = sparse.csr_array((light.data, indices, light.indptr), shape=(light.shape[0], max(len(places), 1)))
+    product = (basis @ lit).tocsr()
+    wide = places[product.indices] if len(places) else product.indices
+    return sparse.csr_array((product.data, wide, product.indptr), shape=(basis.shape[0], light.shape[1]))
+
+
 def _seen(lights: Sequence[Filed], basis: sparse.csr_array, columns: IntArray) -> FloatArray:
     """(groups, b, pixels, c) frames of mixtures ``basis`` (b, rows) of each group's light, at c ``columns``."""
     pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
     chosen = np.zeros((pixels, len(columns)))
     chosen[columns, np.arange(len(columns))] = 1
-    mixed = [(light.optics, [basis @ group for group in light.groups]) for light in lights]
+    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     frames = np.zeros((groups, basis.shape[0], pixels, len(columns)))
 
     def form(row: int) -> None:
@@ -409,6 +431,29 @@ def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
     return float(np.sqrt(variance / energy)) if energy > 0 else 0.0
 
 
+def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
+    """What the Monte Carlo error of all ``frames`` is below, at 95 %; see :func:`bound_of`."""
+    parts, energy = np.zeros(1), 0.0
+    for frame in frames:
+        parts = parts + np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
+        energy += float(np.square(frame.irradiance).sum())
+    return bound_of(parts, energy)
+
+
+def bound_of(parts: FloatArray, energy: float) -> float:
+    """What a relative Monte Carlo error is below, at 95 %, from its square's ``parts`` by group and frames' ``energy``.
+
+    The error that was made is one draw, and its estimate another. Where few paths make the noise, groups of the light
+    differ much in the energy of theirs, and so would other draws: with v the relative variance of that energy among G
+    groups, the squared error is below 1 + 1.645 sqrt(v G / (G - 1)) times its estimate.
+    """
+    if not energy or not parts.sum():
+        return 0.0
+    count = len(parts)
+    spread = float(parts.var(ddof=1)) / float(parts.mean()) ** 2 * count / (count - 1) if count > 1 else 0.0
+    return float(np.sqrt(parts.sum() / energy * (1 + _NORMAL * np.sqrt(spread))))
+
+
 def _row(matrix: sparse.csr_array, row: int) -> tuple[IntArray, FloatArray]:
     inside = slice(matrix.indptr[row], matrix.indptr[row + 1])
     return matrix.indices[inside].astype(np.int64), matrix.data[inside]
@@ -421,6 +466,17 @@ def _aligned(flat: IntArray, parts: Sequence[tuple[IntArray, FloatArray]]) -> Fl
     for line, (places, light) in zip(values, parts, strict=True):
         line[order[np.searchsorted(flat[order], places)]] = light
     return values
+
+
+class _Stack:
+    """The same as :func:`_stack`, whose rows are made when they are asked for."""
+
+    def __init__(self, factor: FloatArray, weights: FloatArray) -> None:
+        self._factor, self._weights = np.ascontiguousarray(factor.T), np.ascontiguousarray(weights.T)
+
+    def __getitem__(self, rows: IntArray) -> FloatArray:
+        anchor, cell = np.divmod(rows, len(self._factor))
+        return np.asarray(self._weights[anchor] * self._factor[cell])
 
 
 def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:

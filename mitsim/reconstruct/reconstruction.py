@@ -24,7 +24,7 @@ from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import Misfit, judge
-from mitsim.reconstruct.noise import FrameNoise, factor_energy
+from mitsim.reconstruct.noise import FrameNoise, factor_energy, print_energy
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.tv import solve_tv
@@ -34,8 +34,8 @@ METHODS = ("tikhonov", "tv")
 IMAGE_FILE, UNCERTAINTY_FILE, RESULT_FILE = "image.exr", "uncertainty.exr", "result.json"
 _BYTES_A_NUMBER = 32.0
 """Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
-_KEPT_NUMBERS = 1 << 25
-"""Pixels of all measurements up to which they are kept for a second look: 128 of 512 x 512, at most 512 MiB."""
+_KEPT_NUMBERS = 1 << 24
+"""Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +255,7 @@ class Accumulated:
             self.kept or shots.measured(),
             self.noise,
             factor_energy(self.prepared, shots.patterns, stated, image) if stated else None,
+            print_energy(self.prepared, factors.sides, shots.patterns, image),
             Evidence(factors, shots.patterns),
         )
 

@@ -31,6 +31,12 @@ class CellAxis:
         """Which of the tan-angles ``tau`` lie in one of the cells."""
         return np.asarray((tau >= self.start) & (tau < self.start + self.count * self.size))
 
+    def part(self, first: float, last: float) -> CellAxis:
+        """The cells from tan-angle ``first`` to ``last``, and one more on each side where there is one."""
+        low = max(int(self.cell(np.array(first))) - 1, 0)
+        high = min(int(self.cell(np.array(last))) + 1, self.count - 1)
+        return CellAxis(self.start + low * self.size, self.size, high - low + 1)
+
     def cell(self, tau: FloatArray) -> npt.NDArray[np.int64]:
         """The cell of each tan-angle ``tau``; outside of all, the nearest."""
         return np.clip(np.floor((tau - self.start) / self.size).astype(np.int64), 0, self.count - 1)

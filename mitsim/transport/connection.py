@@ -50,7 +50,16 @@ class ProjectorConnector:
             self._to_world = self.emitter.world_transform()
             self._pixel_at_unit = projector.pixel_size()
 
-    def connect(self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool) -> Connection:
+    def lens_point(self, rng: mi.PCG32) -> mi.Point3f:
+        """A point of the lens in the projector's frame, drawn by ``rng``; the pinhole where there is none."""
+        if self.projector.aperture == 0:
+            return mi.Point3f(0)
+        disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        return mi.Point3f(disk.x, disk.y, 0) * dr.opaque(mi.Float, self.projector.aperture)
+
+    def connect(
+        self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool, lens: mi.Point3f | None = None
+    ) -> Connection:
         """Connect surface points to the projector; visibility is the caller's.
 
         Parameters
@@ -61,15 +70,14 @@ class ProjectorConnector:
             random numbers for lens and spot, if there are any.
         active
             lanes that count.
+        lens
+            points of the lens; None: random ones.
         """
         if self.projector.ideal:
             ds, weight = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
             return Connection(ds.d, ds.p, weight, mi.Float(0), self.projector.pixel_at(ds.uv), active & (ds.pdf > 0))
         local = self._to_world.inverse() @ si.p
-        lens = mi.Point3f(0)
-        if self.projector.aperture > 0:
-            disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
-            lens = mi.Point3f(disk.x, disk.y, 0) * dr.opaque(mi.Float, self.projector.aperture)
+        lens = self.lens_point(rng) if lens is None else lens
         offset = local - lens
         pixel, strength, valid = self._seen(lens, offset, rng, active & (local.z > 0))
         distance = dr.norm(offset)
@@ -80,7 +88,9 @@ class ProjectorConnector:
         pdf = dr.square(distance) / (cosine * self._area) if self.projector.aperture > 0 else mi.Float(0)
         return Connection(dr.normalize(target - si.p), target, weight, pdf, pixel, valid)
 
-    def hit(self, ray: mi.Ray3f, reach: mi.Float, rng: mi.PCG32, active: mi.Bool) -> LensHit:
+    def hit(
+        self, ray: mi.Ray3f, reach: mi.Float, rng: mi.PCG32, active: mi.Bool, since: mi.Float | float = 0.0
+    ) -> LensHit:
         """Rays of random directions that meet the lens; needs a finite aperture.
 
         Parameters
@@ -93,6 +103,8 @@ class ProjectorConnector:
             random numbers for the spot, if it is blurred.
         active
             lanes that count.
+        since
+            distance [mm] from the surface that the direction was drawn at to where the ray starts.
         """
         inverse = self._to_world.inverse()
         origin, direction = inverse @ ray.o, inverse @ ray.d
@@ -104,7 +116,7 @@ class ProjectorConnector:
         pixel, strength, met = self._seen(lens, -direction, rng, met)
         cosine = -direction.z
         radiance = strength / (self._area * dr.square(dr.square(cosine)))
-        return LensHit(radiance, dr.square(distance) / (cosine * self._area), pixel, met)
+        return LensHit(radiance, dr.square(distance + since) / (cosine * self._area), pixel, met)
 
     @property
     def _area(self) -> mi.Float:

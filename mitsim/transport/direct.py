@@ -65,17 +65,17 @@ class DirectTracer(Tracer):
         return len(self._pixels) * self.anchors**2
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        count = dr.opaque(mi.UInt32, len(self._pixels))
-        pixel, anchor = dr.gather(mi.UInt32, mi.UInt32(self._pixels), lane % count), lane // count
+        number, anchor, share = self._pair(seed, sample, lane)
+        pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         anchors = dr.opaque(mi.UInt32, self.anchors)
         row, column = anchor // anchors, anchor % anchors
         # Streams belong to pixels: every anchor is connected to the same points.
         shared, rng = streams(seed, pixel, sample)
-        jitter = stratified(sample, shared)
+        jitter, weight = self._place(number, row, column, stratified(sample, shared))
         wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         sensor = self._random_point(sample, shared, rng) if self.spread else self._anchor(row, column)
-        flux = self.rays.flux(pixel, wavelengths) * spectral
+        flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
         if self.receiver.passage.open:
             seen = self._passing(ray, sensor, flux, pixel, rng)
         else:
@@ -83,6 +83,19 @@ class DirectTracer(Tracer):
             reception = self.receiver.receive(si, -ray.d, sensor, si.is_valid())
             seen = reception.sightings(panchromatic(reception.irradiance * flux), pixel)
         return [Deposits.fetched(seen, DIRECT, (row, column))]
+
+    def _pair(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+        """A lane's place in the list of pixels, its anchor, and its weight."""
+        del seed, sample
+        count = dr.opaque(mi.UInt32, len(self._pixels))
+        return lane % count, lane // count, mi.Float(1)
+
+    def _place(
+        self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
+    ) -> tuple[mi.Point2f, mi.Float]:
+        """Where in its pixel a ray starts, by the pixel's place in the list and the anchor, and the ray's weight."""
+        del number, row, column
+        return jitter, mi.Float(1)
 
     def _passing(
         self, ray: mi.Ray3f, sensor: mi.Point3f, flux: mi.Spectrum, pixel: mi.UInt32, rng: mi.PCG32
@@ -95,12 +108,12 @@ class DirectTracer(Tracer):
         ) -> tuple[object, ...]:
             si = self.scene.ray_intersect(ray, active)
             active &= si.is_valid()
-            part = passage.straight(si, active)
-            onward = passage.onward(si, ray.d)
+            passed = passage.through(si, ray.d, active)
+            onward = passage.onward(si, passed.direction)
             reception = self.receiver.receive(si, -ray.d, sensor, active)
             light = panchromatic(reception.irradiance * flux)
             seen = seen.joined_by(reception.sightings(light, pixel), rng)
-            flux = flux * part
+            flux = flux * passed.part
             return active & (dr.max(flux) > 0), onward, flux, seen, rng
 
         state = mi.Bool(True), ray, flux, Sightings.none(), rng

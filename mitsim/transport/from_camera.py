@@ -26,9 +26,10 @@ import mitsuba as mi
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.cells import CellAxis, CellGrid
-from mitsim.transport.connection import ProjectorConnector
+from mitsim.transport.connection import Connection, ProjectorConnector
 from mitsim.transport.coordinates import x_y
 from mitsim.transport.histogram import Deposits, Sightings
+from mitsim.transport.panes import refracted_way
 from mitsim.transport.passage import Passage
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics
@@ -96,7 +97,7 @@ class _Walk(Walk):
 
     STATE = (
         *("active", "ray", "strength", "part", "bounce", "surfaces", "in_mirror", "mirrored", "by_delta", "travelled"),
-        *("straight", "rng", "inverse_depth", "came_from", "came_pdf", "kept"),
+        *("straight", "since", "behind_glass", "rng", "inverse_depth", "came_from", "came_pdf", "kept"),
     )
 
     def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, cell: mi.UInt32) -> None:
@@ -110,6 +111,7 @@ class _Walk(Walk):
         self.travelled, self.bounce, self.surfaces = mi.Float(0), mi.UInt32(0), mi.UInt32(1)
         self.by_delta, self.mirrored, self.in_mirror = mi.Bool(True), mi.Bool(True), mi.Bool(False)
         self.came_from, self.came_pdf = dr.zeros(mi.Point3f), mi.Float(0)
+        self.since, self.behind_glass = mi.Float(0), mi.Bool(False)
         self._aim(cell, jitter)
 
     # ---- the camera's side ------------------------------------------------------------------------------------------
@@ -163,9 +165,8 @@ class _Walk(Walk):
     def _connect(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
         """Light of the projector that this vertex sends on along its path."""
         # A vertex that is seen straight is the projector's side's.
-        connection = self.connector.connect(si, self.rng, self.active & ~self.straight)
-        seen, passed = self.passage.between(si, connection.target, connection.valid)
-        active = connection.valid & seen
+        connection, passed = self._connection(si, self.active & ~self.straight)
+        active = connection.valid
         toward = si.to_local(connection.direction)
         if self.tracer.projector.aperture > 0 and self.paths.interreflection:
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, toward, active)
@@ -175,6 +176,23 @@ class _Walk(Walk):
         self._keep_of_projector(
             active, self._radiance(value * connection.weight * passed), connection.pixel, self.surfaces
         )
+
+    def _connection(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
+        """A connection to the projector that nothing blocks, and the part of its light that arrives."""
+        if not self.passage.panes:
+            connection = self.connector.connect(si, self.rng, active)
+            seen, passed = self.passage.between(si, connection.target, connection.valid)
+            connection.valid = connection.valid & seen
+            return connection, passed
+        lens = self.connector.lens_point(self.rng)
+        way = refracted_way(self.passage, si, self.connector.projector.emitter.world_transform() @ lens, active)
+        apparent = mi.SurfaceInteraction3f(si)
+        apparent.p = way.apparent
+        connection = self.connector.connect(apparent, self.rng, active & way.open, lens)
+        # As a path that runs into the lens counts it: by the way's length.
+        connection.pdf *= dr.square(way.length) / dr.squared_norm(connection.target - way.apparent)
+        connection.direction = way.direction
+        return connection, way.part / dr.square(way.eta)
 
     def _light(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, emitter: mi.Emitter) -> None:
         """The same for another light of the scene."""
@@ -195,8 +213,9 @@ class _Walk(Walk):
         before.p = self.came_from
         lamp = self.active & (emitter != None)  # noqa: E711 - a Dr.Jit comparison, lane by lane
         ds = mi.DirectionSample3f(self.scene, si, before)
-        pdf = emitter.pdf_direction(before, ds, lamp & ~self.by_delta)
-        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, pdf))
+        unconnected = self.by_delta | self.behind_glass
+        pdf = emitter.pdf_direction(before, ds, lamp & ~unconnected)
+        share = dr.select(unconnected, 1, self._share(self.came_pdf, pdf))
         self._keep_seen("ambient", lamp, self._radiance(emitter.eval(si, lamp)) * share, self._lamps())
 
     def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
@@ -206,14 +225,15 @@ class _Walk(Walk):
         seen in a mirror, it is the projector's side's.
         """
         active = self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
-        hit = self.connector.hit(self.ray, si.t, self.rng, active)
+        hit = self.connector.hit(self.ray, si.t, self.rng, active, self.since)
         share = dr.select(self.by_delta, 1, self._share(self.came_pdf, hit.pdf))
         self._keep_of_projector(hit.met, self._radiance(hit.radiance) * share, hit.pixel, self.surfaces - 1)
 
     def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""
         sample, value, going = self._sampled(si, mi.TransportMode.Radiance)
-        delta, passing = is_delta(sample), self.passage.passes(sample)
+        passing = self.passage.passes(si, sample)
+        delta = is_delta(sample) & ~passing
         if first or self.passage.open:
             turned = self.straight & ~passing
             self.in_mirror = dr.select(turned, delta, self.in_mirror)
@@ -226,6 +246,8 @@ class _Walk(Walk):
         self.mirrored &= delta | passing
         self.surfaces = dr.select(delta | passing, self.surfaces, self.surfaces + 1)
         self.travelled += si.t
+        self.since = dr.select(passing, self.since + si.t, 0)
+        self.behind_glass = passing & (self.behind_glass | is_delta(sample))
         self.came_from = dr.select(passing, self.came_from, si.p)
         self.came_pdf = dr.select(passing, self.came_pdf, sample.pdf)
         self.by_delta = dr.select(passing, self.by_delta, delta)

@@ -20,11 +20,13 @@ from scipy import sparse
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import Directions
-from mitsim.transport.cells import CellGrid
+from mitsim.transport.cells import CellAxis, CellGrid
 
 IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
 """Kinds of light: of lamps, of the projector over one surface that is no mirror, and over several."""
+_COUNTED = 2**26
+"""Places that light is counted in; more of them are sorted."""
 
 
 @dataclass
@@ -149,21 +151,39 @@ class Deposits:
 
 @dataclass(frozen=True)
 class Bundle:
-    """How light is filed: cells, anchors a side, layers as depths [mm] (far to near)."""
+    """How light is filed.
+
+    Attributes
+    ----------
+    grid
+        cells.
+    anchors
+        a side.
+    depths
+        of the layers [mm], far to near.
+    between
+        whether light is split between the two nearest cell centres along each axis, and taken to come from there. Light
+        that an anchor sees over a sharp lobe comes from a small part of a cell, and where that lies counts.
+    """
 
     grid: CellGrid
     anchors: int
     depths: tuple[float, ...]
+    between: bool = False
 
     @property
     def rows(self) -> Directions:
         """Directions of the cells' rows, for the mask's shadow."""
-        return Directions.cells(self.grid.rows.edges)
+        return self._directions(self.grid.rows)
 
     @property
     def columns(self) -> Directions:
         """Directions of the cells' columns."""
-        return Directions.cells(self.grid.columns.edges)
+        return self._directions(self.grid.columns)
+
+    def _directions(self, axis: CellAxis) -> Directions:
+        cells = Directions.cells(axis.edges)
+        return Directions(cells.centres, 0.0) if self.between else cells
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -194,17 +214,23 @@ class Bundle:
         plane = self.anchors * self.cells[0] * width
         count = int(labels.max()) + 1
         row = np.append(labels, count)[deposits.pixel]
-        line = deposits.anchor_row * self.cells[0] + self.grid.rows.cell(deposits.row)
-        place = line * width + deposits.anchor_column * self.cells[1] + self.grid.columns.cell(deposits.column)
-        layers = self._layers(deposits.inverse_depth)
-        values = np.concatenate([deposits.value * (share / samples) for _, share in layers])
-        flat = np.concatenate([layer * plane + place for layer, _ in layers])
+        parts = [
+            (layer * plane + (first + line) * width + second + place, share * line_share * place_share)
+            for first, second in [(deposits.anchor_row * self.cells[0], deposits.anchor_column * self.cells[1])]
+            for line, line_share in self._cells(self.grid.rows, deposits.row)
+            for place, place_share in self._cells(self.grid.columns, deposits.column)
+            for layer, share in self._layers(deposits.inverse_depth)
+        ]
+        values = np.concatenate([deposits.value * (share / samples) for _, share in parts])
+        flat = np.concatenate([place for place, _ in parts])
         shape = (count + 1, self.size)
         # 32-bit indices sort twice as fast.
         index = np.int32 if max(shape) < 2**31 else np.int64
-        entries = values, (np.tile(row, len(layers)).astype(index), flat.astype(index))
-        # By way of columns, for two passes of counting take half the time of sorting.
-        light = sparse.coo_array(entries, shape=shape).tocsc().tocsr()
+        entries = values, (np.tile(row, len(parts)).astype(index), flat.astype(index))
+        light = sparse.coo_array(entries, shape=shape)
+        # By way of columns, for two passes of counting take half the time of sorting; but a count takes a word a place.
+        light = light.tocsc().tocsr() if self.size < _COUNTED else light.tocsr()
+        light.sum_duplicates()
         light.eliminate_zeros()
         return light
 
@@ -228,6 +254,15 @@ class Bundle:
         copies = self.anchors**2
         copied = np.tile(entries.data, copies), (np.tile(entries.row, copies), np.concatenate(places))
         return sparse.coo_array(copied, shape=(light.shape[0], self.size)).tocsr()
+
+    def _cells(self, axis: CellAxis, tau: FloatArray) -> list[tuple[IntArray, FloatArray]]:
+        """Cells along an axis that share the light, each with its part."""
+        if not self.between or axis.count == 1:
+            return [(axis.cell(tau), np.ones(1))]
+        position = np.clip((tau - axis.start) / axis.size - 0.5, 0, axis.count - 1)
+        first = np.minimum(position.astype(np.int64), axis.count - 2)
+        beyond = position - first
+        return [(first, 1 - beyond), (first + 1, beyond)]
 
     def _layers(self, inverse_depth: FloatArray) -> list[tuple[IntArray, FloatArray]]:
         """Pairs of layers that share the light, each with its part; beyond the first or the last all goes to it."""

@@ -99,7 +99,8 @@ class _Walk(Walk):
         toward = -self.ray.d
         si.wi = si.to_local(toward)
         sample, value, going = self._sampled(si, mi.TransportMode.Importance, self.first_turn if first else None)
-        delta, passing = is_delta(sample), self.passage.passes(sample)
+        passing = self.passage.passes(si, sample)
+        delta = is_delta(sample) & ~passing
         onward = si.to_world(sample.wo)
         # Light that is followed forward sees shading normals the other way round (Veach 1997, 5.3).
         turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)

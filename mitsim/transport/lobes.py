@@ -10,6 +10,7 @@ a connection by x I. So N connections see the light L of the lobes as ``N L^2 / 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -29,18 +30,37 @@ _SHARP = 100.0
 
 Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
 """
+_SHARPEST = 0.1
+"""Part of the light over sharper lobes than the width that is reported: the peak of a GGX lobe is met that often."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SharpLight:
-    """Light over sharp lobes, mean over the sensor without its mask [W m^-2], and its Monte Carlo ``error``.
+    """Light over sharp lobes, without the mask.
 
-    ``hits``: of one connection of every projector pixel, those that would meet a lobe, as far as noise goes.
+    Attributes
+    ----------
+    irradiance, error
+        mean over the sensor [W m^-2], and its Monte Carlo error.
+    hits
+        of one connection of every projector pixel, those that would meet a lobe, as far as noise goes.
+    by_pixel, moments
+        (n^2,) ``irradiance`` of each projector pixel, and the second moment of its connection [W^2 m^-4].
+    width
+        radius of the lobes on the sensor [mm], 1 / sqrt(pi q) of all but the sharpest tenth of the light.
     """
 
     irradiance: float
     error: float
     hits: float
+    by_pixel: FloatArray
+    moments: FloatArray
+    width: float
+
+    @classmethod
+    def none(cls, pixels: int) -> SharpLight:
+        """Of a projector of so many ``pixels`` that lights no sharp lobe."""
+        return cls(0.0, 0.0, math.inf, np.zeros(pixels), np.zeros(pixels), math.inf)
 
 
 def sharp_light(
@@ -64,16 +84,30 @@ def sharp_light(
     """
     lanes = projector.n**2
     lobes = _Lobes(scene, camera, projector, geometry)
-    total = squares = moment = 0.0
+    squares, widths, weights = 0.0, [], []
+    by_pixel, moments = np.zeros(lanes), np.zeros(lanes)
     for sample, pixel in launches(lanes, 0, samples):
-        mean, connected = lobes.meet(seed, sample, pixel)
+        mean, connected, density = lobes.meet(seed, sample, pixel)
         check_finite(mean)
         check_finite(connected)
-        total += float(mean.sum())
+        number = np.array(pixel)
+        by_pixel += np.bincount(number, mean, minlength=lanes) / samples
+        moments += np.bincount(number, mean * connected, minlength=lanes) / samples
         squares += float(np.square(mean).sum())
-        moment += float((mean * connected).sum())
-    error = np.sqrt(max(squares - total**2 / (lanes * samples), 0.0)) / samples
-    return SharpLight(total / samples, float(error), total**2 / samples / moment if moment else 0.0)
+        widths.append(1 / np.sqrt(np.pi * density[mean > 0]))
+        weights.append(mean[mean > 0])
+    total, moment = float(by_pixel.sum()), float(moments.sum())
+    error = np.sqrt(max(squares / samples - total**2 / lanes, 0.0) / samples)
+    hits = total**2 / moment if moment else 0.0
+    width = _quantile(np.concatenate(widths), np.concatenate(weights), _SHARPEST)
+    return SharpLight(total, float(error), hits, by_pixel, moments, width)
+
+
+def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
+    """Value below which ``part`` of the ``weights`` lie; inf for none."""
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(sums, part * sums[-1])]) if values.size else math.inf
 
 
 class _Lobes:
@@ -85,8 +119,8 @@ class _Lobes:
         self.scene, self.camera, self.geometry = scene, camera, geometry
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
 
-    def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> tuple[FloatArray, FloatArray]:
-        """Two (lanes,) arrays: estimates x of the mean irradiance, and light I of a connection to the point met."""
+    def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Estimates x of the mean irradiance, light I of a connection to the point met, density q there; (lanes,)."""
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         wavelengths, spectral = sampled_wavelengths(self.camera, rng)
@@ -111,5 +145,6 @@ class _Lobes:
         per_area = density * -onward.z / dr.square(reach)
         mean = dr.select(active, light / (4 * dr.square(half) * per_area), 0)
         light = dr.select(active, light, 0)
-        dr.eval(mean, light)
-        return np.array(mean, dtype=np.float64), np.array(light, dtype=np.float64)
+        dr.eval(mean, light, per_area)
+        fetched = (np.array(values, dtype=np.float64) for values in (mean, light, per_area))
+        return next(fetched), next(fetched), next(fetched)

@@ -1,15 +1,20 @@
-"""Light that goes straight on through surfaces: from two points of a scene to the part of the light between them.
+"""Light that passes surfaces: from two points of a scene to the way between them and the part of the light it keeps.
 
 The hole of a cut-out (``mask``), a thin pane (``thindielectric``), a filter: their *null lobe* lets a part of the light
-pass as if nothing were there. No direction that is drawn at random tells such light from that of free space, so it is
-what it would be without the surface, weaker: direct light stays direct, and a lamp is looked for behind a hole as
+go straight on as if nothing were there. Flat glass bends it, but to one way between two points only
+(:mod:`mitsim.transport.panes`). No direction that is drawn at random tells such light from that of free space, so it is
+what it would be without the surface, weaker: direct light stays direct, and a light is looked for behind a hole as
 before it. Scenes without such surfaces keep a plain test of visibility.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
+
+from mitsim.transport.panes import flat_panes
 
 _OFFSET = 9e-5
 """How far a ray starts beyond a surface that it has passed, for each mm of its coordinates: Mitsuba's ray epsilon."""
@@ -17,22 +22,33 @@ _GRAZING = 0.02
 """Least cosine that this distance is divided by, so that a grazing ray does not skip centimetres."""
 
 
+@dataclass
+class Passed:
+    """Light beyond a surface: where it goes on, the part left, and the refractive index there over that before."""
+
+    direction: mi.Vector3f
+    part: mi.Spectrum
+    eta: mi.Float
+
+
 class Passage:
-    """What light passes in a scene; prepared once.
+    """What light passes in a ``scene``; prepared once.
 
     Attributes
     ----------
     scene
         as loaded.
+    panes
+        shapes of flat glass.
     open
         whether there is a surface that light may pass. An instance hides its materials, and may have such.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        self.scene = scene
+        self.scene, self.panes = scene, flat_panes(scene)
         materials = [shape.bsdf() for shape in scene.shapes()]
         self.open = any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in materials)
-        self.open |= any(shape.class_name() == "Instance" for shape in scene.shapes())
+        self.open |= any(shape.class_name() == "Instance" for shape in scene.shapes()) or bool(self.panes)
 
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
         """Whether points see each other, and the part of the light that what lies between them lets through.
@@ -65,16 +81,55 @@ class Passage:
 
     @staticmethod
     def straight(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """Part of the light that a surface lets straight on."""
+        """Part of the light that the surface at ``si`` lets straight on, where ``active``."""
         return mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, active))
 
-    def passes(self, sample: mi.BSDFSample3f) -> mi.Bool:
-        """Whether the direction of a ``sample`` is that of light which passes."""
-        return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null) if self.open else mi.Bool(False)
+    def through(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Passed:
+        """What light does that comes to surfaces and passes them.
+
+        Parameters
+        ----------
+        si
+            points of the surfaces, met by a ray of that direction.
+        direction
+            unit, of the light.
+        active
+            lanes that count.
+        """
+        passed = Passed(mi.Vector3f(direction), self.straight(si, active), mi.Float(1))
+        if self.panes:
+            context = mi.BSDFContext(mi.TransportMode.Importance)
+            context.type_mask = int(mi.BSDFFlags.DeltaTransmission)
+            glass = active & self.is_pane(si)
+            sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), glass)
+            bent = glass & (sample.pdf > 0)
+            passed.direction = dr.select(bent, si.to_world(sample.wo), passed.direction)
+            passed.part = dr.select(bent, mi.unpolarized_spectrum(weight), passed.part)
+            passed.eta = dr.select(bent, sample.eta, passed.eta)
+        return passed
+
+    def is_pane(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Whether the surface at ``si`` is flat glass."""
+        found = mi.Bool(False)
+        for pane in self.panes:
+            found |= si.shape == pane
+        return found
+
+    def passes(self, si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f) -> mi.Bool:
+        """Whether the direction of a ``sample`` at ``si`` is that of light which passes."""
+        if not self.open:
+            return mi.Bool(False)
+        bent = self.is_pane(si) & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaTransmission)
+        return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null) | bent
+
+    @staticmethod
+    def clear(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
+        """How far a ray that leaves the surface at ``si`` in a ``direction`` starts from it [mm]."""
+        slope = dr.maximum(dr.abs(dr.dot(si.n, direction)), _GRAZING)
+        return _OFFSET * (1 + dr.max(dr.abs(si.p))) / slope
 
     @staticmethod
     def onward(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
         """A ray that starts beyond the surface at ``si`` in a ``direction``, on the line through the point itself."""
-        slope = dr.maximum(dr.abs(dr.dot(si.n, direction)), _GRAZING)
-        clear = _OFFSET * (1 + dr.max(dr.abs(si.p))) / slope
+        clear = Passage.clear(si, direction)
         return mi.Ray3f(si.p + direction * clear, direction, si.time, si.wavelengths)

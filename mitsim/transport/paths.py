@@ -148,9 +148,9 @@ class Walk(ABC):
         sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, self.active)
         going = self.active & (sample.pdf > 0)
         if not self.interreflection:
-            going &= (is_delta(sample) & self.mirrors) | self.passage.passes(sample)
+            going &= (is_delta(sample) & self.mirrors) | self.passage.passes(si, sample)
         elif not self.mirrors:
-            going &= ~is_delta(sample)
+            going &= ~is_delta(sample) | self.passage.passes(si, sample)
         return sample, mi.unpolarized_spectrum(value), going
 
     def _end_some(self, going: mi.Bool, mirrored: mi.Bool, passing: mi.Bool, first: bool) -> None:

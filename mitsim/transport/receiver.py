@@ -7,7 +7,8 @@ A surface point P that receives the flux phi irradiates the sensor point with::
 f is the BSDF, cos_s and cos_g the arriving light's cosines to the shading and the geometric normal at P, cos_P and
 cos_a those of the connection at P and at the sensor, and r(t) the pixel's angular response. Without a lens, every
 surface point that is not in the shadow of another sees the sensor: light can be followed from the projector's side,
-where every path counts for a pixel that is known from the start.
+where every path counts for a pixel that is known from the start. Behind flat glass r and cos_a are those of the point
+that the sensor seems to see (:mod:`mitsim.transport.panes`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import mitsuba as mi
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.coordinates import rows_columns
 from mitsim.transport.histogram import Sightings
+from mitsim.transport.panes import refracted_way
 from mitsim.transport.passage import Passage
 
 
@@ -76,15 +78,23 @@ class Receiver:
         to_world = self.camera.world_transform()
         point = to_world.inverse() @ si.p
         sensor = to_world @ local
-        offset = sensor - si.p
+        apparent, way = si.p, None
+        if self.passage.panes:
+            way = refracted_way(self.passage, si, sensor, active)
+            apparent, active = way.apparent, active & way.open
+            point = to_world.inverse() @ apparent
+        offset = sensor - apparent
         squared = dr.squared_norm(offset)
-        direction = offset * dr.rsqrt(squared)
+        direction = offset * dr.rsqrt(squared) if way is None else way.direction
         t = mi.Vector2f(point.x - local.x, point.y - local.y) / point.z
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
         active = active & (point.z > dr.opaque(mi.Float, self.geometry.mask_distance))
         active &= (dr.abs(t.x) <= stop) & (dr.abs(t.y) <= stop)
-        seen, passed = self.passage.between(si, sensor, active)
-        active &= seen
+        if way is None:
+            seen, passed = self.passage.between(si, sensor, active)
+            active &= seen
+        else:
+            passed = way.part
         si.wi = si.to_local(direction)
         reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), active)
         cosine = dr.rsqrt(1 + dr.squared_norm(t))

@@ -15,6 +15,7 @@ from mitsim.capture.evidence import LOOKS, Changes, Evidence, Forming, Part, Set
 from mitsim.capture.pilot.direct import AnchoredLight, FineLight
 from mitsim.capture.pilot.looks import Sample
 from mitsim.capture.pilot.reach import light_reach
+from mitsim.capture.pilot.sharp import sharp_pixels
 from mitsim.capture.pilot.switched import SwitchedEffects
 from mitsim.capture.prices import FIXED, Numbers, forming_seconds
 from mitsim.capture.simulation import Simulation
@@ -76,7 +77,9 @@ class Look:
         depth, self._light = _depth(first, seed, self._sharp)
         seen = Simulation(bench, Settings(depth=depth, effects=first_look))
         reach = light_reach(seen, integer(seed, "pilot", "reach"))
-        self._base = Settings(depth=depth, effects=first_look, reach=reach)
+        own = integer(seed, "pilot", "sharp")
+        apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
+        self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
         self.samples = dict.fromkeys(STAGES, Sample.of(lighting, bench.geometry.pixels))
         for stage in STAGES:
             self._measure(stage)
@@ -127,8 +130,8 @@ class Look:
         """What has been found."""
         fine, switched, anchored = self.fine, self.switched, self.anchored
         seen = {**anchored.changes, **fine.changes, **switched.changes}
-        light, sharp = switched.light, self._sharp
-        few = sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
+        light, sharp, apart = switched.light, self._sharp, self._base.sharp
+        few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
         return Evidence(
             depth=self._base.depth,
             layers=fine.layers,
@@ -142,6 +145,8 @@ class Look:
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
             reach=self._base.reach,
+            sharp=apart,
+            sharp_light=switched.sharp_effort(),
         )
 
 
@@ -165,7 +170,7 @@ def _sharp(simulation: Simulation, seed: int) -> SharpLight:
     """Direct light over lobes that are too sharp to be met by connections."""
     loaded = simulation.bench.loaded
     if not loaded.glossy:
-        return SharpLight(0.0, 0.0, math.inf)
+        return SharpLight.none(simulation.bench.n**2)
     parts = loaded.scene, loaded.camera, simulation.physics.projector, simulation.physics.geometry
     return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -57,7 +58,10 @@ class FineLight:
         self._deposits = [self._tracer.trace(self._seeds[0], 0, sample.fine)]
         started = time.perf_counter()
         self._deposits += [self._tracer.trace(seed, 0, sample.fine) for seed in self._seeds[1:]]
-        self.pace = (time.perf_counter() - started) / ((LOOKS - 1) * self._tracer.lanes * sample.fine)
+        self.pace = (time.perf_counter() - started) / max((LOOKS - 1) * self._tracer.lanes * sample.fine, 1)
+        simulation = Simulation(bench, base)
+        apart, samples = simulation.apart, sample.sharp(simulation)
+        self._sharp = [apart.trace(seed, 0, samples) for seed in self._seeds] if apart else []
 
     @property
     def judging(self) -> tuple[float, ...]:
@@ -76,7 +80,7 @@ class FineLight:
 
     def _range(self) -> tuple[float, float]:
         """Nearest and farthest depth that the light is seen at [mm]."""
-        inverse = np.concatenate([deposits.inverse_depth for deposits in self._deposits])
+        inverse = np.concatenate([deposits.inverse_depth for deposits in (*self._deposits, *self._sharp)])
         if not inverse.size:
             return self.base.depth, self.base.depth
         return 1 / float(inverse.max()), 1 / max(float(inverse.min()), _FARTHEST / self.base.depth)
@@ -144,11 +148,18 @@ class FineLight:
 
     def _frames(self, layers: tuple[float, ...], subdivision: int) -> FloatArray:
         simulation = Simulation(self.bench, replace(self.base, layers=layers, subdivision=subdivision))
-        return self._formed(simulation, self._deposits, self.sample.fine)
+        return self._formed(simulation, self._deposits, self.sample.fine, self._sharp)
 
-    def _formed(self, simulation: Simulation, deposits: list[Deposits], samples: int) -> FloatArray:
+    def _formed(
+        self, simulation: Simulation, deposits: list[Deposits], samples: int, sharp: Sequence[Deposits] = ()
+    ) -> FloatArray:
         labels = self.sample.lighting.labels
-        return self.sample.frames(simulation, [simulation.file_direct(look, labels, samples) for look in deposits])
+        lights = [simulation.file_direct(look, labels, samples) for look in deposits]
+        if sharp:
+            few = self.sample.sharp(simulation)
+            apart = [simulation.file_sharp(look, labels, few) for look in sharp]
+            lights = [light + more for light, more in zip(lights, apart, strict=True)]
+        return self.sample.frames(simulation, lights)
 
 
 class AnchoredLight:
@@ -238,4 +249,5 @@ def _tracer(simulation: Simulation, sample: Sample) -> DirectTracer:
     """Direct light to every anchor, of those projector pixels only that the sample's shots show."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, simulation.settings.anchors, physics.geometry
-    return DirectTracer(*parts, pixels=sample.shown)
+    apart = simulation.settings.sharp
+    return DirectTracer(*parts, pixels=np.setdiff1d(sample.shown, apart.pixels) if apart else sample.shown)

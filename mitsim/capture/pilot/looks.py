@@ -16,8 +16,9 @@ from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.rig.patterns import Lighting
 
-_SHOTS = 4
-"""Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming."""
+_SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
+"""Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming; but more
+where they show fewer pixels than this all together, which are no fair sample of the scene."""
 _COLUMNS = 64
 """Columns of pixels that the pilot looks at: a frame's neighbours are alike, and each column costs its forming."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
@@ -26,6 +27,10 @@ _PIXELS = 64**2
 """Few pixels are sampled more often, until they take as many samples as so many pixels."""
 _MOST_PATHS = 2**20
 """Paths of one look that are held at a time: 60 MB."""
+_SHARP_PATHS = 2**18
+"""Paths of sharp pixels in one look: each is filed in four cells, again and again."""
+_MOST_SHARP = 256
+"""Samples of a sharp pixel in a look: its error is then 3e-3 (plates of roughness 1e-3 and 1e-4)."""
 EVEN_CELLS = 0.25
 """Half as large cells leave this much of the error where light is smooth: they are of second order."""
 _UNKNOWN_GAIN = 0.5
@@ -50,7 +55,9 @@ class Sample:
         """A few shots of ``lighting`` and columns of a sensor of ``pixels`` a side, evenly spread."""
         shots, count = len(lighting.weights), min(pixels, _COLUMNS)
         columns = (np.arange(count) + (np.arange(count) * _GOLDEN) % 1) * pixels / count
-        chosen = np.unique(np.linspace(0, shots - 1, min(shots, _SHOTS)).astype(int))
+        lit = np.bincount(lighting.labels, minlength=lighting.weights.shape[1]) @ (lighting.weights[0] != 0)
+        wanted = min(max(_SHOTS, _SHOWN // max(int(lit), 1)), _MOST_SHOTS, shots)
+        chosen = np.unique(np.linspace(0, shots - 1, wanted).astype(int))
         return cls(lighting.shots(chosen), columns.astype(np.int64))
 
     @property
@@ -83,6 +90,11 @@ class Sample:
     def followed(self) -> int:
         """Samples a projector pixel of indirect light, and a cell of light that is followed from the camera."""
         return max(1, self.direct // 2)
+
+    def sharp(self, simulation: Simulation) -> int:
+        """Samples of each pixel that a ``simulation`` traces apart, in each look."""
+        paths = simulation.apart.lanes if simulation.apart else 1
+        return min(max(_SHARP_PATHS // paths, 4), _MOST_SHARP)
 
     def _within(self, samples: int, pixels: int) -> int:
         return max(1, min(samples, _MOST_PATHS // pixels))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -10,6 +11,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
 from mitsim.capture.pilot.looks import Sample, coarsened, noise, norm
+from mitsim.capture.pilot.sharp import SHARP_RATE
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
@@ -44,7 +46,8 @@ class SwitchedEffects:
         self.paces: dict[str, float] = {}
         self.direct = self._direct(self.simulation)
         self.followed = {name: self._follow(self.simulation, name) for name in _TRACERS}
-        self.frames = self._form(self.simulation, self.direct, self._joined(self.followed))
+        self.sharp = self._sharp(self.simulation)
+        self.frames = self._form(self.simulation, self.direct, self._joined(self.followed), self.sharp)
         self.light = norm(self.frames)
         """Norm of the frames of all light."""
 
@@ -81,6 +84,16 @@ class SwitchedEffects:
         relative = error / self.light if self.light else 0.0
         return Effort(Noise(relative, self.sample.followed, 0.5), lanes, self.paces[name])
 
+    def sharp_effort(self) -> Effort:
+        """The same of pixels that are traced apart, their rate being that of stratified rays."""
+        tracer = self.simulation.apart
+        if tracer is None:
+            return Effort.none()
+        nothing, samples = [Deposits.none()] * LOOKS, self.sample.sharp(self.simulation)
+        error = noise(self._form(self.simulation, nothing, nothing, self.sharp))
+        relative = error / self.light if self.light else 0.0
+        return Effort(Noise(relative, samples, SHARP_RATE), tracer.lanes, self.paces["sharp"])
+
     @cached_property
     def _noise(self) -> dict[str, tuple[float, int]]:
         """Error of a look by each tracer, and its paths in a sample."""
@@ -94,14 +107,16 @@ class SwitchedEffects:
     def _without(self, effect: Effect) -> FloatArray:
         simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {effect.name}))
         retraced = effect.retraced(simulation.physics)
-        direct = self._direct(simulation) if DIRECT in retraced else self.direct
+        direct, sharp = self.direct, self.sharp
+        if DIRECT in retraced:
+            direct, sharp = self._direct(simulation), self._sharp(simulation)
         if FOLLOWED in retraced:
             followed = self._joined({name: self._follow(simulation, name) for name in _TRACERS})
         else:
             followed = self._joined(self.followed)
             if effect.kind:
                 followed = [light.where(light.kind != _KINDS[effect.kind]) for light in followed]
-        return self._form(simulation, direct, followed)
+        return self._form(simulation, direct, followed, sharp)
 
     def _direct(self, simulation: Simulation) -> list[Deposits]:
         return [simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds]
@@ -123,11 +138,32 @@ class SwitchedEffects:
     def _joined(followed: dict[str, list[Deposits]]) -> list[Deposits]:
         return [Deposits.joined(looks) for looks in zip(*followed.values(), strict=True)]
 
-    def _form(self, simulation: Simulation, direct: list[Deposits], followed: list[Deposits]) -> FloatArray:
+    def _sharp(self, simulation: Simulation) -> list[Deposits]:
+        """Light of pixels that are traced apart, look by look; the first, which may compile a kernel, is not timed."""
+        tracer, samples = simulation.apart, self.sample.sharp(simulation)
+        if tracer is None:
+            return []
+        found = [tracer.trace(integer(self.seeds[0], "sharp"), 0, samples)]
+        started = time.perf_counter()
+        found += [tracer.trace(integer(seed, "sharp"), 0, samples) for seed in self.seeds[1:]]
+        self.paces.setdefault("sharp", (time.perf_counter() - started) / ((LOOKS - 1) * tracer.lanes * samples))
+        return found
+
+    def _form(
+        self,
+        simulation: Simulation,
+        direct: list[Deposits],
+        followed: list[Deposits],
+        sharp: Sequence[Deposits] = (),
+    ) -> FloatArray:
         sample, labels = self.sample, self.sample.lighting.labels
         lights = [
             simulation.file_direct(one, labels, sample.direct)
             + simulation.file_followed(other, labels, sample.followed)
             for one, other in zip(direct, followed, strict=True)
         ]
+        if sharp:
+            samples = sample.sharp(simulation)
+            apart = [simulation.file_sharp(look, labels, samples) for look in sharp]
+            lights = [light + more for light, more in zip(lights, apart, strict=True)]
         return sample.frames(simulation, lights)

@@ -74,6 +74,15 @@ def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors
         reconstruct(shots, Factors(factors.left, factors.right, manifest, factors.status))
 
 
+def test_the_condition_of_each_side_is_told(shots: Capture, factors: Factors) -> None:
+    """Columns of very different light on the right alone."""
+    worse = Factors(factors.left, factors.right * np.array([1.0, 1.0, 1.0, 1e-3]), factors.manifest, factors.status)
+    result = reconstruct(shots, worse, 1.0)
+    left, right = result.condition_sides
+    assert right > 1e4 > left > 1 and result.condition == right
+    assert left == reconstruct(shots, factors, 1.0).condition_sides[0]
+
+
 def test_the_time_of_both_parts_is_stated(shots: Capture, factors: Factors) -> None:
     begin = time.perf_counter()
     result = reconstruct(shots, factors)

@@ -1,0 +1,142 @@
+"""Light through flat panes of glass: closed forms under a pinhole, and Mitsuba's ``path`` under a lens.
+
+Rationale. A path of Mitsuba finds no pinhole behind glass. It runs into a lens by chance, however, and a large lens
+often: so the reference sees a projector whose lens is a disk of 50 mm that shines (``mitsim_projector``), and so does
+the factored estimator, which finds the same light by refracted connections, from the projector's side and, over
+mirrors, from the camera's. All light is compared, whichever tracer finds it, reflections inside of the glass too; what
+would be found twice or not at all shows. Panes are slanted so that none mirrors the lens into the sensor, which is the
+beams' light (tests/unit/transport/test_glint.py). The unmasked sensor of 0.75 mm is seen as a whole, whose mean is that
+at its centre to 1e-6.
+
+Significance. Means over independent seeds (8 of each side); a gate of seven standard errors stands for five of the t
+distribution, and each test states how narrow it is. Seeds are fixed.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.transport.aperture import aperture_scene_parts, register
+from mitsim.transport.cells import aligned_grid
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT
+from mitsim.transport.indirect import IndirectTracer
+from tests.physics.test_passage import LAMP, METAL, MIRROR, direct_light, mean, plate
+from tests.unit.transport.test_panes import WALL, slab
+
+pytestmark = pytest.mark.usefixtures("variant")
+SEEDS, SIGMAS, LENS = 8, 7.0, 50.0
+THIN = '<bsdf type="thindielectric"/>'
+# At x = -40 mm, from 305 to 385 mm: it throws light on the wall, and the camera sees the wall in it.
+MIRROR_WALL = f"""<shape type="rectangle"><transform name="to_world"><scale x="40" y="40"/><rotate y="1" angle="90"/>
+    <translate x="-40" z="345"/></transform>{MIRROR}</shape>"""
+SCENES = {
+    "one, slanted": slab(220, 6, 20),
+    "two, both slanted": slab(220, 6, 12) + slab(320, 10, -25),
+    "an edge in the view": slab(330, 4, 20, 25, 25) + plate(390, METAL, 30, -10, 10),
+    "before the camera alone": slab(60, 3, 25, -12, 18),
+    "a thin pane and a thick one before rough metal": plate(200, THIN, 60, 0, 15) + slab(320, 8, 20, 0, 60)
+    + plate(400, METAL, 30, 5, 15),
+    "a mirror wall behind": slab(220, 5, 20) + MIRROR_WALL,
+    "a lamp before": slab(300, 5, 20) + LAMP,
+}  # fmt: skip
+QUICK = ("two, both slanted", "before the camera alone")
+
+
+@pytest.fixture(scope="module")
+def scene(shared_scene: Callable[..., Path], variant: str) -> Callable[..., Bench]:
+    count = iter(range(1000))
+
+    def load(extra: str, **numbers: object) -> Bench:
+        values = {"sheet_z": WALL, "mask": "open", **numbers}
+        return open_bench(shared_scene(f"panes{next(count)}", extra=extra, **values), variant)
+
+    return load
+
+
+def all_light(bench: Bench, seed: int, samples: int, aperture: float = 0.0) -> np.ndarray:
+    """(3,) of each kind at the sensor's centre: ambient, direct, indirect."""
+    loaded, optics = bench.loaded, replace(bench.projector_optics, aperture=aperture, focus=WALL)
+    aim = aligned_grid(*bench.windows, 64, 1, bench.geometry.tan_half_fov + 0.01)
+    parts = loaded.scene, loaded.camera, optics
+    tracers = (
+        (DirectTracer(*parts, 1), samples),
+        (IndirectTracer(*parts, True, True), 4 * samples),
+        (FromCameraTracer(*parts, aim, Paths(True, True, loaded.lamps)), samples),
+    )
+    light = np.zeros(3)
+    for tracer, count in tracers:
+        deposits = tracer.trace(seed, 0, count)
+        light += np.bincount(deposits.kind, deposits.value / count, minlength=3)
+    return light
+
+
+def reference_with_lens(bench: Bench, spp: int) -> tuple[float, float]:
+    """Mean over the sensor, and its standard error."""
+    register()
+    loaded = bench.loaded
+    shapes = {f"shape{i}": shape for i, shape in enumerate(loaded.scene.shapes())}
+    parts = aperture_scene_parts(loaded.projector, LENS, WALL)
+    integrator = {"type": "volpath", "max_depth": 24, "rr_depth": 100}
+    whole = mi.load_dict({"type": "scene", "integrator": integrator, "camera": loaded.camera, **shapes, **parts})
+    return mean([float(np.array(mi.render(whole, spp=spp, seed=seed), np.float64).mean()) for seed in range(SEEDS)])
+
+
+def test_an_upright_pane_dims_the_wall_and_brings_it_nearer(scene: Callable[..., Bench]) -> None:
+    """Direct light keeps (1 - R)^4, R = ((n - 1) / (n + 1))^2, and the wall is t (1 - 1/n) nearer to the projector.
+
+    The sensor looks at an even wall through a narrow stop: radiance, which distance does not change. Angles of 10
+    degrees at most change T and the shift by 5e-4.
+    """
+    alone, behind = scene("", fov=8), scene(slab(220, 6), fov=8)
+    nearer = WALL / (WALL - 6 * (1 - 1 / 1.5))
+    found = direct_light(behind, 1) / direct_light(alone, 1)
+    assert found == pytest.approx((1 - 0.04) ** 4 * nearer**2, rel=1e-3)
+
+
+def test_with_all_reflections_the_pane_passes_the_closed_form(scene: Callable[..., Bench]) -> None:
+    """T = (1 - R)^2 / (1 - R^2) for each crossing, once reflections inside of the glass are followed.
+
+    Light between wall and pane (up to 2 R times the wall's 0.5, spread over the hemisphere) is told apart as indirect.
+    """
+    alone, behind = scene("", fov=8), scene(slab(220, 6), fov=8)
+    light = [all_light(behind, seed, 128)[DIRECT] for seed in range(SEEDS)]
+    found, error = mean(light)
+    passed = (1 - 0.04) ** 2 / (1 - 0.04**2)
+    expected = direct_light(alone, 1) * passed**2 * (WALL / (WALL - 2)) ** 2
+    assert SIGMAS * error < 1e-3 * expected
+    assert abs(found - expected) < SIGMAS * error + 1e-3 * expected
+    # Without what the followers add, the 0.3 % between (1 - R)^4 and T^2, it would be told apart.
+    assert direct_light(behind, 1) < expected * (1 - 2e-3)
+
+
+def test_a_pane_before_the_camera_counts_light_once(scene: Callable[..., Bench]) -> None:
+    """The projector shines past it, so both sides could find the wall's light: seen through the pane, or connected."""
+    bench = scene(slab(30, 3, 0, -12, 20), fov=8)
+    alone = scene("", fov=8)
+    found, error = mean([all_light(bench, seed, 64)[DIRECT] for seed in range(SEEDS)])
+    expected = direct_light(alone, 1) * (1 - 0.04) ** 2 / (1 - 0.04**2)
+    assert SIGMAS * error < 2e-3 * expected
+    assert abs(found - expected) < SIGMAS * error + 1e-3 * expected
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
+)
+def test_all_light_is_that_of_paths_that_meet_the_lens(scene: Callable[..., Bench], name: str) -> None:
+    bench = scene(SCENES[name])
+    light = [all_light(bench, seed, 64, LENS) for seed in range(SEEDS)]
+    found, error = mean([float(parts.sum()) for parts in light])
+    expected, spread = reference_with_lens(bench, 128 if name in QUICK else 512)
+    gate = SIGMAS * np.hypot(error, spread)
+    assert gate < 0.04 * expected
+    assert abs(found - expected) < gate, f"{found / expected - 1:+.2%}, gate {gate / expected:.2%}"
+    assert np.mean(light, axis=0)[[DIRECT, INDIRECT]].min() > 0 and (np.mean(light, axis=0)[AMBIENT] > 0) == (
+        name == "a lamp before"
+    )
