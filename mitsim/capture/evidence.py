@@ -117,6 +117,8 @@ class Evidence:
         terms of the shadow, wave-optical over geometric.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
+    left_out
+        light that no tracer finds, over that and direct light (:mod:`mitsim.transport.left_out`).
     """
 
     depth: float
@@ -133,6 +135,7 @@ class Evidence:
     seconds_per_frame: float
     terms: float
     unresolved: float = 0.0
+    left_out: float = 0.0
 
     def connecting(self, settings: Settings, anchors: int) -> float:
         """Seconds of direct light in the samples of ``settings``, and of its differences between ``anchors`` a side."""

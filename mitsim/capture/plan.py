@@ -235,6 +235,7 @@ def decide(
         f"cells ({cells}x{cells})": evidence.cell_error[cells],
         "coarse cells": coarse.error,
         "light over sharp lobes": evidence.unresolved,
+        "light over mirrors or curved glass both ways (left out)": evidence.left_out,
         **{f"{name} (off)": error for name, error in evidence.effect_error.items() if name not in on},
     }
     systematic = math.hypot(*parts.values())

@@ -19,10 +19,13 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
 from mitsim.scene.darkness import why_dark
+from mitsim.transport.left_out import left_out_light
 from mitsim.transport.lobes import SharpLight, sharp_light
 
 _LOBE_RAYS = 2**20
 """Rays that look for sharp lobes: a lobe of 1e-4 of the hemisphere is met a hundred times."""
+_CAUSTIC_PATHS = 2**20
+"""Paths that look for light that is left out: a thousandth of the light that all curved glass sends is met 30 times."""
 _FEWEST_HITS = 30.0
 """Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""
 _FAINT = 1e-3
@@ -76,6 +79,7 @@ def measure(bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> Evi
         from_camera=switched.effort("from_camera"),
         seconds_per_frame=fine.seconds_per_frame,
         terms=float(len(bench.spectrum.weights) * (2 if bench.geometry.mask == "flatcam" else 1)),
+        left_out=_left_out(switched.simulation, seed, light),
         unresolved=sharp.irradiance / (light + sharp.irradiance) if sharp.hits * sample.fine < _FEWEST_HITS else 0.0,
     )
 
@@ -87,6 +91,18 @@ def _sharp(simulation: Simulation, seed: int) -> SharpLight:
         return SharpLight(0.0, 0.0, math.inf)
     parts = loaded.scene, loaded.camera, simulation.physics.projector, simulation.physics.geometry
     return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
+
+
+def _left_out(simulation: Simulation, seed: int, direct: float) -> float:
+    """Light that no tracer finds, over that and ``direct`` light."""
+    loaded, physics = simulation.bench.loaded, simulation.physics
+    if not loaded.mirrors:
+        return 0.0
+    samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
+    own = integer(seed, "pilot", "caustics")
+    parts = loaded.scene, loaded.camera, physics.projector, simulation.aim
+    light = left_out_light(*parts, physics.geometry, own, samples)
+    return light / (light + direct) if light else 0.0
 
 
 def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float]:
