@@ -178,8 +178,12 @@ def plan(
     quiet: Quiet = False,
 ) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
+    from mitsim.core.resources import running_seconds
+
     request = _request(patterns=patterns, accuracy=accuracy, seed=seed, effects=effects)
-    plan = _open(scene, variant, camera, projector, define, outside).plan(**request)
+    bench = _open(scene, variant, camera, projector, define, outside)
+    starting = running_seconds()
+    plan = bench.plan(**request).taking(start=starting)
     if not as_json:
         _print_plan(plan)
     return _finish(as_json, plan.payload(), [], plan.warnings)

@@ -196,13 +196,19 @@ class _Table:
             sharp=self.evidence.sharp,
             **{f"{name}_samples": float(count[index]) for name, count in self.samples.items()},
         )
-        missing, centre = self.evidence.unresolved, np.add(*self._from_centre(SURE))
-        value, bound = (float(self._systematic(sure, frozenset())[index]) + missing for sure in (0.0, SURE))
+        lacking = {
+            "light over sharp lobes": self.evidence.unresolved,
+            "light over mirrors or curved glass both ways (left out)": self.evidence.left_out,
+        }
+        missing, centre = min(sum(lacking.values()), 1.0), np.add(*self._from_centre(SURE))
+        # Errors of the light that is there count for its part of all.
+        rest = (float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE))
+        value, bound = (missing + (1 - missing) * error for error in rest)
         return Choice(
             settings=settings,
             systematic=Estimate(value, bound),
             unsigned={
-                "light over sharp lobes": missing,
+                **lacking,
                 "one anchor for other than direct light": float(centre[index]),
             },
             target=float(self.target[index]),

@@ -247,6 +247,8 @@ class Evidence:
         effects that are no part of the expected frames, with the independent error of leaving each out.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
+    left_out
+        light that no tracer finds, over that and direct light (:mod:`mitsim.transport.left_out`).
     reach, sharp
         as in :class:`Settings`.
     sharp_light
@@ -264,6 +266,7 @@ class Evidence:
     forming: Forming
     apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
+    left_out: float = 0.0
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())

@@ -23,7 +23,7 @@ from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
+from mitsim.optics.frames import ExpectedFrames, monte_carlo_bound, monte_carlo_error
 from mitsim.rig.patterns import Lighting
 
 if TYPE_CHECKING:
@@ -275,13 +275,15 @@ def trace_light(
         )
         expected = light.frames(checked, seed)
         error = monte_carlo_error(expected)
+        # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
         target = sampling.target(expected) if sampling.target else plan.sampling_target
-        progress("transport", min(1.0, (target / error) ** 2) if error > 0 else 1.0)
-        if error <= target or light.paths >= _MOST_PATHS:
-            return replace(light, sampling_error=error, reached=error <= target)
+        seen = error if sampling.target else monte_carlo_bound(expected)
+        progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
+        if seen <= target or light.paths >= _MOST_PATHS:
+            return replace(light, sampling_error=error, reached=seen <= target)
         rate = _FOLLOWED_RATE if simulation.indirect or simulation.from_camera else _DIRECT_RATE
         # Capped before the power as well: a target that was set very low would overflow it.
-        growth = min(error / target, _LARGEST_GROWTH) ** rate
+        growth = min(seen / target, _LARGEST_GROWTH) ** rate
         rounds *= min(max(1.05 * growth, 1.1), _LARGEST_GROWTH)
 
 

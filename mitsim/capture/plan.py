@@ -98,9 +98,10 @@ class Plan:
             raise MitsimError(f"plan: no row {name!r}; there are {', '.join(rows)}")
         return rows[name]
 
-    def total(self, mc_error: float) -> Estimate:
-        """Error of frames whose Monte Carlo error is ``mc_error``, all in all."""
-        return Estimate(*(math.hypot(error, mc_error) for error in (self.systematic_error, self.systematic_bound)))
+    def total(self, noise: Estimate) -> Estimate:
+        """Error of frames with this Monte Carlo error, ``noise``, all in all."""
+        systematic = self.systematic_error, self.systematic_bound
+        return Estimate(*(math.hypot(*both) for both in zip(systematic, noise, strict=True)))
 
     def taking(self, **seconds: float) -> Plan:
         """The same plan, with the ``seconds`` of more stages in its prediction."""

@@ -14,7 +14,7 @@ import numpy as np
 from mitsim.capture.ambient import AmbientFrame, is_taken, shots_for
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
-from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.evidence import GROUPS, Estimate, Settings
 from mitsim.capture.exposer import Exposer, NoiseTarget, in_chunks
 from mitsim.capture.light import Light, Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan
@@ -28,7 +28,7 @@ from mitsim.core.manifests import Digital as DigitalScale
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.runs import AMBIENT, Capture, RunFolder, RunMemory, claimed, frame_name
 from mitsim.core.versions import DECIDING, versions
-from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.optics.frames import ExpectedFrames, Frame, bound_of
 from mitsim.rig.patterns import Lighting, PatternFamily, Shot
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import Digital
@@ -167,7 +167,7 @@ def capture(
             _record_ambient(recorder, ambient, exposer)
         shooting = _Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
         shooting.shoot(expected, job)
-        total = light.plan.total(totals.mc_error)
+        total = light.plan.total(totals.noise)
         manifest = RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
@@ -186,7 +186,7 @@ def capture(
             paths=light.paths,
             lost_light=light.lost,
             seconds=job.clock.seconds(),
-            warnings=light.warnings + tuple(_warnings(light, totals, shooting)),
+            warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
             versions=versions(),
         )
         return recorder.finish(manifest)
@@ -216,25 +216,34 @@ def _sampling(bench: Bench, request: Request) -> Sampling:
 class _Totals:
     """Over all expected frames: brightest pixel [W m^-2], relative Monte Carlo error, most light below zero.
 
-    ``heaviest``: the largest part of the Monte Carlo variance that one group of the light brings.
+    ``heaviest``: the largest part of the Monte Carlo variance that one group of the light brings; ``mc_bound``: what
+    that error is below, at 95 %.
     """
 
     peak: float
     mc_error: float
     removed: float
     heaviest: float
+    mc_bound: float
+
+    @property
+    def noise(self) -> Estimate:
+        """The Monte Carlo error, and its bound."""
+        return Estimate(self.mc_error, self.mc_bound)
 
     @classmethod
     def of(cls, expected: ExpectedFrames) -> _Totals:
         peak = energy = variance = removed = heaviest = 0.0
+        parts = np.zeros(GROUPS)
         for frame in expected:
             removed = max(removed, frame.removed)
             peak = max(peak, float(frame.irradiance.max()))
             energy += float(np.square(frame.irradiance).sum())
             variance += frame.variance * frame.irradiance.size
             heaviest += frame.heaviest * frame.variance * frame.irradiance.size
+            parts += np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
         mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
-        return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0)
+        return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,10 +394,12 @@ def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     )
 
 
-def _warnings(light: Light, totals: _Totals, shooting: _Shooting) -> Iterator[str]:
-    accuracy = light.plan.accuracy
+def _warnings(light: Light, totals: _Totals, shooting: _Shooting, request: Request) -> Iterator[str]:
+    accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
     if not light.reached:
         yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
+    elif total.bound > accuracy and not light.plan.warnings and request.noise_fraction is None:
+        yield f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"
     if totals.removed > accuracy:
         yield f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for more"
     if totals.heaviest > _FIREFLIES and totals.mc_error > _NEGLIGIBLE * accuracy:

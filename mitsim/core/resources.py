@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,6 +95,11 @@ def free_memory() -> float:
         if soft != psutil.RLIM_INFINITY:
             left.append(float(soft - process.memory_info().vms))
     return max(min(left), 0.0)
+
+
+def running_seconds() -> float:
+    """Seconds since this process began: what its start took, when asked for at the beginning of work."""
+    return max(time.time() - float(psutil.Process().create_time()), 0.0)
 
 
 def free_disk(path: Path) -> float:

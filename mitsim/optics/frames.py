@@ -35,6 +35,8 @@ PROBES = 8
 """Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`_probes`."""
 _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+_NORMAL = 1.645
+"""Standard deviations above which a normal deviate is in 5 % of cases."""
 _HELD = 8
 """Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
 _MOST_COLUMNS = 2**22
@@ -59,12 +61,15 @@ class Frame:
     heaviest
         largest part of the variance that one group of the light brings: with one heavy path among G groups,
         (G - 1) / G.
+    by_group
+        (G,) parts of the variance that each group of the light brings.
     """
 
     irradiance: FloatArray
     variance: float
     removed: float
     heaviest: float
+    by_group: tuple[float, ...] = ()
 
 
 class FrameOptics:
@@ -335,7 +340,8 @@ class ExpectedFrames:
             heaviest = float(squared.max()) / spread if spread else 0.0
             seen = np.maximum(frame, 0)
             total = float(seen.sum())
-            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest)
+            by_group = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
+            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, by_group)
 
 
 def _mean_of(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
@@ -423,6 +429,29 @@ def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
         variance += frame.variance * frame.irradiance.size
         energy += float(np.square(frame.irradiance).sum())
     return float(np.sqrt(variance / energy)) if energy > 0 else 0.0
+
+
+def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
+    """What the Monte Carlo error of all ``frames`` is below, at 95 %; see :func:`bound_of`."""
+    parts, energy = np.zeros(1), 0.0
+    for frame in frames:
+        parts = parts + np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
+        energy += float(np.square(frame.irradiance).sum())
+    return bound_of(parts, energy)
+
+
+def bound_of(parts: FloatArray, energy: float) -> float:
+    """What a relative Monte Carlo error is below, at 95 %, from its square's ``parts`` by group and frames' ``energy``.
+
+    The error that was made is one draw, and its estimate another. Where few paths make the noise, groups of the light
+    differ much in the energy of theirs, and so would other draws: with v the relative variance of that energy among G
+    groups, the squared error is below 1 + 1.645 sqrt(v G / (G - 1)) times its estimate.
+    """
+    if not energy or not parts.sum():
+        return 0.0
+    count = len(parts)
+    spread = float(parts.var(ddof=1)) / float(parts.mean()) ** 2 * count / (count - 1) if count > 1 else 0.0
+    return float(np.sqrt(parts.sum() / energy * (1 + _NORMAL * np.sqrt(spread))))
 
 
 def _row(matrix: sparse.csr_array, row: int) -> tuple[IntArray, FloatArray]:

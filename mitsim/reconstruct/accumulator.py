@@ -9,14 +9,14 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.sides import Side, Slab
+from mitsim.reconstruct.sides import IndexArray, Side
 
 _LARGEST = 1e100
 """Largest norm of a frame, and one over the smallest: its square, the energy, is then told from 0 and infinity."""
 
 
 class Accumulator:
-    """Sum over frames of what the solver needs: W, the frames' energy, and which frames came.
+    """Sum over frames of what the solver needs: W by quarters of the sensor, the frames' energy, and which frames came.
 
     Made by :meth:`mitsim.reconstruct.solver.Prepared.accumulator`; belongs to the factors that made it.
 
@@ -32,14 +32,19 @@ class Accumulator:
         self._left = left
         self._right = right
         self._centre = centre
-        self._sum = np.zeros((left.accumulated_size, right.accumulated_size))
+        self._quarters = np.zeros((2, 2, left.accumulated_size, right.accumulated_size))
         self._energy = 0.0
         self._seen = np.zeros((left.pattern_count, right.pattern_count), dtype=np.bool_)
 
     @property
     def sum(self) -> FloatArray:
         """W (r_left, r_right), or for the Gram method the paper's Q (n, n); a copy."""
-        return self._sum.copy()
+        return np.asarray(self._quarters.sum(axis=(0, 1)))
+
+    @property
+    def quarters(self) -> FloatArray:
+        """(2, 2, r_left, r_right) parts of :attr:`sum` by half of the sensor's rows and of its columns; a copy."""
+        return self._quarters.copy()
 
     @property
     def energy(self) -> float:
@@ -83,7 +88,8 @@ class Accumulator:
         where: Any = (left.columns, right.columns)
         if isinstance(left.columns, np.ndarray) and isinstance(right.columns, np.ndarray):
             where = np.ix_(left.columns, right.columns)
-        self._sum[where] += _project(values, left, right)
+        halves = self._left.halves, self._right.halves
+        self._quarters[(slice(None), slice(None), *where)] += _project(values, left.matrix, right.matrix, halves)
         self._energy += energy
         self._seen[row, column] = True
 
@@ -127,8 +133,14 @@ def _out_of_range(name: str, values: FloatArray) -> str:
     )
 
 
-def _project(frame: FloatArray, left: Slab, right: Slab) -> FloatArray:
-    """left^T frame right, the thinner factor first: the frame is then read with the least arithmetic."""
-    if left.matrix.shape[1] < right.matrix.shape[1]:
-        return np.asarray((left.matrix.T @ frame) @ right.matrix)
-    return np.asarray(left.matrix.T @ (frame @ right.matrix))
+def _project(
+    frame: FloatArray, left: FloatArray, right: FloatArray, halves: tuple[tuple[IndexArray, ...], ...]
+) -> FloatArray:
+    """left^T frame right by ``halves`` of the rows and of the columns, the thinner factor first: the frame is then read
+    with the least arithmetic."""
+    rows, columns = halves
+    if left.shape[1] < right.shape[1]:
+        partial = [left[half].T @ frame[half] for half in rows]
+        return np.array([[part[:, half] @ right[half] for half in columns] for part in partial])
+    partial = [frame[:, half] @ right[half] for half in columns]
+    return np.array([[left[half].T @ part[half] for part in partial] for half in rows])

@@ -23,11 +23,10 @@ from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Status, Verdict
 
 UNEXPLAINED = 3.5e-3
-"""Part of the measurements, rms, that a fitting scene may leave unexplained: print that is finer than a projector's
-pixel leaves up to 2.4e-3 (the resolution target, 49 dots); a sheet 2 mm off 400 leaves 4.2e-3 (16 dots) to 1.0e-2
-(49)."""
+"""Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
+and 3e-3 (edges under pixels of 7.5 mm); a sheet 2 mm off 400 leaves 4.2e-3 (16 dots) to 1.0e-2 (49)."""
 UNEXPLAINED_TILE = 2e-2
-"""The same of a single tile, where such print is not averaged: above all that fitting scenes left
+"""The same of a single tile, where print is not averaged: above all that fitting scenes left
 (tests/physics/test_misfit.py)."""
 CHANCE = 6.0
 """Standard deviations of the noise's own energy that are left to chance: with 64 tiles once in 10^7 images."""
@@ -51,7 +50,8 @@ class Misfit:
     chi_square
         energy of the residual over what is expected of it; 1 where the model fits.
     unexplained
-        square root of the energy beyond that, relative to the measurements; 0 where nothing is.
+        square root of the energy beyond that and beyond what print within a pixel may add, relative to the
+        measurements; 0 where nothing is.
     tiles
         (rows, columns) the chi-square of each tile of the sensor.
     worst_tile
@@ -164,6 +164,7 @@ def judge(
     measured: Iterable[Measurement],
     noise: FrameNoise,
     factor_energy: float | None,
+    print_energy: float,
     evidence: Evidence,
 ) -> Misfit | None:
     """Hold all measurements against the model; None where there are no more data than unknowns.
@@ -178,6 +179,8 @@ def judge(
         of them, summed up already.
     factor_energy
         what noisy factors add to the frames; None: not stated.
+    print_energy
+        what print within a pixel may add: left to a fitting scene, but no part of the chi-square.
     evidence
         empty, of the same model.
     """
@@ -187,9 +190,10 @@ def judge(
     for measurement in measured:
         sums.add(measurement)
     expected = sums.expected(factor_energy or 0.0)
-    energy, excess = float(sums.energy.sum()), float((sums.residual - expected).sum())
+    beyond = sums.residual - expected - print_energy * sums.pixels / sums.pixels.sum()
+    energy, excess = float(sums.energy.sum()), float(beyond.sum())
     unexplained = float(np.sqrt(max(excess, 0.0) / max(energy, _TINY)))
-    tiles = np.sqrt(np.maximum(sums.residual - expected, 0.0) / np.maximum(sums.energy, _TINY))
+    tiles = np.sqrt(np.maximum(beyond, 0.0) / np.maximum(sums.energy, _TINY))
     chi_square = float(sums.residual.sum() / max(float(expected.sum()), _TINY))
     chi_squares = sums.residual / np.maximum(expected, _TINY)
     stated = noise.stated and factor_energy is not None

@@ -24,9 +24,9 @@ from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import Misfit, judge
-from mitsim.reconstruct.noise import FrameNoise, factor_energy
+from mitsim.reconstruct.noise import FrameNoise, factor_energy, print_energy
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
-from mitsim.reconstruct.status import Status
+from mitsim.reconstruct.status import Status, Verdict
 from mitsim.reconstruct.tv import solve_tv
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Propagation, Uncertainty, uncertainty
 
@@ -194,6 +194,9 @@ def reconstruct(
     solution = prepared.solve(frames, lam) if method == "tikhonov" else solve_tv(prepared, frames, lam)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution.image)
+    separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
+    if method == "tikhonov" and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
+        solution = prepared.solve(frames, lam, explained=False)
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status
@@ -255,6 +258,7 @@ class Accumulated:
             self.kept or shots.measured(),
             self.noise,
             factor_energy(self.prepared, shots.patterns, stated, image) if stated else None,
+            print_energy(self.prepared, factors.sides, shots.patterns, image),
             Evidence(factors, shots.patterns),
         )
 

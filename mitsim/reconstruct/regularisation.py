@@ -1,13 +1,14 @@
-"""Tikhonov weight from the data alone, by an unbiased estimate of the risk on the accumulated projections.
+"""Tikhonov weight from the data alone: the accumulated projections in, lambda out.
 
 In the basis of the factors the fit is diagonal: coefficient W_ij is kept by the share
-sigma_ij^2 / (sigma_ij^2 + lambda), and the energy of the frames outside the model's range tells the noise, so
-any lambda costs n^2 operations, whatever the number of frames. Why not generalised cross-validation:
-docs/decisions/0002-automatic-lambda.md.
+sigma_ij^2 / (sigma_ij^2 + lambda), so any lambda costs n^2 operations, whatever the number of frames. Where the model
+explains the frames, lambda minimises an unbiased estimate of the image's error; where it does not, the image must also
+stand still when lambda changes. What was tried instead: docs/decisions/0004-lambda-by-halves.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +16,14 @@ from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.halves import MEDIAN_SPREAD, Halves
 
 RISK_POWER = 0.5
 """Errors are weighted by sigma to this power: 0 is the image's error, 2 that of predicted frames; chosen in
 docs/decisions/0002-automatic-lambda.md."""
+MISFIT_RATIO = 1.2
+"""Noise outside the model's range over the noise within, above which the model does not explain the frames: 0.92 to
+1.02 in the captures of flat prints that benchmarks/lambda_losses.py makes, 1.4 and more with depth and gloss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +40,15 @@ class DiagonalProblem:
         squared norm of all data.
     data_count
         number of independent data.
+    halves
+        ``projected`` by quarters of the sensor, which tell its noise; None: the noise is taken for white.
     """
 
     sigma: FloatArray
     projected: FloatArray
     energy: float
     data_count: int
+    halves: Halves | None = None
 
     def residual_energy(self, lam: float) -> float:
         """||Y - model||^2 of the Tikhonov solution at ``lam``; rounding leaves about 1e-16 of ``energy``."""
@@ -58,7 +66,7 @@ class DiagonalProblem:
         return float(np.square(self.sigma.max()))
 
 
-def risk_score(problem: DiagonalProblem, lam: float, noise: float) -> float:
+def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) -> float:
     """Unbiased estimate of the weighted squared error of the image, up to a constant.
 
     Parameters
@@ -68,7 +76,7 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float) -> float:
     lam
         lambda, in the unit of sigma^2.
     noise
-        variance of one datum.
+        variance of one datum, or (r, r') of each number of ``projected``.
 
     Notes
     -----
@@ -78,9 +86,22 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float) -> float:
     """
     measured = problem.sigma > 0
     sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
+    variance = np.broadcast_to(noise, problem.sigma.shape)[measured]
     kept = problem.kept(lam)[measured]
-    errors = ((kept - 2) * (data - noise) + kept * noise) / (np.square(sigma) + lam)
+    errors = ((kept - 2) * (data - variance) + kept * variance) / (np.square(sigma) + lam)
     return float(np.sum(sigma**RISK_POWER * errors))
+
+
+def movement(problem: DiagonalProblem, lam: float) -> float:
+    """||lambda dX / dlambda||^2 of the Tikhonov image X of a ``problem`` at ``lam``.
+
+    Small where neither coefficients that lambda cuts off nor noise that it lets through weigh much: the
+    quasi-optimality criterion of Tikhonov and Glasko (1965), which takes no number for the noise and so holds for
+    errors of any spectrum.
+    """
+    kept = problem.kept(lam)
+    measured = kept > 0
+    return float(np.sum(np.square((kept * (1 - kept) * problem.projected)[measured] / problem.sigma[measured])))
 
 
 def noise_variance(problem: DiagonalProblem) -> float:
@@ -95,23 +116,63 @@ def noise_variance(problem: DiagonalProblem) -> float:
     return max(problem.energy - float(inside), 0.0) / spare
 
 
-def automatic_lambda(problem: DiagonalProblem) -> float:
-    """Lambda that minimises :func:`risk_score` of a ``problem``: a grid over 16 decades, refined at its best.
+def is_misfit(problem: DiagonalProblem) -> bool:
+    """Whether a ``problem`` has more energy outside the model's range than the noise within it explains.
+
+    Noise strikes both alike; what the model does not explain strikes few numbers within, which do not move the median
+    of the halves' differences, and all beyond.
+    """
+    if not problem.halves:
+        return False
+    chance = 3 * MEDIAN_SPREAD / float(np.sqrt(2 * np.count_nonzero(problem.sigma)))
+    return noise_variance(problem) > (MISFIT_RATIO + chance) * problem.halves.typical
+
+
+def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
+    """Noise variance of each number (r, r') of ``problem.projected``, or of all.
+
+    Most have the noise that is outside the model's range, where there are more data to tell it; or, where the model
+    does not explain the frames, what the halves of the sensor disagree on. What strikes single rows and columns comes
+    on top.
+    """
+    white = noise_variance(problem)
+    if not problem.halves:
+        return white
+    return (problem.halves.typical if is_misfit(problem) else white) + problem.halves.excess
+
+
+def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
+    """Lambda that minimises :func:`risk_score` of a ``problem``, with the noise that halves of the sensor tell.
+
+    Where the model does not explain the frames, as they say themselves or as is known before (``explained`` is False),
+    that is a lower bound: what both halves agree on is then an error that follows no law, and the image that
+    :func:`movement` says to be the steadiest is taken.
 
     Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there
     are no more data than unknowns (the noise is then unknown) or no signal.
     """
-    noise = noise_variance(problem)
+    noise = coefficient_noise(problem)
     if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
-    grid = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
+    exponents = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
+    lam = _least(lambda lam: risk_score(problem, lam, noise), problem.scale, exponents)
+    if is_misfit(problem) or not explained:
+        # Beyond the largest sigma^2 all that still moves is the brightness, on its way to black.
+        candidates = problem.scale * 10.0 ** exponents[exponents <= 0]
+        lam = min([lam, *candidates[candidates > lam]], key=lambda lam: movement(problem, lam))
+    return lam
 
-    def score(exponent: float) -> float:
-        return risk_score(problem, problem.scale * 10.0**exponent, noise)
 
-    best = int(np.argmin([score(exponent) for exponent in grid]))
-    if best == 0 and risk_score(problem, 0.0, noise) <= score(grid[0]):
+def _least(score: Callable[[float], float], scale: float, exponents: FloatArray) -> float:
+    """Lambda of the least ``score``: of ``scale`` times ten to the ``exponents``, refined at the best, or 0."""
+    best = int(np.argmin([score(scale * 10.0**exponent) for exponent in exponents]))
+    if best == 0 and score(0.0) <= score(scale * 10.0 ** exponents[0]):
         return 0.0
-    lower, upper = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    refined = minimize_scalar(score, bounds=(lower, upper), method="bounded", options={"xatol": 1e-3})
-    return float(problem.scale * 10.0 ** float(refined.x))
+    lower, upper = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
+    refined = minimize_scalar(
+        lambda exponent: score(scale * 10.0**exponent),
+        bounds=(lower, upper),
+        method="bounded",
+        options={"xatol": 1e-3},
+    )
+    return float(scale * 10.0 ** float(refined.x))

@@ -12,6 +12,7 @@ and slab i touches only the blocks that pattern i lights.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -24,6 +25,9 @@ from mitsim.core.errors import MitsimError
 IndexArray = npt.NDArray[np.intp]
 Method = Literal["svd", "gram"]
 Structure = Literal["auto", "block", "full"]
+_STRIPS = 8
+"""Strips of sensor rows that alternate between the two halves: some on either side of all that varies slowly over the
+sensor, and each wider than a feature of the mask or a neighbour's crosstalk."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +99,26 @@ class Side:
     def accumulated_size(self) -> int:
         """Length of this side of W."""
         return len(self.singular) if self.projected else self.scene_size
+
+    @cached_property
+    def halves(self) -> tuple[IndexArray, IndexArray]:
+        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.halves` holds against each other."""
+        odd = np.arange(self.sensor_size) // -(-self.sensor_size // _STRIPS) % 2 == 1
+        return np.flatnonzero(~odd), np.flatnonzero(odd)
+
+    @cached_property
+    def first_half(self) -> FloatArray:
+        """G = U_0^T U_0 (r, r), with U_0 the rows of U in the first half of the sensor: what that half sees of W."""
+        size = self.accumulated_size
+        gram = np.zeros((size, size))
+        for slab in self.slabs:
+            rows = slab.matrix[self.halves[0]]
+            columns = np.arange(size)[slab.columns]
+            gram[np.ix_(columns, columns)] += rows.T @ rows
+        if self.projected:
+            return gram
+        scale = np.divide(1.0, self.singular, out=np.zeros_like(self.singular), where=self.singular > 0)
+        return np.asarray(scale[:, None] * (self.basis.T @ gram @ self.basis) * scale)
 
 
 def pattern_blocks(patterns: FloatArray) -> tuple[IndexArray, ...]:

@@ -32,6 +32,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.accumulator import Accumulator, centred_columns
+from mitsim.reconstruct.halves import Halves
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.sides import Method, Side, Structure, check_choices, factorise, group_pixels
 from mitsim.reconstruct.status import Status, Verdict
@@ -141,12 +142,13 @@ class Prepared:
             total = self.left.pattern_count * self.right.pattern_count
             raise MitsimError(f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all")
         sigma = np.outer(self.left.singular, self.right.singular)
-        projected = frames.sum
+        quarters = frames.quarters
         if self.method == "gram":
-            rotated = self.left.basis.T @ projected @ self.right.basis
-            projected = np.divide(rotated, sigma, out=np.zeros_like(sigma), where=sigma > 0)
+            rotated = self.left.basis.T @ quarters @ self.right.basis
+            quarters = np.divide(rotated, sigma, out=np.zeros_like(quarters), where=sigma > 0)
         data_count = self.left.data_rows * self.right.data_rows
-        return DiagonalProblem(sigma, projected, frames.energy, data_count)
+        halves = Halves(quarters, self.left, self.right)
+        return DiagonalProblem(sigma, quarters.sum(axis=(0, 1)), frames.energy, data_count, halves)
 
     def image(self, coefficients: npt.ArrayLike) -> FloatArray:
         """Scene image (n, n') of ``coefficients`` (r, r') in the diagonal basis: V_L coefficients V_R^T."""
@@ -156,18 +158,30 @@ class Prepared:
         """Adjoint of :meth:`image`: coefficients (r, r') V_L^T ``image`` V_R of an image (n, n')."""
         return np.asarray(self.left.basis.T @ np.asarray(image) @ self.right.basis)
 
-    def solve(self, frames: Accumulator, lam: float | Literal["auto"] = "auto") -> Solution:
+    def solve(self, frames: Accumulator, lam: float | Literal["auto"] = "auto", explained: bool = True) -> Solution:
         """Tikhonov solution of the added ``frames``.
 
-        ``lam`` is lambda >= 0 in the unit of (Phi_L Phi_R)^2; 0 gives the pseudo-inverse, in which singular
-        values below max(rows, columns) eps of the largest of their side count as zero. ``"auto"`` chooses
-        it by an unbiased risk estimate. MitsimError for missing frames or another lambda.
+        Parameters
+        ----------
+        frames
+            all of them.
+        lam
+            lambda >= 0 in the unit of (Phi_L Phi_R)^2; 0 gives the pseudo-inverse, in which singular values below
+            max(rows, columns) eps of the largest of their side count as zero; ``"auto"`` chooses it by
+            :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
+        explained
+            False where factors are known not to explain what the camera sees, which ``auto`` then heeds.
+
+        Raises
+        ------
+        MitsimError
+            for missing frames or another lambda.
         """
         problem = self.problem(frames)
         if isinstance(lam, str):
             if lam != "auto":
                 raise MitsimError(f"lambda is {lam!r}; give a number of at least 0, or auto")
-            lam = automatic_lambda(problem)
+            lam = automatic_lambda(problem, explained)
         lam = float(lam)
         if not (np.isfinite(lam) and lam >= 0):
             raise MitsimError(f"lambda is {lam}; give a finite number of at least 0, or auto")

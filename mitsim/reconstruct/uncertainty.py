@@ -36,7 +36,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.framefile import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.noise import FrameNoise, moved_responses
 from mitsim.reconstruct.regularisation import DiagonalProblem
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
@@ -151,7 +151,7 @@ class Propagation:
         left, right = self._sides
         gain = self.gain
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
-        moved = [_moved(*side) for side in zip(self._sides, self.factors, self.patterns, strict=True)]
+        moved = [moved_responses(*side) for side in zip(self._sides, self.factors, self.patterns, strict=True)]
         seen = moved[0].T @ rows @ (right.basis * right.singular), (left.basis * left.singular).T @ columns @ moved[1]
         return sum((np.square(self.prepared.image(gain * each)) for each in seen), np.zeros_like(image))
 
@@ -282,16 +282,6 @@ def _responses(side: Side, patterns: FloatArray) -> FloatArray:
         part[:, slab.columns] = slab.matrix
     products = np.einsum("ima,jma->aij", stack, stack, optimize=True)
     return np.asarray(np.einsum("pi,aij,pj->ap", patterns, products, patterns, optimize=True))
-
-
-def _moved(side: Side, factor: FloatArray, patterns: FloatArray) -> FloatArray:
-    """(n, r) sum_j diag(p_j) Phi'^T U_j: what coefficients see of light that is one pixel beside the centre of its
-    own."""
-    slope = np.gradient(factor, axis=1) if factor.shape[1] > 1 else np.zeros_like(factor)
-    total = np.zeros((factor.shape[1], len(side.singular)))
-    for column, slab in zip(patterns.T, side.slabs, strict=True):
-        total[:, slab.columns] += column[:, None] * (slope.T @ slab.matrix)
-    return total
 
 
 def _together(parts: list[FloatArray]) -> FloatArray:

@@ -45,12 +45,14 @@ class Paths:
     """Which light is followed besides projector - surface - camera.
 
     ``mirrors``: over delta reflections and transmissions on the camera's side; ``interreflection``: any number of
-    bounces; ``emitters``: other lights of the scene, all of them one class of ambient light.
+    bounces; ``emitters``: other lights of the scene, all of them one class of ambient light. ``caustics_alone``: of all
+    this, only what mirrors bring from the projector's lens to the last surface, which no connection finds.
     """
 
     mirrors: bool = False
     interreflection: bool = False
     emitters: tuple[mi.Emitter, ...] = ()
+    caustics_alone: bool = False
 
 
 class FromCameraTracer(Tracer):
@@ -155,7 +157,7 @@ class _Walk(Walk):
             self._emitter_hit(si)
         self.active &= si.is_valid()
         bsdf = si.bsdf()
-        if not first:
+        if not (first or self.paths.caustics_alone):
             self._connect(si, bsdf)
         for emitter in self.paths.emitters:
             self._light(si, bsdf, emitter)
@@ -225,6 +227,8 @@ class _Walk(Walk):
         seen in a mirror, it is the projector's side's.
         """
         active = self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
+        if self.paths.caustics_alone:
+            active &= self.by_delta
         hit = self.connector.hit(self.ray, si.t, self.rng, active, self.since)
         share = dr.select(self.by_delta, 1, self._share(self.came_pdf, hit.pdf))
         self._keep_of_projector(hit.met, self._radiance(hit.radiance) * share, hit.pixel, self.surfaces - 1)

@@ -23,6 +23,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
 from mitsim.scene.darkness import why_dark
+from mitsim.transport.left_out import left_out_light
 from mitsim.transport.lobes import SharpLight, sharp_light
 
 STAGES = ("cells", "effects", "anchors")
@@ -40,6 +41,8 @@ _FRAMES_AS_MANY = 20.0
 """Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
 _LOBE_RAYS = 2**20
 """Rays that look for sharp lobes: a lobe of 1e-4 of the hemisphere is met a hundred times."""
+_CAUSTIC_PATHS = 2**20
+"""Paths that look for light that is left out: a thousandth of the light that all curved glass sends is met 30 times."""
 _FEWEST_HITS = 30.0
 """Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""
 _FAINT = 1e-3
@@ -125,6 +128,10 @@ class Look:
         """How frames are formed."""
         return self.fine.forming(self.lighting)
 
+    @cached_property
+    def _left_out(self) -> float:
+        return _left_out(self.switched.simulation, self.seed, self._light)
+
     @property
     def evidence(self) -> Evidence:
         """What has been found."""
@@ -144,6 +151,7 @@ class Look:
             forming=self.forming,
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
+            left_out=self._left_out,
             reach=self._base.reach,
             sharp=apart,
             sharp_light=switched.sharp_effort(),
@@ -173,6 +181,18 @@ def _sharp(simulation: Simulation, seed: int) -> SharpLight:
         return SharpLight.none(simulation.bench.n**2)
     parts = loaded.scene, loaded.camera, simulation.physics.projector, simulation.physics.geometry
     return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
+
+
+def _left_out(simulation: Simulation, seed: int, direct: float) -> float:
+    """Light that no tracer finds, over that and ``direct`` light."""
+    loaded, physics = simulation.bench.loaded, simulation.physics
+    if not loaded.mirrors:
+        return 0.0
+    samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
+    own = integer(seed, "pilot", "caustics")
+    parts = loaded.scene, loaded.camera, physics.projector, simulation.aim
+    light = left_out_light(*parts, physics.geometry, own, samples)
+    return light / (light + direct) if light else 0.0
 
 
 def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float]:

@@ -16,8 +16,9 @@ from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.rig.patterns import Lighting
 
-_SHOTS = 4
-"""Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming."""
+_SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
+"""Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming; but more
+where they show fewer pixels than this all together, which are no fair sample of the scene."""
 _COLUMNS = 64
 """Columns of pixels that the pilot looks at: a frame's neighbours are alike, and each column costs its forming."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
@@ -54,7 +55,9 @@ class Sample:
         """A few shots of ``lighting`` and columns of a sensor of ``pixels`` a side, evenly spread."""
         shots, count = len(lighting.weights), min(pixels, _COLUMNS)
         columns = (np.arange(count) + (np.arange(count) * _GOLDEN) % 1) * pixels / count
-        chosen = np.unique(np.linspace(0, shots - 1, min(shots, _SHOTS)).astype(int))
+        lit = np.bincount(lighting.labels, minlength=lighting.weights.shape[1]) @ (lighting.weights[0] != 0)
+        wanted = min(max(_SHOTS, _SHOWN // max(int(lit), 1)), _MOST_SHOTS, shots)
+        chosen = np.unique(np.linspace(0, shots - 1, wanted).astype(int))
         return cls(lighting.shots(chosen), columns.astype(np.int64))
 
     @property

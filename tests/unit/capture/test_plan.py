@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.capture.choice import cheapest, doubt, parts_of, predicted
 from mitsim.capture.effects import EFFECTS, SWITCHES, parse_switches
-from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Evidence, Forming, Noise, Part
+from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Estimate, Evidence, Forming, Noise, Part
 from mitsim.capture.plan import Plan, PlanRow, SceneFacts, check_accuracy, decide
 from mitsim.capture.prices import FIXED
 from mitsim.core.errors import MitsimError
@@ -299,8 +299,8 @@ def test_sampling_gets_what_is_left(accuracy: float) -> None:
     assert 0 < found.sampling_target < accuracy
     if not found.warnings:
         assert math.hypot(found.systematic_bound, found.sampling_target) <= accuracy
-    total = found.total(found.sampling_target)
-    assert total.value <= total.bound
+    total = found.total(Estimate(0.8 * found.sampling_target, found.sampling_target))
+    assert total.value == pytest.approx(math.hypot(found.systematic_error, 0.8 * found.sampling_target))
     assert total.bound == pytest.approx(math.hypot(found.systematic_bound, found.sampling_target))
 
 

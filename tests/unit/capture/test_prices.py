@@ -1,17 +1,17 @@
 """What simulating is predicted to take: multiplications counted by hand, and the pilot's own frame found again."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 
 from mitsim.capture.evidence import GROUPS, Forming
-from mitsim.capture.prices import FIXED, Numbers, Paces, forming_seconds, optics_seconds, paces_of
+from mitsim.capture.prices import FIXED, Numbers, Paces, forming_seconds, optics_seconds, paces_of, tracing_seconds
 from mitsim.optics.frames import PROBES
-from tests.unit.capture.test_plan import EVIDENCE
+from tests.unit.capture.test_plan import EVIDENCE, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
 ONE = Numbers.coarsest()
-COUNTED = Paces(direct=0.0, anchored=0.0, indirect=0.0, from_camera=0.0, product=1.0, entry=0.0)
+COUNTED = Paces(**{**{pace.name: 0.0 for pace in fields(Paces)}, "product": 1.0})
 """Paces at which seconds are multiplications of forming frames."""
 
 
@@ -71,3 +71,12 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
         ({"anchors": 2.0, "indirect": 1.0}, (1 + 2) * 3 * one),
     ):
         assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
+
+
+def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_all_anchors() -> None:
+    """Samples are whole; differences between 3 x 3 anchors take nine connections each, and one anchor has none."""
+    settings = replace(plan().settings, direct_samples=2.5, anchored_samples=4.0)
+    paces, paths = replace(COUNTED, direct=1.0, anchored=1.0), EVIDENCE.direct.paths
+    several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), paces) for count in (3, 1))
+    assert several["direct"] == one["direct"] == GROUPS * 3 * paths
+    assert several["anchored"] == 9 * GROUPS * 4 * EVIDENCE.anchored.paths and one["anchored"] == 0

@@ -1,5 +1,7 @@
 """The automatic lambda is as good as the oracle's, at the anchor geometry and under sensor noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from skimage import data
@@ -10,6 +12,8 @@ from mitsim.reconstruct.regularisation import (
     RISK_POWER,
     DiagonalProblem,
     automatic_lambda,
+    coefficient_noise,
+    is_misfit,
     noise_variance,
     risk_score,
 )
@@ -46,6 +50,27 @@ def captured(factor, image, k, peak=1e4, read_noise=2.24, seed=0):
     return prepared, sums
 
 
+def under_uniform_light(model, truth, image, seed):
+    """Prepared ``model``, a pair of factors, and the frame of the factor ``truth``, 1e4 electrons at most."""
+    frame, one = truth @ image @ truth.T, np.ones((N, 1))
+    gain, rng = 1e4 / frame.max(), np.random.default_rng([seed, 99])
+    prepared = prepare(*model, one, one)
+    sums = prepared.accumulator()
+    sums.add((rng.poisson(gain * frame) + 2.24 * rng.normal(size=frame.shape)) / gain, 0, 0)
+    return prepared, sums
+
+
+def lost(prepared, sums, truth, **known):
+    """Decibels that the automatic lambda loses against the best of 41, and that of white noise alone."""
+    problem = prepared.problem(sums)
+    best = max(psnr(prepared.solve(sums, problem.scale * part).image, truth) for part in np.logspace(-10, 0, 41))
+    white = automatic_lambda(replace(problem, halves=None))
+    return (
+        best - psnr(prepared.solve(sums, "auto", **known).image, truth),
+        best - psnr(prepared.solve(sums, white).image, truth),
+    )
+
+
 def psnr(image, truth):
     return -10 * np.log10(np.mean((image - truth) ** 2))
 
@@ -74,9 +99,45 @@ def test_chosen_lambda_is_the_minimum_of_the_score(factor, photograph):
     prepared, sums = captured(factor, photograph, 5)
     problem = prepared.problem(sums)
     chosen = automatic_lambda(problem)
-    noise = noise_variance(problem)
+    noise = coefficient_noise(problem)
     others = [risk_score(problem, chosen * step, noise) for step in (0.5, 0.9, 1.1, 2.0)]
     assert risk_score(problem, chosen, noise) < min(others)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_sheet_far_from_its_place_is_seen_and_lambda_follows(factor, photograph, seed):
+    """At 380 mm, calibrated at 400: the noise outside the model's range is 1.7 times that within, and white noise alone
+    loses 23 dB. (Planted: the misfit missed; candidates up to ten times the largest sigma^2, which lose 9 dB.)"""
+    profile = mls_mask().terms[0][1]
+    there = scene_factor(profile, 0.06, centred_edges(512, 0.01172), centred_edges(N, 120 / N), 2.0, 380.0)
+    prepared, sums = under_uniform_light((factor, factor), there, photograph, seed)
+    assert is_misfit(prepared.problem(sums))
+    automatic, white = lost(prepared, sums, photograph)
+    assert automatic < 1.0
+    assert white > 10
+
+
+def test_what_the_frames_cannot_say_may_be_told(factor, photograph):
+    """At 395 mm the error lies within the model's range, where it looks like an image: noise alone loses 6 dB and more.
+    Told that the factors do not explain the frames, the steadiest image loses less than 1."""
+    profile = mls_mask().terms[0][1]
+    there = scene_factor(profile, 0.06, centred_edges(512, 0.01172), centred_edges(N, 120 / N), 2.0, 395.0)
+    prepared, sums = under_uniform_light((factor, factor), there, photograph, 0)
+    assert not is_misfit(prepared.problem(sums))
+    assert lost(prepared, sums, photograph)[0] > 3
+    assert lost(prepared, sums, photograph, explained=False)[0] < 1.0
+
+
+def test_noise_of_the_calibration_counts(factor, photograph):
+    """Factors whose errors strike the brightest rows and columns 30 times as hard as the sensor's noise does: lambda
+    still loses less than half a decibel, and the noise that it takes for them is in the first column and row."""
+    rng = np.random.default_rng(5)
+    scale = 0.03 * np.sqrt(np.mean(factor**2))
+    model = tuple(factor + scale * rng.normal(size=factor.shape) for _ in range(2))
+    prepared, sums = under_uniform_light(model, factor, photograph, 5)
+    noise = coefficient_noise(prepared.problem(sums))
+    assert noise[0, 0] > 5 * np.median(noise)
+    assert lost(prepared, sums, photograph)[0] < 0.5
 
 
 def test_the_score_is_the_expected_squared_error_up_to_a_constant():

@@ -98,6 +98,7 @@ def test_condition_covers_all_blocks_and_the_worse_side():
     left, right = np.diag([8.0, 1.0, 4.0, 1.0]), np.diag([3.0, 1.0])
     prepared = prepare(left, right, dots(4, 2), np.ones((2, 1)))
     assert prepared.condition == pytest.approx(64.0)
+    assert (prepared.unknowns, prepared.rank) == (4 * 2, 4 * 2)
     whole = np.kron(left.T @ left * (dots(4, 2) @ dots(4, 2).T), right.T @ right)
     assert prepared.condition_whole == pytest.approx(np.linalg.cond(whole), rel=1e-9)
     assert prepare(right, left, np.ones((2, 1)), dots(4, 2)).condition == pytest.approx(64.0)

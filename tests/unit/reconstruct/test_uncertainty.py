@@ -11,6 +11,7 @@ import pytest
 
 from mitsim.core.framefile import read_frame
 from mitsim.core.manifests import Digital, FactorNoise
+from mitsim.reconstruct.noise import EDGES, print_energy
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem
 from mitsim.reconstruct.solver import prepare
@@ -101,6 +102,24 @@ def test_print_within_a_pixel() -> None:
     exact += np.square(small.solver @ small.matrix(left, np.gradient(right, axis=1)) @ columns.ravel())
     assert small.propagation.of_print(small.image).ravel() == pytest.approx(exact, rel=1e-9)
     assert not small.propagation.of_print(np.ones((N, N))).any(), "an even print has nothing within its pixels"
+
+
+@pytest.mark.parametrize("patterns", FAMILIES)
+def test_energy_of_print_within_a_pixel(patterns: str) -> None:
+    """What the same light puts outside the range of A. (Planted: the part inside not taken off.)"""
+    small = Small(patterns)
+    left, right = small.factors
+    rows, columns = (np.gradient(small.image, axis=axis) / 12 for axis in (0, 1))
+    basis, _ = np.linalg.qr(small.A)
+    exact = 0.0
+    for matrix, slope in (
+        (small.matrix(np.gradient(left, axis=1), right), rows),
+        (small.matrix(left, np.gradient(right, axis=1)), columns),
+    ):
+        moved = matrix @ slope.ravel()
+        exact += float(np.square(moved - basis @ (basis.T @ moved)).sum())
+    got = print_energy(small.propagation.prepared, small.factors, small.patterns, small.image)
+    assert got == pytest.approx(EDGES * exact, rel=1e-9)
 
 
 def test_bias_is_what_lambda_takes_away() -> None:

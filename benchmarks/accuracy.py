@@ -1,0 +1,163 @@
+"""Measured total error of `mitsim capture` against an independent answer, and its seconds, predicted and taken.
+
+    python benchmarks/accuracy.py --json FILE [--scene photograph ...] [--accuracy 1e-2 ...] [--old PATH]
+
+The answer is light of two other seeds with every effect of the scene, one step finer in anchors, layers and cells than
+the plan at 3e-4, and coarse cells as fine as the rest. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the
+squared error of frames a without the noise of the answer; its standard error is the jackknife's over shots. Captures
+are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version to be timed
+and judged beside this one. What FILE holds already is not repeated, so the work can be cut short at any time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mitsim as ms
+from mitsim.capture.choice import predicted
+from mitsim.capture.exposer import Exposer
+from mitsim.capture.light import Sampling, trace_light
+from mitsim.core.framefile import read_frame
+from mitsim.core.job import Job
+from mitsim.core.seeds import integer
+from mitsim.study.knobs import Stand
+
+SCENES = (
+    *("photograph", "colour_chart", "resolution_target", "keystone", "gift_card", "corner", "cards", "metal_blade"),
+    *("compact_disc", "mirror", "lamp_bench", "cookie_bag"),
+)
+PATTERNS, ACCURACIES = "dots:7", (1e-2, 3e-3, 1e-3, 3e-4)
+FINEST, NOISE = 3e-4, 2e-3
+"""Accuracy whose settings the answer goes one step beyond, and the Monte Carlo error of each of its halves, whose own
+energy drops out."""
+SHOTS = (3, 17, 24, 30, 44)
+"""Shots that are judged, none of which the plan looks at."""
+_OLD_START = "import sys; from mitsim.cli import main; sys.exit(main())"
+SEED, ANSWERS = 0, (811, 812)
+
+
+def answer(scene: str, noise: float) -> list[np.ndarray]:
+    """Irradiance (shots, pixels, pixels) of the judged shots in two independent halves."""
+    bench = ms.open_bench(scene)
+    family = bench.family(PATTERNS, SEED)
+    stand = Stand(bench, family, ANSWERS[0], Job(), FINEST)
+    finest = stand.finest(stand.plan(FINEST), 1.0)
+    samples = predicted(noise, stand.evidence, finest.settings, {}).settings
+    plan = replace(finest, settings=samples, sampling_target=noise)
+    shots = family.lighting.shots(np.array(SHOTS))
+    halves = []
+    for seed in ANSWERS:
+        light = trace_light(bench, plan, shots, integer(seed, "answer"), Sampling(by_pixel=False))
+        halves.append(np.stack([frame.irradiance for frame in light.merged().frames(shots, 0)]))
+    return halves
+
+
+def captured(scene: str, accuracy: float, tree: Path | None) -> dict[str, Any]:
+    """Seconds and manifest of a capture by the version in ``tree`` (this one without), and its judged frames."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        command = [
+            sys.executable,
+            *(["-c", _OLD_START] if tree else ["-m", "mitsim"]),
+            "capture",
+            scene,
+            "--patterns",
+            PATTERNS,
+            "--seed",
+            str(SEED),
+        ]
+        command += ["--accuracy", str(accuracy), "-o", str(run), "--json"]
+        path = {"PYTHONPATH": str(tree)} if tree else {}
+        started = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **path}, cwd=folder)
+        seconds = time.perf_counter() - started
+        if not (run / "manifest.json").exists():
+            raise SystemExit(f"{scene} at {accuracy:g}: {done.stderr}")
+        manifest = json.loads((run / "manifest.json").read_text())
+        names = [shot["file"] for shot in manifest["patterns"]["captures"]]
+        frames = [read_frame(run / names[shot])[0]["electrons"] for shot in SHOTS]
+    exposure = manifest.get("digital", manifest)["exposure_s"]
+    return {"seconds": seconds, "manifest": manifest, "frames": np.stack(frames), "exposure_s": exposure}
+
+
+def squared_error(frames: np.ndarray, halves: list[np.ndarray]) -> tuple[float, float]:
+    """Squared relative error of ``frames`` and its standard error, by the jackknife over shots."""
+    first, second = halves
+    products = ((frames - first) * (frames - second)).sum(axis=(1, 2))
+    energies = (first * second).sum(axis=(1, 2))
+    without = (products.sum() - products) / (energies.sum() - energies)
+    count = len(products)
+    spread = np.sqrt((count - 1) / count * np.square(without - without.mean()).sum())
+    return float(products.sum() / energies.sum()), float(spread)
+
+
+def judged(scene: str, accuracy: float, halves: list[np.ndarray], tree: Path | None) -> dict[str, Any]:
+    """One capture, held against the answer."""
+    run = captured(scene, accuracy, tree)
+    bench = ms.open_bench(scene)
+    unit = float(Exposer(bench.rig, run["exposure_s"], 0).electrons(_Unit()))
+    square, spread = squared_error(run["frames"].astype(np.float64) / unit, halves)
+    manifest = run["manifest"]
+    plan = manifest["plan"]
+    return {
+        "error": float(np.sqrt(max(square, 0))),
+        "low": float(np.sqrt(max(square - 2 * spread, 0))),
+        "high": float(np.sqrt(max(square + 2 * spread, 0))),
+        "seconds": run["seconds"],
+        "predicted_seconds": plan["predicted_seconds"],
+        **{name: manifest.get(name) for name in ("total_error", "total_error_bound", "mc_error", "warnings")},
+        "stages": manifest["seconds"],
+        "predicted": plan.get("predicted"),
+        "settings": plan["settings"],
+    }
+
+
+class _Unit:
+    """A frame of 1 W m^-2."""
+
+    irradiance = 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--scene", action="append", default=[])
+    parser.add_argument("--accuracy", action="append", type=float, default=[])
+    parser.add_argument("--old", type=Path)
+    parser.add_argument("--noise", type=float, default=NOISE)
+    options = parser.parse_args()
+    found = json.loads(options.json.read_text()) if options.json.exists() else {}
+    for scene in options.scene or SCENES:
+        rows = found.setdefault(scene, {})
+        kept, halves = options.json.with_suffix(f".{scene}.npy"), None
+        for accuracy in options.accuracy or ACCURACIES:
+            for name, tree in (("new", None), ("old", options.old)):
+                key = f"{name} {accuracy:g}"
+                if key in rows or (name == "old" and tree is None):
+                    continue
+                if halves is None:
+                    if not kept.exists():
+                        np.save(kept, np.stack(answer(scene, options.noise)))
+                    halves = list(np.load(kept))
+                rows[key] = row = judged(scene, accuracy, halves, tree)
+                said = f"error {row['error']:.2e} [{row['low']:.1e}, {row['high']:.1e}]"
+                print(
+                    f"{scene} {key}: {said}, {row['seconds']:.1f} s, predicted {row['predicted_seconds']:.1f}",
+                    flush=True,
+                )
+                options.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

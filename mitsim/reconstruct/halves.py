@@ -1,0 +1,84 @@
+"""W by quarters of the sensor in; how much noise its numbers hold out, wherever it comes from.
+
+Where Y = U S X' + noise, with X' the image in the diagonal basis, the half W_0 = U_0^T Y of the sum over the sensor's
+rows is G W up to noise, G = U_0^T U_0: in W_0 - G W there is no image, and nothing else that both halves agree on.
+White noise gives its number i the variance G (I - G)_ii times its own, since G and I - G commute. An error E of the
+left factor that is independent from sensor row to row, as a calibration's noise is, shows too: U^T E X S' strikes all
+numbers of a column of W alike, by that column's light. Halves of the columns tell the same of the right factor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.reconstruct.sides import Side
+
+_LEAST_SPREAD = 0.01
+"""Least G (I - G)_ii that a half is told from the whole by: 1/4 where both halves see as much, 0 where a side has no
+more rows than unknowns."""
+_MEDIAN = 0.4549
+"""Median of the square of a standard normal number."""
+MEDIAN_SPREAD = 2.33
+"""Relative standard deviation of the median of n such squares, times the square root of n."""
+_SIGNIFICANT = 2.0
+"""Standard deviations above which a row or column is noisier than others: of chance excess, one in forty is left."""
+
+
+@dataclass(frozen=True, eq=False)
+class Halves:
+    """Quarters (2, 2, r, r') of W in the diagonal basis, and the sides whose halves they are sums over."""
+
+    quarters: FloatArray
+    left: Side
+    right: Side
+
+    @cached_property
+    def _squares(self) -> tuple[FloatArray, FloatArray]:
+        """(r, r') squared differences of the halves of rows, and of columns, in units of a number's variance; NaN where
+        halves cannot be told apart."""
+        rows, columns = self.left.first_half, self.right.first_half
+        total = self.quarters.sum(axis=(0, 1))
+        by_row = self.quarters[0].sum(axis=0) - rows @ total
+        by_column = self.quarters[:, 0].sum(axis=0) - total @ columns
+        return np.square(by_row) / _spread(rows)[:, None], np.square(by_column) / _spread(columns)
+
+    @cached_property
+    def typical(self) -> float:
+        """Noise variance of most numbers, by the median; NaN when unknown."""
+        return _median(np.concatenate([square[self._measured] for square in self._squares]))
+
+    @cached_property
+    def excess(self) -> FloatArray:
+        """(r, r') noise variance of each number above that of most: what is significant in its row and its column."""
+        row, column = (np.where(self._measured, square, np.nan) for square in self._squares)
+        return _excess(row.T) + _excess(column)[:, None]
+
+    @property
+    def _measured(self) -> npt.NDArray[np.bool_]:
+        return np.asarray(np.outer(self.left.singular, self.right.singular) > 0)
+
+
+def _spread(half: FloatArray) -> FloatArray:
+    """(r,) variance of W_0 - G W for white noise of variance 1: the diagonal of G (I - G); NaN where too small."""
+    spread = np.diag(half) - np.einsum("ij,ji->i", half, half)
+    return np.where(spread >= _LEAST_SPREAD, spread, np.nan)
+
+
+def _median(squares: FloatArray) -> float:
+    """Variance of normal numbers by the median of their ``squares``, which a few that are no noise do not move."""
+    known = squares[~np.isnan(squares)]
+    return float(np.median(known)) / _MEDIAN if known.size else float("nan")
+
+
+def _excess(squares: FloatArray) -> FloatArray:
+    """(rows,) variance of each row of ``squares`` above that of the middle row, beyond what chance explains."""
+    level = np.array([_median(row) for row in squares])
+    count = np.maximum((~np.isnan(squares)).sum(axis=1), 1)
+    middle = np.nanmedian(level) if not np.isnan(level).all() else np.nan
+    significant = level > middle * (1 + _SIGNIFICANT * MEDIAN_SPREAD / np.sqrt(count))
+    return np.where(significant, level - middle, 0.0)

@@ -1,0 +1,116 @@
+"""Parts of the misfit in closed form, where whole sessions would hardly show a wrong term."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mitsim.core.manifests import Digital, FactorNoise, Patterns
+from mitsim.reconstruct import misfit
+from mitsim.reconstruct.causes import Evidence, _beyond, _orthonormal
+from mitsim.reconstruct.misfit import Residuals
+from mitsim.reconstruct.noise import FrameNoise, factor_energy
+from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.uncertainty import Propagation
+from mitsim.rig.patterns import parse_patterns
+from tests.ideal_sessions import bench
+from tests.unit.reconstruct.test_factors import N, factors
+from tests.unit.reconstruct.test_misfit import SHIFT, recovered
+
+
+def test_noise_outside_two_ranges_is_taken_off_and_light_inside_is_no_misfit() -> None:
+    """6 x 5 data less 2 x 3 that the ranges take up, each of variance 0.5."""
+    rng = np.random.default_rng(1)
+    left, right = (np.linalg.qr(rng.normal(size=shape))[0] for shape in ((6, 2), (5, 3)))
+    inside = left @ rng.normal(size=(2, 3)) @ right.T
+    assert _beyond(np.zeros((6, 5)), 0.5, left, right) == pytest.approx(-12.0)
+    assert _beyond(inside, 0.0, left, right) == pytest.approx(0, abs=1e-12)
+    assert _beyond(inside + 1, 0.0, left, right) == pytest.approx(
+        30 - np.square(left.sum(axis=0)).sum() * np.square(right.sum(axis=0)).sum()
+    )
+
+
+def test_directions_that_are_rounding_of_the_largest_are_none() -> None:
+    matrix = np.eye(5, 3) * [1.0, 1e-8, 1e-18]
+    assert _orthonormal(matrix).shape == (5, 2)
+
+
+def test_the_groups_that_are_looked_at_are_spread_over_both_sides() -> None:
+    family = parse_patterns("dots:5", N)
+    evidence = Evidence(factors(), (family.left.astype(float), family.right.astype(float)))
+    first = {(int(rows.pixels[0]), int(columns.pixels[0])) for rows, columns in evidence._groups}
+    assert first == {(0, 1), (2, 4), (3, 0), (4, 3)}
+
+
+def test_what_is_expected_of_residuals_adds_up() -> None:
+    """Noise of the data that the fit does not take up, all of the rendering's error, and of the factors'."""
+    rng = np.random.default_rng(2)
+    prepared = prepare(rng.random((16, 3)), rng.random((20, 2)), np.ones((3, 1)), np.ones((2, 1)))
+    sums = Residuals(prepared, np.zeros((3, 2)), SimpleNamespace(rendering=5.0), None)  # type: ignore[arg-type]
+    sums.variance[:], sums.power[:] = 2.0, rng.random((8, 8))
+    assert sums.pixels.sum() == 320
+    assert sums.expected(7.0).sum() == pytest.approx(2.0 * 64 * (1 - 6 / 320) + 5 + 7)
+
+
+def test_an_image_is_flagged_only_beyond_chance_and_beyond_what_fine_print_leaves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A sheet beside its place, at thresholds that it does not reach."""
+
+    def flagged() -> bool:
+        found = recovered(bench(SHIFT)).misfit
+        return found is not None and found.flagged
+
+    assert flagged()
+    for name in ("UNEXPLAINED", "UNEXPLAINED_TILE"):
+        monkeypatch.setattr(misfit, name, 1.0)
+    assert not flagged(), "it is beyond chance"
+    monkeypatch.undo()
+    monkeypatch.setattr(misfit, "CHANCE", 1e9)
+    assert not flagged(), "it is large"
+
+
+def test_noise_of_a_measurement_is_its_shots_and_that_of_the_dark_frame_where_one_was_taken_off() -> None:
+    """The difference of a pair has lost the dark frame. Rendering is off by its two errors, of all light."""
+    digital = Digital(
+        exposure_s=0.1, gain_dn_per_e=0.5, black_level_dn=8.0, read_noise_e=3.0, dark_current_e_per_s=20.0
+    )
+    patterns = Patterns.of(parse_patterns("uniform", 2), ["frame"])
+    manifest = SimpleNamespace(digital=digital, patterns=patterns, mc_error=3e-3, plan={"systematic_error": 4e-3})
+    noise = FrameNoise(manifest, dark_variance=50.0)  # type: ignore[arg-type]
+    light = np.array([100.0, 4000.0])
+    np.testing.assert_allclose(noise.of(light, 1), digital.variance(light, 1) + 50)
+    np.testing.assert_allclose(noise.of(light, 2), digital.variance(light, 2))
+    noise.power = 8.0
+    assert noise.rendering == pytest.approx(2.5e-5 * 8)
+
+
+def oblong() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Factors 5 x 3 and 6 x 2, and two patterns of each side: no size is another's."""
+    rng = np.random.default_rng(4)
+    return [rng.random((5, 3)), rng.random((6, 2))], [rng.random((3, 2)), rng.random((2, 2))]
+
+
+def test_a_dark_frame_s_noise_goes_into_an_oblong_image_from_both_its_sides() -> None:
+    """Under uniform light, solved once for each of its 30 numbers: variances of independent numbers add up."""
+    sides, _ = oblong()
+    patterns = np.ones((3, 1)), np.ones((2, 1))
+    prepared, lam = prepare(*sides, *patterns), 0.01
+    images = []
+    for unit in np.eye(30):
+        sums = prepared.accumulator()
+        sums.add(unit.reshape(5, 6), 0, 0)
+        images.append(prepared.solve(sums, lam).image)
+    found = Propagation(prepared, (sides[0], sides[1]), patterns, lam).of_dark_frame(3.0)
+    np.testing.assert_allclose(found, 3.0 * np.square(images).sum(axis=0), rtol=1e-9)
+
+
+def test_noisy_factors_add_the_same_energy_whichever_side_is_called_left() -> None:
+    sides, patterns = oblong()
+    image = np.random.default_rng(5).random((3, 2))
+    one = factor_energy(
+        prepare(*sides, *patterns), tuple(patterns), FactorNoise(left=0.1, right=0.3, unexplained=0.0), image
+    )
+    turned = prepare(*sides[::-1], *patterns[::-1])
+    other = factor_energy(turned, tuple(patterns[::-1]), FactorNoise(left=0.3, right=0.1, unexplained=0.0), image.T)
+    assert one == pytest.approx(other, rel=1e-12) and one > 0

@@ -1,0 +1,62 @@
+"""Light that no tracer finds is measured: by a plane mirror that light meets twice, in closed form; not by windows."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.light import make_plan
+from mitsim.rig.patterns import Lighting
+from mitsim.transport.cells import aligned_grid
+from mitsim.transport.left_out import left_out_light
+from tests.unit.transport.test_panes import BALL, WALL, slab
+
+pytestmark = pytest.mark.usefixtures("variant")
+SEEDS = 4
+MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="115" y="115"/><rotate y="1" angle="90"/>
+    <translate x="-40" z="315"/></transform>
+    <bsdf type="conductor"><string name="material" value="none"/></bsdf></shape>"""
+
+
+def left_out(bench: Bench) -> tuple[float, float]:
+    """Mean over seeds of 2^21 paths, and its standard error."""
+    loaded = bench.loaded
+    grid = aligned_grid(*bench.windows, 64, 1, bench.geometry.tan_half_fov + 0.01)
+    parts = loaded.scene, loaded.camera, bench.projector_optics, grid, bench.geometry
+    light = [left_out_light(*parts, seed, 2**21 // (grid.shape[0] * grid.shape[1])) for seed in range(SEEDS)]
+    return float(np.mean(light)), float(np.std(light, ddof=1) / np.sqrt(SEEDS))
+
+
+def test_a_wall_that_is_lit_and_seen_by_a_mirror(
+    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mirror x = -40 of z = 200 to 430: light from (-140, 0, 0), the projector's image, seen from (-80, 0, 0).
+
+    The wall, of reflectance 0.5, has E = pi scale / z^2 where both images see it in the mirror: light at tan-angles
+    100/430 to 0.3, seen at 40/430 to 0.176, to 64 mm up and down. A larger lens, of
+    20 mm, casts the same light, and paths meet it six times as often; it blurs the strip of 29 mm by 0.5 mm.
+    """
+    monkeypatch.setattr("mitsim.transport.left_out._LENS", 0.05)
+    found, error = left_out(open_bench(shared_scene("twice", extra=MIRROR, sheet_z=WALL)))
+    low = max(-140 + WALL * 100 / 430, -80 + WALL * 40 / 430)
+    x, y = (np.linspace(*ends, 400) for ends in ((low, -140 + WALL * 0.3), (-64.0, 64.0)))
+    radiance = 0.5 / np.pi * np.pi * 111000 / WALL**2
+    squared = (x[:, None] + 80) ** 2 + y**2 + WALL**2
+    expected = radiance * (WALL**2 / squared**2).mean() * np.ptp(x) * np.ptp(y)
+    assert 7 * error < 0.25 * expected
+    assert abs(found - expected) < 7 * error + 0.05 * expected
+
+
+def test_windows_leave_nothing_out(shared_scene: Callable[..., Path]) -> None:
+    """But what is reflected inside of them on both ways, R^2 = 1.6e-3 each."""
+    bench = open_bench(shared_scene("window", extra=slab(220, 6, 20), sheet_z=WALL))
+    assert left_out(bench)[0] < 1e-5 * 0.02
+
+
+def test_a_plan_is_flagged_that_leaves_light_out(shared_scene: Callable[..., Path]) -> None:
+    """A glass ball before the wall: most of what is lit behind it is seen through it."""
+    ball = BALL.replace('value="5"', 'value="60"')
+    plan = make_plan(open_bench(shared_scene("ball_of_glass", extra=ball, sheet_z=WALL)), Lighting.uniform(16), 1e-2, 1)
+    assert any("left out" in warning for warning in plan.warnings) and plan.systematic_error > 0.05
