@@ -267,6 +267,11 @@ def vignetting(frame: np.ndarray) -> np.ndarray:
     return 1 + 0.05 / 3 - 0.05 * (x[:, None] + x[None, :]) / 2
 
 
+def moved(pair: Pair, axis: int) -> np.ndarray:
+    """All light one projector pixel on, along rows of cells (``axis`` 2) or along columns (4)."""
+    return pair.of_changed_light(lambda light: np.roll(light, pair.plan.settings.subdivision, axis=axis))
+
+
 MUTATIONS: dict[str, Callable[[Pair], np.ndarray]] = {
     "1 % brighter": lambda pair: 1.01 * pair.factored,
     "1 % darker": lambda pair: 0.99 * pair.factored,
@@ -276,8 +281,8 @@ MUTATIONS: dict[str, Callable[[Pair], np.ndarray]] = {
     "mask flipped": lambda pair: pair.of_changed_light(flip_scene)[::-1],
     "sensor flipped": lambda pair: pair.factored[:, ::-1],
     "rows and columns swapped": lambda pair: pair.factored.T,
-    "light one cell down": lambda pair: pair.of_changed_light(lambda light: np.roll(light, 1, axis=2)),
-    "light one cell right": lambda pair: pair.of_changed_light(lambda light: np.roll(light, 1, axis=4)),
+    "light one projector pixel down": lambda pair: moved(pair, 2),
+    "light one projector pixel right": lambda pair: moved(pair, 4),
 }
 # Under a dot pattern the reference cannot see a percent of scale.
 GEOMETRIC = [name for name in MUTATIONS if "%" not in name]

@@ -145,7 +145,8 @@ def untimed(folder: Path) -> dict[str, Any]:
     manifest = json.loads((folder / "manifest.json").read_text())
     plan = manifest["plan"]
     rows = [{**row, "seconds": 0} for row in plan["effects"]]
-    return {**manifest, "seconds": {}, "plan": {**plan, "effects": rows, "predicted_seconds": 0}}
+    untimed_plan = {**plan, "effects": rows, "predicted_seconds": 0, "predicted": {}}
+    return {**manifest, "seconds": {}, "plan": untimed_plan}
 
 
 def assert_equal_files(one: Path, other: Path) -> None:
@@ -192,14 +193,19 @@ def test_lambda_out_of_range(shots: ms.Capture, factors: ms.Factors, lam: Any) -
 def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Purposes of all light that was traced since."""
     purposes: list[str] = []
-    original = light.trace_light
+    original, truth = light.trace_light, light.trace_truth
 
     def counted(bench: Any, plan: Any, lighting: Any, seed: int, sampling: Any = None, progress: Any = None) -> Any:
         purposes.append((sampling or light.Sampling()).purpose)
         return original(bench, plan, lighting, seed, sampling, *([progress] if progress else []))
 
+    def counted_truth(*arguments: Any) -> Any:
+        purposes.append("truth")
+        return truth(*arguments)
+
     for module in (light, run):
         monkeypatch.setattr(module, "trace_light", counted)
+    monkeypatch.setattr(light, "trace_truth", counted_truth)
     return purposes
 
 
@@ -213,7 +219,7 @@ def same_light(ours: ms.Capture, theirs: ms.Capture) -> None:
 def test_light_is_that_of_a_capture(bench: ms.Bench, shots: ms.Capture, traced: list[str]) -> None:
     """Of the family that it was traced for: the same plan, and so the same paths."""
     same_light(bench.light("dots:3", accuracy=ACCURACY, seed=SEED).expose("dots:3"), shots)
-    assert traced == ["scene", "board"]
+    assert traced == ["scene", "truth"]
 
 
 def test_light_serves_any_family_and_is_traced_once(
@@ -229,7 +235,7 @@ def test_light_serves_any_family_and_is_traced_once(
     light = bench.light("dots:3", accuracy=ACCURACY, seed=SEED)
     families = "dots:1", "dots:2", "dots:5", "uniform", "hadamard:2"
     exposed = {patterns: light.expose(patterns) for patterns in families}
-    assert traced == ["scene", "board"]
+    assert traced == ["scene", "truth"]
     for patterns, ours in exposed.items():
         same_light(ours, bench.capture(planned(bench, patterns, accuracy=ACCURACY, seed=SEED)))
     assert len(traced) == 2 + 2 * len(families), "a capture of its own traces anew"

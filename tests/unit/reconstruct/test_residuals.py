@@ -70,14 +70,14 @@ def test_an_image_is_flagged_only_beyond_chance_and_beyond_what_fine_print_leave
     assert not flagged(), "it is large"
 
 
-def test_noise_of_a_measurement_is_its_shots_and_that_of_the_dark_frame_where_one_was_taken_off() -> None:
-    """The difference of a pair has lost the dark frame. Rendering is off by its two errors, of all light."""
+def test_noise_of_a_measurement_is_its_shots_and_that_of_the_ambient_frame_where_one_was_taken_off() -> None:
+    """The difference of a pair has lost the ambient frame. Rendering is off by its two errors, of all light."""
     digital = Digital(
         exposure_s=0.1, gain_dn_per_e=0.5, black_level_dn=8.0, read_noise_e=3.0, dark_current_e_per_s=20.0
     )
     patterns = Patterns.of(parse_patterns("uniform", 2), ["frame"])
     manifest = SimpleNamespace(digital=digital, patterns=patterns, mc_error=3e-3, plan={"systematic_error": 4e-3})
-    noise = FrameNoise(manifest, dark_variance=50.0)  # type: ignore[arg-type]
+    noise = FrameNoise(manifest, ambient_variance=50.0)  # type: ignore[arg-type]
     light = np.array([100.0, 4000.0])
     np.testing.assert_allclose(noise.of(light, 1), digital.variance(light, 1) + 50)
     np.testing.assert_allclose(noise.of(light, 2), digital.variance(light, 2))
@@ -91,7 +91,7 @@ def oblong() -> tuple[list[np.ndarray], list[np.ndarray]]:
     return [rng.random((5, 3)), rng.random((6, 2))], [rng.random((3, 2)), rng.random((2, 2))]
 
 
-def test_a_dark_frame_s_noise_goes_into_an_oblong_image_from_both_its_sides() -> None:
+def test_an_ambient_frame_s_noise_goes_into_an_oblong_image_from_both_its_sides() -> None:
     """Under uniform light, solved once for each of its 30 numbers: variances of independent numbers add up."""
     sides, _ = oblong()
     patterns = np.ones((3, 1)), np.ones((2, 1))
@@ -101,7 +101,7 @@ def test_a_dark_frame_s_noise_goes_into_an_oblong_image_from_both_its_sides() ->
         sums = prepared.accumulator()
         sums.add(unit.reshape(5, 6), 0, 0)
         images.append(prepared.solve(sums, lam).image)
-    found = Propagation(prepared, (sides[0], sides[1]), patterns, lam).of_dark_frame(3.0)
+    found = Propagation(prepared, (sides[0], sides[1]), patterns, lam).of_ambient_frame(3.0)
     np.testing.assert_allclose(found, 3.0 * np.square(images).sum(axis=0), rtol=1e-9)
 
 
