@@ -6,9 +6,7 @@
 ``note`` runs the command line (of the environment that ``--python`` belongs to) on the twelve shipped scenes and writes
 a checksum of every result; ``compare`` runs the same and exits with 1 when one differs. Checksums are of pixel values,
 not of files, so that metadata and file layout may change. Numbers depend on the processor's vector width and on LLVM,
-which are noted too: between machines, note the old version on the new machine first.
-
-benchmarks/frames-0.3.0.json holds the checksums of version 0.3.0.
+which are noted too: note the old version on the same machine, in an environment of its own.
 """
 
 from __future__ import annotations
@@ -43,18 +41,12 @@ def runs(scene: str, folder: Path) -> list[tuple[str, list[str], list[str]]]:
         ("dots:3", [*capture, "--patterns", "dots:3", "-o", str(folder / "dots")], ["dots"]),
     ]
     if scene in ("photograph", "cookie_bag", "mirror"):
-        more = [
+        signed = [
             *capture,
-            "--patterns",
-            "hadamard:2",
-            "--seed",
-            "7",
-            "--exposure",
-            "0.1",
-            "-o",
+            *["--patterns", "hadamard:2", "--seed", "7", "--exposure", "0.1", "-o"],
             str(folder / "hadamard"),
         ]
-        jobs.append(("hadamard:2", more, ["hadamard"]))
+        jobs.append(("hadamard:2", signed, ["hadamard"]))
         render = ["render", scene, "--accuracy", ACCURACY]
         reference = [*render, "--spp", "8", "-o", str(folder / "reference.exr")]
         factored = [*render, "--estimator", "factored", "-o", str(folder / "factored.exr")]
