@@ -130,17 +130,30 @@ class Light:
         """Where it shines."""
         return self.simulation.bench
 
-    def frames(self, lighting: Lighting, seed: int) -> ExpectedFrames:
-        """Expected frames of the shots of ``lighting``; ``seed`` is of the probes that tell their error.
+    def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
+        """Expected frames of some shots.
 
-        Light by pixel serves every family; light by class only families that never split one of its classes
-        (ValueError else).
+        Light by pixel serves every family; light by class only families that never split one of its classes.
+
+        Parameters
+        ----------
+        lighting
+            the shots.
+        seed
+            of the probes that tell their error.
+        leaking
+            whether black pixels leak, as :meth:`Simulation.expected` takes it.
+
+        Raises
+        ------
+        ValueError
+            for shots that split a class of the light.
         """
         rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
         rows[self.labels] = lighting.labels
         if not np.array_equal(rows[self.labels], lighting.labels):
             raise ValueError("the light was traced for another family of patterns")
-        return self.simulation.expected(self.groups, rows, lighting, seed)
+        return self.simulation.expected(self.groups, rows, lighting, seed, leaking)
 
     def expose(
         self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
@@ -273,7 +286,8 @@ def trace_light(
             sampling_error=math.inf,
             reached=False,
         )
-        expected = light.frames(checked, seed)
+        # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
+        expected = light.frames(checked, seed, leaking=False)
         error = monte_carlo_error(expected)
         # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
         target = sampling.target(expected) if sampling.target else plan.sampling_target

@@ -343,7 +343,9 @@ class Simulation:
             return None
         return self.bench.glint.frames(labels, self.physics.geometry, self.physics.spectrum)
 
-    def expected(self, groups: Sequence[FiledLight], rows: Labels, lighting: Lighting, seed: int) -> ExpectedFrames:
+    def expected(
+        self, groups: Sequence[FiledLight], rows: Labels, lighting: Lighting, seed: int, leaking: bool = True
+    ) -> ExpectedFrames:
         """Expected frames of all shots of a lighting.
 
         Parameters
@@ -356,9 +358,11 @@ class Simulation:
             the shots.
         seed
             of the probes that tell the Monte Carlo error.
+        leaking
+            whether black pixels leak, so that every shot lights all of them; without, shots of few pixels form faster.
         """
         first = len(rows)
-        black = self.physics.black_level
+        black = self.physics.black_level if leaking else 0.0
         emitted = black + (1 - black) * lighting.weights
         lights, ambient = [Filed(self.fine.optics, tuple(group.fine[:first] for group in groups))], []
         if self.settings.anchors > 1:
