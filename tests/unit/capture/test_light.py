@@ -13,6 +13,7 @@ from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.light import Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan, SceneFacts
+from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.rig.patterns import Lighting, parse_patterns
@@ -113,3 +114,17 @@ def test_a_plan_follows_the_users_choice(plan: Plan, bench: Bench, family: Light
     assert make_plan(bench, family, 0.3, 0, {"interreflection": True}).settings.effects >= {"interreflection"}
     with pytest.raises(MitsimError, match=r"^accuracy 0"):
         make_plan(bench, family, 0.0, 0)
+
+
+def test_sampling_is_checked_without_what_black_pixels_leak(bench: Bench, plan: Plan, family: Lighting) -> None:
+    """Frames that do not leak are those of a projector whose black is black, to the last bit.
+
+    (Planted: ``leaking`` not heeded.)
+    """
+    grey = replace(bench, rig=replace(bench.rig, projector=bench.projector.model_copy(update={"contrast_ratio": 20.0})))
+    with_black = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects | {"black-level"}))
+    light = trace_light(grey, with_black, family, 3)
+    ours = stacked(light.frames(family, 3, leaking=False))
+    sharp = replace(light, simulation=Simulation(bench, plan.settings))
+    assert np.array_equal(ours, stacked(sharp.frames(family, 3)))
+    assert stacked(light.frames(family, 3)).sum() > 1.05 * ours.sum()
