@@ -25,7 +25,6 @@ from mitsim.core.errors import MitsimError
 IndexArray = npt.NDArray[np.intp]
 Method = Literal["svd", "gram"]
 Structure = Literal["auto", "block", "full"]
-Strips = tuple[tuple[slice, ...], tuple[slice, ...]]
 _STRIPS = 8
 """Strips of sensor rows that alternate between the two halves: some on either side of all that varies slowly over the
 sensor, and each wider than a feature of the mask or a neighbour's crosstalk."""
@@ -102,11 +101,10 @@ class Side:
         return len(self.singular) if self.projected else self.scene_size
 
     @cached_property
-    def halves(self) -> Strips:
-        """Strips of sensor rows that make the two halves which :mod:`mitsim.reconstruct.halves` holds together."""
-        edges = range(0, self.sensor_size, -(-self.sensor_size // _STRIPS))
-        strips = [slice(edge, edge + edges.step) for edge in edges]
-        return tuple(strips[::2]), tuple(strips[1::2])
+    def halves(self) -> tuple[IndexArray, IndexArray]:
+        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.halves` holds against each other."""
+        odd = np.arange(self.sensor_size) // -(-self.sensor_size // _STRIPS) % 2 == 1
+        return np.flatnonzero(~odd), np.flatnonzero(odd)
 
     @cached_property
     def first_half(self) -> FloatArray:
@@ -114,7 +112,7 @@ class Side:
         size = self.accumulated_size
         gram = np.zeros((size, size))
         for slab in self.slabs:
-            rows = np.concatenate([slab.matrix[strip] for strip in self.halves[0]])
+            rows = slab.matrix[self.halves[0]]
             columns = np.arange(size)[slab.columns]
             gram[np.ix_(columns, columns)] += rows.T @ rows
         if self.projected:
