@@ -4,9 +4,10 @@
 
 The answer is light of two other seeds with every effect of the scene, one step finer in anchors, layers and cells than
 the plan at 3e-4, and coarse cells as fine as the rest. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the
-squared error of frames a without the noise of the answer; its standard error is the jackknife's over shots. Captures
-are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version to be timed
-and judged beside this one. What FILE holds already is not repeated, so the work can be cut short at any time.
+squared error of all frames a without the noise of the answer; its standard error is the jackknife's over shots.
+Captures are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version to
+be timed and judged beside this one. What FILE and the answers beside it hold already is not repeated, so the work can
+be cut short at any time; ``--answers`` makes those alone, which need no idle machine.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 import mitsim as ms
 from mitsim.capture.choice import predicted
@@ -38,33 +40,31 @@ SCENES = (
     *("compact_disc", "mirror", "lamp_bench", "cookie_bag"),
 )
 PATTERNS, ACCURACIES = "dots:7", (1e-2, 3e-3, 1e-3, 3e-4)
-FINEST, NOISE = 3e-4, 2e-3
+FINEST, NOISE = 3e-4, 1e-3
 """Accuracy whose settings the answer goes one step beyond, and the Monte Carlo error of each of its halves, whose own
 energy drops out."""
-SHOTS = (3, 17, 24, 30, 44)
-"""Shots that are judged, none of which the plan looks at."""
 _OLD_START = "import sys; from mitsim.cli import main; sys.exit(main())"
 SEED, ANSWERS = 0, (811, 812)
+Frames = npt.NDArray[np.floating[Any]]
 
 
-def answer(scene: str, noise: float) -> list[np.ndarray]:
-    """Irradiance (shots, pixels, pixels) of the judged shots in two independent halves."""
+def answer(scene: str, noise: float) -> npt.NDArray[np.float32]:
+    """(2, shots, pixels, pixels) irradiance of all shots in two independent halves."""
     bench = ms.open_bench(scene)
     family = bench.family(PATTERNS, SEED)
     stand = Stand(bench, family, ANSWERS[0], Job(), FINEST)
     finest = stand.finest(stand.plan(FINEST), 1.0)
     samples = predicted(noise, stand.evidence, finest.settings, {}).settings
     plan = replace(finest, settings=samples, sampling_target=noise)
-    shots = family.lighting.shots(np.array(SHOTS))
     halves = []
     for seed in ANSWERS:
-        light = trace_light(bench, plan, shots, integer(seed, "answer"), Sampling(by_pixel=False))
-        halves.append(np.stack([frame.irradiance for frame in light.merged().frames(shots, 0)]))
-    return halves
+        light = trace_light(bench, plan, family.lighting, integer(seed, "answer"), Sampling(by_pixel=False)).merged()
+        halves.append([frame.irradiance.astype(np.float32) for frame in light.frames(family.lighting, 0)])
+    return np.array(halves)
 
 
 def captured(scene: str, accuracy: float, tree: Path | None) -> dict[str, Any]:
-    """Seconds and manifest of a capture by the version in ``tree`` (this one without), and its judged frames."""
+    """Seconds and manifest of a capture by the version in ``tree`` (this one without), and its frames."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         command = [
@@ -85,29 +85,28 @@ def captured(scene: str, accuracy: float, tree: Path | None) -> dict[str, Any]:
         if not (run / "manifest.json").exists():
             raise SystemExit(f"{scene} at {accuracy:g}: {done.stderr}")
         manifest = json.loads((run / "manifest.json").read_text())
-        names = [shot["file"] for shot in manifest["patterns"]["captures"]]
-        frames = [read_frame(run / names[shot])[0]["electrons"] for shot in SHOTS]
+        frames = [read_frame(run / shot["file"])[0]["electrons"] for shot in manifest["patterns"]["captures"]]
     exposure = manifest.get("digital", manifest)["exposure_s"]
     return {"seconds": seconds, "manifest": manifest, "frames": np.stack(frames), "exposure_s": exposure}
 
 
-def squared_error(frames: np.ndarray, halves: list[np.ndarray]) -> tuple[float, float]:
+def squared_error(frames: Frames, halves: Frames) -> tuple[float, float]:
     """Squared relative error of ``frames`` and its standard error, by the jackknife over shots."""
     first, second = halves
-    products = ((frames - first) * (frames - second)).sum(axis=(1, 2))
-    energies = (first * second).sum(axis=(1, 2))
+    each = zip(frames.astype(np.float64), first, second, strict=True)
+    products, energies = np.array([[((a - r) * (a - s)).sum(), (r * s).sum(dtype=np.float64)] for a, r, s in each]).T
     without = (products.sum() - products) / (energies.sum() - energies)
     count = len(products)
     spread = np.sqrt((count - 1) / count * np.square(without - without.mean()).sum())
     return float(products.sum() / energies.sum()), float(spread)
 
 
-def judged(scene: str, accuracy: float, halves: list[np.ndarray], tree: Path | None) -> dict[str, Any]:
+def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None) -> dict[str, Any]:
     """One capture, held against the answer."""
     run = captured(scene, accuracy, tree)
     bench = ms.open_bench(scene)
     unit = float(Exposer(bench.rig, run["exposure_s"], 0).electrons(_Unit()))
-    square, spread = squared_error(run["frames"].astype(np.float64) / unit, halves)
+    square, spread = squared_error(run["frames"] / unit, halves)
     manifest = run["manifest"]
     plan = manifest["plan"]
     return {
@@ -135,22 +134,21 @@ def main() -> None:
     parser.add_argument("--scene", action="append", default=[])
     parser.add_argument("--accuracy", action="append", type=float, default=[])
     parser.add_argument("--old", type=Path)
+    parser.add_argument("--answers", action="store_true")
     parser.add_argument("--noise", type=float, default=NOISE)
     options = parser.parse_args()
     found = json.loads(options.json.read_text()) if options.json.exists() else {}
     for scene in options.scene or SCENES:
         rows = found.setdefault(scene, {})
-        kept, halves = options.json.with_suffix(f".{scene}.npy"), None
-        for accuracy in options.accuracy or ACCURACIES:
+        kept = options.json.with_suffix(f".{Path(scene).stem}.npy")
+        if not kept.exists():
+            np.save(kept, answer(scene, options.noise))
+        for accuracy in () if options.answers else options.accuracy or ACCURACIES:
             for name, tree in (("new", None), ("old", options.old)):
                 key = f"{name} {accuracy:g}"
                 if key in rows or (name == "old" and tree is None):
                     continue
-                if halves is None:
-                    if not kept.exists():
-                        np.save(kept, np.stack(answer(scene, options.noise)))
-                    halves = list(np.load(kept))
-                rows[key] = row = judged(scene, accuracy, halves, tree)
+                rows[key] = row = judged(scene, accuracy, np.load(kept), tree)
                 said = f"error {row['error']:.2e} [{row['low']:.1e}, {row['high']:.1e}]"
                 print(
                     f"{scene} {key}: {said}, {row['seconds']:.1f} s, predicted {row['predicted_seconds']:.1f}",
