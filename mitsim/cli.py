@@ -233,7 +233,8 @@ def capture(
     )
     advise(RESUME)
     with _job(quiet or as_json, max_seconds, max_memory) as job:
-        bench = _open(scene, variant, camera, projector, define, outside)
+        with job.clock.stage("open scene"):
+            bench = _open(scene, variant, camera, projector, define, outside)
         shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
     payload = shots.summary()
     seconds = payload["seconds"]
@@ -277,7 +278,8 @@ def calibrate(
     session = load_recipe(recipe)
     advise(RESUME)
     with _job(quiet or as_json, max_seconds, max_memory) as job:
-        bench = _open(scene, variant, camera, projector, define, outside)
+        with job.clock.stage("open scene"):
+            bench = _open(scene, variant, camera, projector, define, outside)
         factors = bench.calibrate(seed, accuracy, session, output, resume, job)
     payload = {**factors.manifest.result, "output": str(output)}
     # JSON has no numbers beyond the finite ones.
@@ -470,12 +472,12 @@ def _number(argument: str, text: str) -> float | Literal["auto"]:
 @contextmanager
 def _job(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
     """A job with limits, and a progress bar on stderr while the context lasts."""
-    from mitsim.core.job import Job
-    from mitsim.core.resources import Limits
+    from mitsim.core.job import Clock, Job
+    from mitsim.core.resources import Limits, running_seconds
 
     limits = Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
     with _progress(silent_progress) as progress:
-        yield Job(progress=progress, limits=limits)
+        yield Job(Clock(running_seconds()), progress, limits)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ _LANES_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
 _DEPOSIT_BYTES = 36.0
 """An entry of a sparse matrix, and the sum that it is added to."""
-_EXPOSING_S, _WRITING_S = 7e-8, 2.5e-8
+_EXPOSING_S, _WRITING_S = 4e-8, 2e-8
 """A pixel; measured on two cores."""
 _BYTES_PER_PIXEL = 8
 """Two channels, uncompressed: digital number and expected electrons; truth and its standard error."""

@@ -17,6 +17,8 @@ COUNTED = ("anchors", "layers", "cells")
 """What a plan counts: points of the sensor a side, depths, and cells a side of a projector pixel."""
 COARSE = ("anchored", "indirect")
 """Light that is filed in coarse cells: direct light's differences between anchors, and indirect light."""
+EVEN = ("direct", "anchored", "sharp")
+"""Light whose points come from a Sobol sequence alone, so that the number of samples matters."""
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
 GROUPS = 8
@@ -111,18 +113,26 @@ class Noise:
         return self.samples * (self.error / target) ** (1 / self.rate)
 
 
+def even(samples: Number) -> Number:
+    """The least 2^k or 3 * 2^k from ``samples`` on: so many points of a Sobol sequence are spread evenly."""
+    power = np.exp2(np.floor(np.log2(np.maximum(samples, 1.0))))
+    found = np.where(samples <= power, power, np.where((samples <= 1.5 * power) & (power > 1), 1.5 * power, 2 * power))
+    return found if isinstance(samples, np.ndarray) else float(found)
+
+
 @dataclass(frozen=True)
 class Effort:
-    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds a path."""
+    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and file a
+    path, 0 where nobody has timed it."""
 
     noise: Noise
     paths: int
-    seconds: float
+    seconds: float = 0.0
 
     @classmethod
     def none(cls) -> Effort:
         """Of light that there is none of."""
-        return cls(Noise(0.0, 1, 0.5), 0, 0.0)
+        return cls(Noise(0.0, 1, 0.5), 0)
 
     @property
     def variance(self) -> float:

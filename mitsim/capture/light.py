@@ -15,8 +15,8 @@ import numpy as np
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
-from mitsim.capture.choice import doubt
-from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.choice import cheapest, doubt
+from mitsim.capture.evidence import EVEN, GROUPS, Evidence, Settings, even
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
 from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.capture.truth import Truth, trace_truth
@@ -38,8 +38,6 @@ _MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _LARGEST_GROWTH = 8.0
 """Most that the samples grow by in one round, because the first rounds know their error badly."""
-_FIRST_ROUND = 0.5
-"""Part of the predicted samples that is traced first: where the plan was careful, half of them do."""
 _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 """Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
 what direct light brings), direct light's with their 0.8th power or faster."""
@@ -50,6 +48,8 @@ _LOST = 0.1
 pixels may have it, and their frames are then off by ten times as much."""
 _LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
+_REHEARSED = 2**16
+"""Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes."""
 
 
 @dataclass(frozen=True)
@@ -233,8 +233,25 @@ def make_plan(
         if look.price(stage) > worth:
             break
         look.refine(stage)
-    plan = decide(accuracy, evidence, SceneFacts.of(bench), switches)
+    chosen = cheapest(accuracy, evidence, switches or {}).settings
+    timed = _timed(evidence, Simulation(bench, chosen), lighting.labels, seed)
+    plan = decide(accuracy, timed, SceneFacts.of(bench), switches)
     return plan.taking(plan=time.perf_counter() - started)
+
+
+def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
+    """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
+    own, found = integer(seed, "pilot", "paces"), {}
+    for name, stage in simulation.tracers().items():
+        samples, taken = max(1, _REHEARSED // stage.tracer.lanes), []
+        # The first, small one compiles the kernel; of the others the shorter was less disturbed.
+        for count in (1, samples, samples):
+            started = time.perf_counter()
+            stage.file(stage.tracer.trace(own, 0, count), labels, count)
+            taken.append(time.perf_counter() - started)
+        field, paths = "sharp_light" if name == "sharp" else name, samples * stage.tracer.lanes
+        found[field] = replace(getattr(evidence, field), seconds=min(taken[1:]) / paths)
+    return replace(evidence, **found)
 
 
 @single_threaded_blas()
@@ -270,7 +287,7 @@ def trace_light(
     checked = lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, _CHECKED_SHOTS)).astype(int)))
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, labels, stream) for stream in streams]
-    rounds = _FIRST_ROUND
+    rounds = 1.0
     while True:
         for group in groups:
             group.sample(rounds)
@@ -288,10 +305,11 @@ def trace_light(
         )
         # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
         expected = light.frames(checked, seed, leaking=False)
-        error = monte_carlo_error(expected)
+        beyond = _unchecked(light, lighting, checked)
+        error = beyond * monte_carlo_error(expected)
         # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
         target = sampling.target(expected) if sampling.target else plan.sampling_target
-        seen = error if sampling.target else monte_carlo_bound(expected)
+        seen = error if sampling.target else beyond * monte_carlo_bound(expected)
         progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
         if seen <= target or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=seen <= target)
@@ -299,6 +317,23 @@ def trace_light(
         # Capped before the power as well: a target that was set very low would overflow it.
         growth = min(seen / target, _LARGEST_GROWTH) ** rate
         rounds *= min(max(1.05 * growth, 1.1), _LARGEST_GROWTH)
+
+
+def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> float:
+    """How much larger the error of all shots of a ``lighting`` is than that of those ``checked``, at least 1.
+
+    By what the groups differ in the total light of each shot. A heavy path that no checked shot sees shows there, and
+    forms no frame.
+    """
+    rows = np.zeros(int(light.labels.max()) + 1, dtype=np.int64)
+    rows[light.labels] = lighting.labels
+    totals = np.array([np.bincount(rows, group.totals[:-1], lighting.weights.shape[1]) for group in light.groups])
+
+    def spread(shots: Lighting) -> float:
+        return float((totals @ shots.weights.T).var(axis=0).mean())
+
+    of_checked = spread(checked)
+    return math.sqrt(max(spread(lighting) / of_checked, 1.0)) if of_checked else 1.0
 
 
 class _Group:
@@ -315,7 +350,8 @@ class _Group:
     def sample(self, rounds: float) -> None:
         """Trace until this many times the samples that the plan predicted are done."""
         for name, stage in self.simulation.tracers().items():
-            wanted, seed = max(math.ceil(rounds * stage.predicted), 1), integer(self.seed, stage.stream)
+            samples = max(rounds * stage.predicted, 1.0)
+            wanted, seed = math.ceil(even(samples) if name in EVEN else samples), integer(self.seed, stage.stream)
             while (done := self.done.get(name, 0)) < wanted:
                 count = min(max(1, _LANES_AT_ONCE // stage.tracer.lanes), wanted - done)
                 deposits = stage.tracer.trace(seed, done, count)

@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Any, Literal
 from mitsim.capture.choice import Choice, cheapest, predicted
 from mitsim.capture.effects import EFFECTS, Effect
 from mitsim.capture.evidence import Estimate, Evidence, Settings
-from mitsim.capture.prices import Numbers, Paces, checking_seconds, optics_seconds, paces_of, priced, tracing_seconds
+from mitsim.capture.prices import (
+    Numbers,
+    Paces,
+    checking_seconds,
+    optics_seconds,
+    paces_of,
+    priced,
+    tracing_seconds,
+    truth_seconds,
+)
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.pictures import table
 
@@ -240,7 +249,7 @@ def _stages(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, f
     tracing = tracing_seconds(evidence, settings, paces)
     return {
         "transport": sum(tracing.values()) + float(checking_seconds(forming, numbers, paces)),
-        "truth": tracing["direct"],
+        "truth": truth_seconds(evidence, settings, paces),
         "optics": float(optics_seconds(forming, numbers, paces)),
     }
 

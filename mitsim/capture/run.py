@@ -131,6 +131,7 @@ def capture(
         as there.
     """
     job = job or Job()
+    starting = job.clock.seconds()["total"]
     request.timing.check(bench.rig)
     family = bench.family(request.patterns, request.seed)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
@@ -144,7 +145,7 @@ def capture(
     with _recorder(place, head, resume) as recorder:
         with job.clock.stage("plan"):
             plan = light.plan if light else plan
-            plan = plan or _planned(bench, lighting, request)
+            plan = (plan or _planned(bench, lighting, request)).taking(start=starting)
         seconds = exposing if light else plan.predicted_seconds
         cost = frames_cost(bench, plan.settings, lighting, seconds, on_disk)
         cost.check(request.patterns, job.limits, place)

@@ -63,6 +63,11 @@ class FiledLight:
         return FiledLight(*(getattr(self, field.name) / count for field in fields(self)))
 
     @property
+    def totals(self) -> FloatArray:
+        """(classes + 1,) light of each row, a mean over the sensor, but for pixels that are traced apart [W m^-2]."""
+        return np.asarray(self.fine.sum(axis=1) + self.smooth.sum(axis=1), dtype=np.float64)
+
+    @property
     def lost(self) -> float:
         """Part of the light that is in no frame."""
         return self.outside / self.received if self.outside else 0.0

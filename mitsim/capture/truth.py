@@ -66,7 +66,7 @@ class Truth:
 
 
 def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
-    """Trace until the truth's standard error, rms over the image, is an eighth of the frames', or 1e-4.
+    """Trace until the truth's standard error, rms over the image, is a sixth of the frames', or 1e-4.
 
     Parameters
     ----------
@@ -89,6 +89,22 @@ def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatAr
     error = np.hypot(_over(scene.standard_error, board.mean), reflectance * _over(board.standard_error, board.mean))
     shape = (bench.n, bench.n)
     return Truth(reflectance.reshape(shape), error.reshape(shape), board.mean, scene.rays + board.rays)
+
+
+def predicted_rays(pixels: int, samples: float, rate: float) -> float:
+    """Rays that :func:`trace_truth` will take for both fluxes.
+
+    Parameters
+    ----------
+    pixels
+        of the projector.
+    samples, rate
+        that each group of the frames' direct light takes a pixel, and the power of their number that its error falls
+        with.
+    """
+    first = GROUPS * pixels * (_FIRST_SAMPLES + _BOARD_SAMPLES)
+    wanted = GROUPS * pixels * samples * float(_PART ** (-1 / rate))
+    return min(first + wanted, max(_MOST_RAYS, _MOST_SAMPLES * pixels))
 
 
 class _Flux:

@@ -12,11 +12,14 @@ from mitsim.core.resources import Limits
 
 
 class Clock:
-    """Seconds by stage, in the order of first use."""
+    """Seconds by stage, in the order of first use.
 
-    def __init__(self) -> None:
-        self._started = time.perf_counter()
-        self._stages: dict[str, float] = {}
+    ``start``: seconds that the program has run already, which count as a stage of that name.
+    """
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._started = time.perf_counter() - start
+        self._stages: dict[str, float] = {"start": start} if start else {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -44,14 +44,13 @@ class Trial:
 
 
 def at_once(expected: ExpectedFrames) -> float:
-    """A target that any error of the ``expected`` frames meets: sampling stops after its first round, half of what the
-    settings predict."""
+    """A target that any error of the ``expected`` frames meets: sampling stops after its first round."""
     return float("inf")
 
 
 def sampled(settings: Settings, samples: int) -> Settings:
     """``settings`` whose first round takes so many ``samples`` of a projector pixel and of a cell in each group."""
-    each = 2.0 * samples
+    each = float(samples)
     return replace(
         settings, direct_samples=each, anchored_samples=each / 8, indirect_samples=each, from_camera_samples=each
     )

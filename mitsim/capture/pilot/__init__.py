@@ -145,7 +145,7 @@ class Look:
             changes=Changes.between(seen, light**2),
             direct_part=anchored.light / light if light else 0.0,
             direct=fine.effort(light),
-            anchored=anchored.effort(fine.pace, light),
+            anchored=anchored.effort(light),
             indirect=switched.effort("indirect"),
             from_camera=switched.effort("from_camera"),
             forming=self.forming,

@@ -1,4 +1,4 @@
-"""Direct light, filed in different ways: what few anchors, layers or cells change, noise and pace."""
+"""Direct light, filed in different ways: what few anchors, layers or cells change, and noise."""
 
 from __future__ import annotations
 
@@ -32,6 +32,9 @@ _JUDGING = 4
 """Layers that judge one layer for light in coarse cells: the error of one is told to a twentieth."""
 _FLAT = 1e-4
 """Relative range of depths below which one layer is exact: rounding in single precision is a thousandth of it."""
+_STEEPEST = 0.9
+"""Power of the samples that the error of direct light falls with at most: over a few samples it may fall faster, but
+edges in the scene bring it to 0.75 in the end."""
 _FARTHEST = 1e-4
 """Inverse depth, relative to the scene's, below which light counts as infinitely far."""
 
@@ -55,10 +58,7 @@ class FineLight:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self._seeds = [integer(seed, "pilot", "fine", look) for look in range(LOOKS)]
         self._tracer = _tracer(Simulation(bench, base), sample)
-        self._deposits = [self._tracer.trace(self._seeds[0], 0, sample.fine)]
-        started = time.perf_counter()
-        self._deposits += [self._tracer.trace(seed, 0, sample.fine) for seed in self._seeds[1:]]
-        self.pace = (time.perf_counter() - started) / max((LOOKS - 1) * self._tracer.lanes * sample.fine, 1)
+        self._deposits = [self._tracer.trace(seed, 0, sample.fine) for seed in self._seeds]
         simulation = Simulation(bench, base)
         apart, samples = simulation.apart, sample.sharp(simulation)
         self._sharp = [apart.trace(seed, 0, samples) for seed in self._seeds] if apart else []
@@ -99,12 +99,12 @@ class FineLight:
         return found
 
     def effort(self, light: float) -> Effort:
-        """Monte Carlo error of one estimate, relative to all ``light``, how fast it falls, and what it takes."""
+        """Monte Carlo error of one estimate, relative to all ``light``, how fast it falls, and its paths."""
         many, few = self._noise
         steep = many > 0 and few > 0 and self._fewer < self.sample.fine
         rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
         relative = many / light if light else 0.0
-        return Effort(Noise(relative, self.sample.fine, min(max(rate, 0.5), 1.0)), self.bench.n**2, self.pace)
+        return Effort(Noise(relative, self.sample.fine, min(max(rate, 0.5), _STEEPEST)), self.bench.n**2)
 
     @property
     def _fewer(self) -> int:
@@ -197,18 +197,10 @@ class AnchoredLight:
         coarse = coarsened("anchored", self._beyond, self.layers)
         return {**{Part("anchors", count): change for count, change in found.items()}, **coarse}
 
-    def effort(self, pace: float, light: float) -> Effort:
-        """Monte Carlo error of one estimate of what a few anchors see beyond their mean.
-
-        Parameters
-        ----------
-        pace
-            [s a path].
-        light
-            norm of frames of all light.
-        """
+    def effort(self, light: float) -> Effort:
+        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
         relative = self._noise / light if light else 0.0
-        return Effort(Noise(relative, self.sample.anchored, 0.5), self.bench.n**2, pace)
+        return Effort(Noise(relative, self.sample.anchored, 0.5), self.bench.n**2)
 
     @cached_property
     def _noise(self) -> float:

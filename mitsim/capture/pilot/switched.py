@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -43,7 +42,6 @@ class SwitchedEffects:
         self.bench, self.everything, self.sample, self.layers = bench, everything, sample, layers
         self.seeds = [integer(seed, "pilot", "effects", look) for look in range(LOOKS)]
         self.simulation = Simulation(bench, everything)
-        self.paces: dict[str, float] = {}
         self.direct = self._direct(self.simulation)
         self.followed = {name: self._follow(self.simulation, name) for name in _TRACERS}
         self.sharp = self._sharp(self.simulation)
@@ -77,12 +75,12 @@ class SwitchedEffects:
         return {name: lanes for name, (_, lanes) in self._noise.items()}
 
     def effort(self, name: str) -> Effort:
-        """Monte Carlo error of one estimate by the tracer ``name``, relative to all light, and what it takes."""
+        """Monte Carlo error of one estimate by the tracer ``name``, relative to all light, and its paths."""
         if name not in self._noise:
             return Effort.none()
         error, lanes = self._noise[name]
         relative = error / self.light if self.light else 0.0
-        return Effort(Noise(relative, self.sample.followed, 0.5), lanes, self.paces[name])
+        return Effort(Noise(relative, self.sample.followed, 0.5), lanes)
 
     def sharp_effort(self) -> Effort:
         """The same of pixels that are traced apart, their rate being that of stratified rays."""
@@ -92,7 +90,7 @@ class SwitchedEffects:
         nothing, samples = [Deposits.none()] * LOOKS, self.sample.sharp(self.simulation)
         error = noise(self._form(self.simulation, nothing, nothing, self.sharp))
         relative = error / self.light if self.light else 0.0
-        return Effort(Noise(relative, samples, SHARP_RATE), tracer.lanes, self.paces["sharp"])
+        return Effort(Noise(relative, samples, SHARP_RATE), tracer.lanes)
 
     @cached_property
     def _noise(self) -> dict[str, tuple[float, int]]:
@@ -122,32 +120,22 @@ class SwitchedEffects:
         return [simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds]
 
     def _follow(self, simulation: Simulation, name: str) -> list[Deposits]:
-        """Light of the tracer ``name``, look by look; the first, which may compile a kernel, is not timed."""
+        """Light of the tracer ``name``, look by look."""
         tracer = getattr(simulation, name)
         if tracer is None:
             return [Deposits.none()] * LOOKS
-        first, *others = (integer(seed, name) for seed in self.seeds)
-        found = [tracer.trace(first, 0, self.sample.followed)]
-        started = time.perf_counter()
-        found += [tracer.trace(seed, 0, self.sample.followed) for seed in others]
-        seconds = time.perf_counter() - started
-        self.paces.setdefault(name, seconds / ((LOOKS - 1) * tracer.lanes * self.sample.followed))
-        return found
+        return [tracer.trace(integer(seed, name), 0, self.sample.followed) for seed in self.seeds]
 
     @staticmethod
     def _joined(followed: dict[str, list[Deposits]]) -> list[Deposits]:
         return [Deposits.joined(looks) for looks in zip(*followed.values(), strict=True)]
 
     def _sharp(self, simulation: Simulation) -> list[Deposits]:
-        """Light of pixels that are traced apart, look by look; the first, which may compile a kernel, is not timed."""
+        """Light of pixels that are traced apart, look by look."""
         tracer, samples = simulation.apart, self.sample.sharp(simulation)
         if tracer is None:
             return []
-        found = [tracer.trace(integer(self.seeds[0], "sharp"), 0, samples)]
-        started = time.perf_counter()
-        found += [tracer.trace(integer(seed, "sharp"), 0, samples) for seed in self.seeds[1:]]
-        self.paces.setdefault("sharp", (time.perf_counter() - started) / ((LOOKS - 1) * tracer.lanes * samples))
-        return found
+        return [tracer.trace(integer(seed, "sharp"), 0, samples) for seed in self.seeds]
 
     def _form(
         self,
