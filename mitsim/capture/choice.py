@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.capture.effects import EFFECTS, names
 from mitsim.capture.evidence import COUNTED, EVEN, GROUPS, SURE, Estimate, Evidence, Part, Settings, even
-from mitsim.capture.prices import FIXED, MIXING, Numbers, checking_seconds, efforts, optics_seconds, priced
+from mitsim.capture.prices import FIXED, MIXING, Numbers, checking_seconds, connections, efforts, optics_seconds, priced
 from mitsim.core.arrays import FloatArray
 
 _MARGIN = 0.92
@@ -71,7 +72,7 @@ class Choice:
 
 def parts_of(evidence: Evidence, settings: Settings) -> frozenset[Part]:
     """What ``settings`` leave out or make coarse, of all that the ``evidence`` knows."""
-    counts = zip(COUNTED, (settings.anchors, len(settings.depths), settings.subdivision), strict=True)
+    counts = zip(COUNTED, counted(settings), strict=True)
     off = (Part(name) for name in evidence.effects if name not in settings.effects)
     return frozenset(chain((Part(*count) for count in counts), off))
 
@@ -117,8 +118,7 @@ def predicted(
     settings
         effects and numbers.
     """
-    numbers = settings.anchors, len(settings.depths), settings.subdivision, settings.coarse_cells
-    row = np.array([[*numbers, settings.coarse_layers]], dtype=np.float64)
+    row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
     return _Table(accuracy, evidence, settings.effects, row, _given(switches), sure).choice(0)
 
 
@@ -149,7 +149,7 @@ class _Table:
     effects
         that are on.
     rows
-        (m, 5) anchors, layers, cells, coarse cells, and whether coarse light has all layers.
+        (m, 6) anchors, layers, cells, followed anchors, coarse cells, and whether coarse light has all layers.
     given
         parts that are left out whatever is chosen.
     """
@@ -165,12 +165,22 @@ class _Table:
     ) -> None:
         self.accuracy, self.evidence, self.effects, self.rows = accuracy, evidence, effects, rows
         self.given, self.sure = given, sure
-        self.anchors, self.layers, self.cells, self.coarse, all_layers = rows.T
+        self.anchors, self.layers, self.cells, self.followed_anchors, self.coarse, self._all_layers = rows.T
         indirect = float("interreflection" in effects)
         waves = float(bool(effects & names(lambda effect: effect.in_shadow)))
-        layered = np.where(all_layers > 0, self.layers, 1.0)
-        mixed = float(MIXING in effects)
-        self.numbers = Numbers(self.anchors, self.layers, self.cells, self.coarse, layered, waves, indirect, mixed)
+        layered = np.where(self._all_layers > 0, self.layers, 1.0)
+        self.numbers = Numbers(
+            anchors=self.anchors,
+            layers=self.layers,
+            cells=self.cells,
+            coarse_cells=self.coarse,
+            coarse_layers=layered,
+            followed_anchors=self.followed_anchors,
+            waves=waves,
+            indirect=indirect,
+            mixed=float(MIXING in effects),
+        )
+        self._follows = bool(effects & names(lambda effect: effect.followed))
 
     def rank(self, index: int) -> tuple[bool, float, float]:
         """What makes one choice better than another: that it fits, less work, less error."""
@@ -186,24 +196,26 @@ class _Table:
 
     def choice(self, index: int) -> Choice:
         """The choice of a row."""
-        anchors, layers, cells, coarse, all_layers = (int(number) for number in self.rows[index])
+        anchors, layers, cells, followed, coarse, all_layers = (int(number) for number in self.rows[index])
         settings = Settings(
             depth=self.evidence.depth,
             anchors=anchors,
             layers=self.evidence.layers[layers] if layers > 1 else (),
             subdivision=cells,
             effects=self.effects,
+            followed_anchors=followed,
             coarse_cells=coarse,
             coarse_layers=bool(all_layers),
             reach=self.evidence.reach,
             sharp=self.evidence.sharp,
-            **{f"{name}_samples": float(count[index]) for name, count in self.samples.items()},
         )
+        samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.samples.items()}
+        settings = replace(settings, **samples)
         lacking = {
             "light over sharp lobes": self.evidence.unresolved,
             "light over mirrors or curved glass both ways (left out)": self.evidence.left_out,
         }
-        missing, centre = min(sum(lacking.values()), 1.0), np.add(*self._from_centre(SURE))
+        missing, centre = min(sum(lacking.values()), 1.0), np.add(*self._from_one_point(SURE))
         # Errors of the light that is there count for its part of all.
         rest = (float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE))
         value, bound = (missing + (1 - missing) * error for error in rest)
@@ -212,7 +224,7 @@ class _Table:
             systematic=Estimate(value, bound),
             unsigned={
                 **lacking,
-                "one anchor for other than direct light": float(centre[index]),
+                "one anchor for ambient light": float(centre[index]),
             },
             target=float(self.target[index]),
             noise=float(self.noise[index]),
@@ -233,7 +245,7 @@ class _Table:
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
         squared, spread = changes.squared(chosen)
-        beside, along = self._from_centre(sure)
+        beside, along = self._from_one_point(sure)
         return np.asarray(np.sqrt(np.maximum(squared, 0) + sure * spread + sum(drawn) + beside**2) + along)
 
     def _weight(self, part: Part) -> FloatArray:
@@ -242,7 +254,8 @@ class _Table:
         if not part.count:
             return np.full(len(self.rows), float(part.name not in self.effects))
         if not light:
-            return np.asarray(getattr(self, part.name) == part.count, dtype=np.float64)
+            left = self._follows or part.name != "followed_anchors"
+            return np.asarray((getattr(self, part.name) == part.count) * left, dtype=np.float64)
         filed = self.anchors > 1 if light == "anchored" else np.full(len(self.rows), self.numbers.indirect > 0)
         # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
         return filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers)
@@ -254,10 +267,10 @@ class _Table:
         parts = np.zeros(max(ladder) + 1)
         for count, error in ladder.items():
             parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
-        return np.where(self.rows[:, 4] > 0, parts[self.layers.astype(int)], 1.0)
+        return np.where(self._all_layers > 0, parts[self.layers.astype(int)], 1.0)
 
-    def _from_centre(self, sure: float) -> tuple[FloatArray, FloatArray]:
-        """(m,) errors of light that is seen from the sensor's centre alone: as one anchor leaves of direct light.
+    def _from_one_point(self, sure: float) -> tuple[FloatArray, FloatArray]:
+        """(m,) errors of ambient light, seen from one point of the sensor: as one anchor leaves of direct light.
 
         The first where direct light has several anchors: it varies over the sensor, unlike what cells and layers leave,
         and is independent of that. The second where it has one, whose error has the same shape and adds up.
@@ -267,7 +280,7 @@ class _Table:
         def size(error: Estimate) -> float:
             return error.bound if sure else error.value
 
-        seen = self.effects & names(lambda effect: effect.from_centre)
+        seen = self.effects & names(lambda effect: effect.from_one_point)
         share = sum(size(error) for name, error in evidence.effects.items() if name in seen)
         error = min(share, 1.0) * size(evidence.ladders["anchors"][1]) / (evidence.direct_part or 1.0)
         several = self.anchors > 1
@@ -289,9 +302,8 @@ class _Table:
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:
         """(m,) work of one sample in every group, by kind of light."""
-        connections = self.anchors**2 * (self.anchors > 1)
         return {
-            name: GROUPS * getattr(FIXED, name) * effort.paths * (connections if name == "anchored" else 1)
+            name: GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.anchors, self.followed_anchors)
             for name, effort in efforts(self.evidence, self.effects).items()
         }
 
@@ -317,7 +329,7 @@ class _Table:
         kinds, total = efforts(self.evidence, self.effects), np.zeros(len(self.rows))
         for name, count in self.samples.items():
             noise = kinds[name].noise
-            on = self.anchors > 1 if name == "anchored" else 1.0
+            on = connections(name, self.anchors, self.followed_anchors) > 0
             total = total + on * np.square(noise.error) * (count / noise.samples) ** (-2 * noise.rate) / GROUPS
         return np.sqrt(total)
 
@@ -328,6 +340,11 @@ class _Table:
         forming = self.evidence.forming
         shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
         return np.asarray(tracing + shown)
+
+
+def counted(settings: Settings) -> tuple[int, int, int, int]:
+    """The numbers that :data:`COUNTED` names."""
+    return settings.anchors, len(settings.depths), settings.subdivision, settings.followed_anchors
 
 
 def _counts(evidence: Evidence, name: str) -> list[int]:

@@ -13,8 +13,9 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 
 Number = float | FloatArray
-COUNTED = ("anchors", "layers", "cells")
-"""What a plan counts: points of the sensor a side, depths, and cells a side of a projector pixel."""
+COUNTED = ("anchors", "layers", "cells", "followed_anchors")
+"""What a plan counts: points of the sensor a side for direct light, depths, cells a side of a projector pixel, and
+points of the sensor a side for light that is followed over several surfaces or from the camera."""
 COARSE = ("anchored", "indirect")
 """Light that is filed in coarse cells: direct light's differences between anchors, and indirect light."""
 EVEN = ("direct", "anchored", "sharp")
@@ -67,6 +68,9 @@ class Settings:
     direct_samples, anchored_samples, indirect_samples, from_camera_samples
         samples that each group is predicted to need: a projector pixel of direct light, of its differences between
         anchors, and of indirect light; a cell of what is followed from the camera.
+    followed_anchors, followed_samples
+        points a side of the sensor that light over several surfaces, or in mirrors, is followed to, and samples that
+        each group is predicted to need of what they see beyond their mean.
     coarse_cells, coarse_layers
         cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
         they have all layers or one.
@@ -86,6 +90,8 @@ class Settings:
     anchored_samples: float = 1.0
     indirect_samples: float = 1.0
     from_camera_samples: float = 1.0
+    followed_anchors: int = 1
+    followed_samples: float = 1.0
     coarse_cells: int = 1
     coarse_layers: bool = False
     reach: float | None = None
@@ -263,6 +269,8 @@ class Evidence:
         as in :class:`Settings`.
     sharp_light
         what that light takes.
+    followed
+        what is followed takes at several anchors beyond its mean (paths: to one of them).
     """
 
     depth: float
@@ -280,6 +288,7 @@ class Evidence:
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())
+    followed: Effort = field(default_factory=lambda: Effort.none())
 
     def error(self, *parts: Part) -> Estimate:
         """Relative change of the frames by all ``parts`` together."""

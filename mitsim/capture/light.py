@@ -18,7 +18,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.choice import cheapest, doubt
 from mitsim.capture.evidence import EVEN, GROUPS, Evidence, Settings, even
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
-from mitsim.capture.simulation import FiledLight, Simulation
+from mitsim.capture.simulation import AT_ANCHORS, FiledLight, Simulation
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
@@ -242,6 +242,7 @@ def make_plan(
 def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
     """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
     own, found = integer(seed, "pilot", "paces"), {}
+    at_anchors = [0.0, 0]
     for name, stage in simulation.tracers().items():
         samples, taken = max(1, _REHEARSED // stage.tracer.lanes), []
         # The first, small one compiles the kernel; of the others the shorter was less disturbed.
@@ -249,8 +250,14 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
             started = time.perf_counter()
             stage.file(stage.tracer.trace(own, 0, count), labels, count)
             taken.append(time.perf_counter() - started)
-        field, paths = "sharp_light" if name == "sharp" else name, samples * stage.tracer.lanes
-        found[field] = replace(getattr(evidence, field), seconds=min(taken[1:]) / paths)
+        seconds = min(taken[1:]) / samples
+        if name in AT_ANCHORS:
+            at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
+            continue
+        field = "sharp_light" if name == "sharp" else name
+        found[field] = replace(getattr(evidence, field), seconds=seconds / stage.tracer.lanes)
+    if at_anchors[1]:
+        found["followed"] = replace(evidence.followed, seconds=at_anchors[0] / at_anchors[1])
     return replace(evidence, **found)
 
 

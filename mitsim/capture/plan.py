@@ -268,7 +268,8 @@ class _Words:
     def rows(self) -> tuple[PlanRow, ...]:
         """A row for each effect and discretisation."""
         effects = (self._effect(effect) for effect in EFFECTS.values())
-        return (self._anchors(), self._layers(), self._cells(), *effects, *_fixed(self.facts))
+        counted = (self._anchors(), self._layers(), self._cells(), self._followed_anchors())
+        return (*counted, *effects, *_fixed(self.facts))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -292,10 +293,12 @@ class _Words:
         """By what leaves it, the bound on each part of the systematic error."""
         evidence, settings = self.evidence, self.chosen.settings
         anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
+        followed = settings.followed_anchors
         return {
             f"anchors ({anchors}x{anchors})": self._number("anchors", anchors).bound,
             f"layers ({layers})": self._number("layers", layers).bound,
             f"cells ({cells}x{cells})": self._number("cells", cells).bound,
+            f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
             **self.chosen.unsigned,
             **{f"{name} (off)": e.bound for name, e in evidence.effects.items() if name not in settings.effects},
         }
@@ -340,6 +343,21 @@ class _Words:
         cells, errors = self.chosen.settings.subdivision, self.evidence.ladders["cells"]
         reason = f"{cells}x{cells} cells of even light a projector pixel leave {_said(errors[cells])}"
         return PlanRow("cells", "approximate", reason, max(error.value for error in errors.values()), 0.0)
+
+    def _followed_anchors(self) -> PlanRow:
+        name, anchors, one = (
+            "followed-anchors",
+            self.chosen.settings.followed_anchors,
+            self._number("followed_anchors", 1),
+        )
+        if not any(effect.followed and effect.name in self.chosen.settings.effects for effect in EFFECTS.values()):
+            return PlanRow(name, "off", "no light over several surfaces or in mirrors is followed", 0.0, 0.0)
+        if anchors == 1:
+            reason = f"light over several surfaces and in mirrors is seen from the centre, which leaves {_said(one)}"
+            return PlanRow(name, "off", reason, one.value, 0.0)
+        left = _said(self._number("followed_anchors", anchors))
+        reason = f"light over several surfaces and in mirrors: {anchors}x{anchors} leave {left}, one {_said(one)}"
+        return PlanRow(name, "approximate", reason, one.value, self._seconds(followed_anchors=1))
 
     def _effect(self, effect: Effect) -> PlanRow:
         settings, name = self.chosen.settings, effect.name

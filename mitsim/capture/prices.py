@@ -34,6 +34,7 @@ class Paces:
     anchored: float
     indirect: float
     from_camera: float
+    followed: float
     sharp: float
     frame: float
     product: float
@@ -46,6 +47,7 @@ FIXED = Paces(
     anchored=1.5e-7,
     indirect=5e-7,
     from_camera=1e-6,
+    followed=5e-7,
     sharp=3e-7,
     frame=2e-3,
     product=6e-11,
@@ -64,6 +66,7 @@ class Numbers:
     cells: Number
     coarse_cells: Number
     coarse_layers: Number
+    followed_anchors: Number
     waves: Number
     indirect: Number
     mixed: Number
@@ -71,7 +74,7 @@ class Numbers:
     @classmethod
     def coarsest(cls) -> Numbers:
         """One of everything, and a wave-optical shadow."""
-        return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
+        return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, settings: Settings) -> Numbers:
@@ -83,6 +86,7 @@ class Numbers:
             cells=float(settings.subdivision),
             coarse_cells=float(settings.coarse_cells),
             coarse_layers=layers if settings.coarse_layers else 1.0,
+            followed_anchors=float(settings.followed_anchors),
             waves=float(bool(settings.effects & names(lambda effect: effect.in_shadow))),
             indirect=float("interreflection" in settings.effects),
             mixed=float(MIXING in settings.effects),
@@ -99,6 +103,7 @@ def paces_of(evidence: Evidence) -> Paces:
         anchored=evidence.anchored.seconds or FIXED.anchored,
         indirect=evidence.indirect.seconds or FIXED.indirect,
         from_camera=evidence.from_camera.seconds or FIXED.from_camera,
+        followed=evidence.followed.seconds or FIXED.followed,
         sharp=evidence.sharp_light.seconds or FIXED.sharp,
         frame=float(slower * FIXED.frame),
         product=float(slower * FIXED.product),
@@ -118,8 +123,24 @@ def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
     if evidence.sharp:
         found["sharp"] = evidence.sharp_light
     if effects & names(lambda effect: effect.followed):
-        found |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera}
+        found |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera, "followed": evidence.followed}
     return found
+
+
+def connections(name: str, anchors: Number, followed_anchors: Number) -> Number:
+    """Connections of each path of the light ``name``; 0 for what anchors see beyond their mean where there is one.
+
+    Parameters
+    ----------
+    name
+        as in :func:`efforts`.
+    anchors, followed_anchors
+        of direct and of followed light, a side.
+    """
+    if name not in ("anchored", "followed"):
+        return 1.0 + 0 * anchors
+    count = np.asarray(anchors if name == "anchored" else followed_anchors, dtype=np.float64)
+    return cast(Number, count**2 * (count > 1))
 
 
 def _products(forming: Forming, lit: Number, cells: Number, layers: Number, anchors: Number, waves: Number) -> Number:
@@ -141,7 +162,7 @@ def _products(forming: Forming, lit: Number, cells: Number, layers: Number, anch
 
 def _entries(forming: Forming, numbers: Numbers) -> Number:
     """Entries of all shadows that are prepared, as many as wave-optical ones take as long."""
-    coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
+    coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect + (np.asarray(numbers.followed_anchors) > 1)
     sides = numbers.cells * numbers.layers + coarse * numbers.coarse_cells * numbers.coarse_layers
     terms = forming.terms * numbers.waves + _GEOMETRIC_ENTRIES * (1 - numbers.waves)
     return cast(Number, 2 * forming.pixels * forming.cells * sides * terms)
@@ -168,6 +189,8 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: float, paces: Pa
         _products(forming, lit, numbers.cells, numbers.layers, 1.0, numbers.waves)
         + several * _products(forming, lit, *coarse, numbers.anchors, numbers.waves)
         + numbers.indirect * _products(forming, 1.0, *coarse, 1.0, numbers.waves)
+        + (np.asarray(numbers.followed_anchors) > 1)
+        * _products(forming, 1.0, *coarse, numbers.followed_anchors, numbers.waves)
     )
     if mixes:
         products = products + numbers.mixed * forming.classes * forming.pixels**2
@@ -209,13 +232,12 @@ def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dic
     paces
         as for :func:`forming_seconds`.
     """
-    anchors = settings.anchors**2 * (settings.anchors > 1)
     return {
         name: GROUPS
         * math.ceil(getattr(settings, f"{name}_samples"))
         * effort.paths
         * getattr(paces, name)
-        * (anchors if name == "anchored" else 1)
+        * float(connections(name, settings.anchors, settings.followed_anchors))
         for name, effort in efforts(evidence, settings.effects).items()
     }
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
+import mitsuba as mi
 import numpy as np
 from scipy import sparse
 
@@ -29,12 +30,15 @@ from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.receiver import SensorPoints
 
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which
 a shadow's fringes hardly move."""
-TRAYS = ("fine", "coarse", "smooth", "sharp")
+TRAYS = ("fine", "coarse", "smooth", "followed", "sharp")
 """Parts of an :class:`FiledLight`."""
+AT_ANCHORS = ("indirect at anchors", "from camera at anchors")
+"""Names of the stages that follow light to every anchor."""
 _MOST_ROWS = 2**12
 """Rows of anchors times cells of sharp light: a class that lights them all is a matrix of 128 MiB."""
 
@@ -43,15 +47,17 @@ _MOST_ROWS = 2**12
 class FiledLight:
     """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
 
-    ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees beyond
-    that, and ``smooth`` is indirect light: small or smooth, so coarse cells hold them well. ``sharp`` is direct light
-    of the pixels that are traced apart. Of all light ``received``, a mean over the sensor without its mask,
+    ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees of direct
+    light beyond that, ``smooth`` is indirect light, and ``followed`` what each anchor sees of followed light beyond its
+    average: small or smooth, so coarse cells hold them well. ``sharp`` is direct light of the pixels that are traced
+    apart. Of all light ``received``, a mean over the sensor without its mask,
     ``outside`` came from beyond all cells: it is in no frame.
     """
 
     fine: sparse.csr_array
     coarse: sparse.csr_array
     smooth: sparse.csr_array
+    followed: sparse.csr_array
     sharp: sparse.csr_array
     received: float = 0.0
     outside: float = 0.0
@@ -137,7 +143,7 @@ class Simulation:
     ----------
     physics
         what is simulated of the bench.
-    fine, coarse, smooth, sharp
+    fine, coarse, smooth, followed, sharp
         trays for the parts of an :class:`FiledLight`; ``ambient`` for lamps' light in the cells of ``fine``.
     """
 
@@ -153,6 +159,7 @@ class Simulation:
         self.fine = self._tray(fine)
         self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
         self.smooth = self._tray(Bundle(coarse, 1, depths))
+        self.followed = self._tray(Bundle(coarse, settings.followed_anchors, depths))
         self.sharp = self._tray(self._apart(pixels))
         self.ambient = self._tray(fine, _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
 
@@ -219,21 +226,41 @@ class Simulation:
 
     @cached_property
     def indirect(self) -> IndirectTracer | None:
-        """Follows light over several surfaces from the projector to the sensor's centre; none where there is none."""
+        """Follows light over several surfaces from the projector to the sensor's centre, or to all of it where it has
+        anchors; none where there is none."""
+        return self._indirect(self._mean_points)
+
+    @cached_property
+    def from_camera(self) -> FromCameraTracer | None:
+        """Follows all other light, from the same points; none where there is none."""
+        return self._from_camera(self._mean_points, self.physics.lamps)
+
+    @property
+    def at_anchors(self) -> tuple[IndirectTracer | None, FromCameraTracer | None]:
+        """Both, to every anchor of followed light, but for ambient light."""
+        points = self._points(self.settings.followed_anchors)
+        return self._indirect(points), self._from_camera(points, ())
+
+    @property
+    def _mean_points(self) -> SensorPoints:
+        return self._points(1, self.settings.followed_anchors > 1)
+
+    def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
+        return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
+
+    def _indirect(self, points: SensorPoints) -> IndirectTracer | None:
         loaded, physics = self.bench.loaded, self.physics
         paths = physics.mirrors, physics.interreflection
         if not any(paths):
             return None
-        return IndirectTracer(loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry)
+        return IndirectTracer(loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points)
 
-    @cached_property
-    def from_camera(self) -> FromCameraTracer | None:
-        """Follows all other light from the sensor's centre; none where there is none."""
+    def _from_camera(self, points: SensorPoints, lamps: tuple[mi.Emitter, ...]) -> FromCameraTracer | None:
         loaded, physics = self.bench.loaded, self.physics
-        if not (physics.lamps or physics.mirrors or (physics.interreflection and loaded.glossy)):
+        if not (lamps or physics.mirrors or (physics.interreflection and loaded.glossy)):
             return None
-        paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
-        return FromCameraTracer(loaded.scene, loaded.camera, physics.projector, self.aim, paths, physics.geometry)
+        paths, parts = Paths(physics.mirrors, physics.interreflection, lamps), (loaded.scene, loaded.camera)
+        return FromCameraTracer(*parts, physics.projector, self.aim, paths, physics.geometry, points)
 
     def follow(self, seed: int, samples: int) -> Deposits:
         """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``, to be filed."""
@@ -241,16 +268,12 @@ class Simulation:
         return Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers])
 
     @cached_property
-    def mean_weights(self) -> FloatArray:
-        """(anchors,) weight of each anchor in the mean over the sensor."""
-        return self._mean_weights(self.settings.anchors)
-
-    @cached_property
     def sharp_weights(self) -> FloatArray:
-        """The same of the sharp pixels' anchors."""
+        """(anchors,) weight of each of the sharp pixels' anchors in the mean over the sensor."""
         return self._mean_weights(self.sharp.bundle.anchors)
 
     def _mean_weights(self, anchors: int) -> FloatArray:
+        """(anchors,) weight of each anchor in the mean over the sensor."""
         edges = self.physics.geometry.pixel_edges
         positions = anchor_positions(anchors, self.physics.geometry.half_width)
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
@@ -273,9 +296,23 @@ class Simulation:
         deposits, labels, samples
             as for :meth:`Tray.file`.
         """
-        mean = self.smooth.file(deposits.averaged(self.mean_weights), labels, samples)
-        coarse = self.coarse.file(deposits, labels, samples)
-        return self._light(None, 1, coarse=coarse - self.coarse.bundle.repeated(mean))
+        return self._light(None, 1, coarse=self._beyond_mean(self.coarse, deposits, labels, samples))
+
+    def file_at_anchors(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`at_anchors` beyond its mean over the sensor, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        return self._light(None, 1, followed=self._beyond_mean(self.followed, deposits, labels, samples))
+
+    def _beyond_mean(self, tray: Tray, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
+        """Light in a ``tray`` beyond its mean over the sensor."""
+        weights = self._mean_weights(tray.bundle.anchors)
+        mean = self.smooth.file(deposits.averaged(weights), labels, samples)
+        return tray.file(deposits, labels, samples) - tray.bundle.repeated(mean)
 
     def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`indirect` or :attr:`from_camera`, per sample.
@@ -327,6 +364,10 @@ class Simulation:
             # The stream keeps the name that it had in 0.3.0, so that the same seed gives the same frames.
             samples = settings.from_camera_samples
             stages["from_camera"] = Stage(self.from_camera, samples, self.file_followed, "other")
+        if settings.followed_anchors > 1:
+            for name, tracer in zip(AT_ANCHORS, self.at_anchors, strict=True):
+                if tracer is not None:
+                    stages[name] = Stage(tracer, settings.followed_samples, self.file_at_anchors, name)
         return stages
 
     def flux(self, deposits: Deposits, samples: int) -> FloatArray:
@@ -374,6 +415,8 @@ class Simulation:
             lights.append(Filed(self.coarse.optics, tuple(group.coarse[:first] for group in groups)))
         if self.settings.sharp:
             lights.append(Filed(self.sharp.optics, tuple(group.sharp[:first] for group in groups)))
+        if self.settings.followed_anchors > 1:
+            lights.append(Filed(self.followed.optics, tuple(group.followed[:first] for group in groups)))
         if self.physics.interreflection:
             lights.append(Filed(self.smooth.optics, tuple(group.smooth[:first] for group in groups)))
         if self.physics.lamps:

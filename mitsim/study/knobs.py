@@ -11,8 +11,9 @@ import numpy as np
 
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
+from mitsim.capture.choice import counted
 from mitsim.capture.effects import names, present
-from mitsim.capture.evidence import GROUPS, Evidence, Part, Settings
+from mitsim.capture.evidence import COUNTED, GROUPS, Evidence, Part, Settings
 from mitsim.capture.light import Light, Sampling, Target, trace_light
 from mitsim.capture.plan import Plan, SceneFacts, decide
 from mitsim.capture.prices import paces_of, tracing_seconds
@@ -52,7 +53,12 @@ def sampled(settings: Settings, samples: int) -> Settings:
     """``settings`` whose first round takes so many ``samples`` of a projector pixel and of a cell in each group."""
     each = float(samples)
     return replace(
-        settings, direct_samples=each, anchored_samples=each / 8, indirect_samples=each, from_camera_samples=each
+        settings,
+        direct_samples=each,
+        anchored_samples=each / 8,
+        indirect_samples=each,
+        from_camera_samples=each,
+        followed_samples=each / 8,
     )
 
 
@@ -151,9 +157,9 @@ class Stand:
     def finest(self, plan: Plan, margin: float) -> Plan:
         """Everything on, one step finer than ``plan`` in each number, and its accuracy over ``margin`` of noise."""
         evidence, now = self.evidence, plan.settings
-        chosen = {"anchors": now.anchors, "layers": len(now.depths), "cells": now.subdivision}
-        anchors, layers, cells = (
-            next((finer for finer in evidence.ladders[name] if finer > count), count) for name, count in chosen.items()
+        anchors, layers, cells, followed = (
+            next((finer for finer in evidence.ladders[name] if finer > count), count)
+            for name, count in zip(COUNTED, counted(now), strict=True)
         )
         settings = replace(
             now,
@@ -161,6 +167,7 @@ class Stand:
             layers=evidence.layers[layers] if layers > 1 else (),
             subdivision=cells,
             effects=frozenset(present(self.bench)),
+            followed_anchors=followed,
             coarse_cells=cells,
             coarse_layers=True,
         )
@@ -168,8 +175,7 @@ class Stand:
 
     def discretisation(self, settings: Settings) -> float:
         """Relative error that the numbers in ``settings`` are predicted to leave."""
-        counts = {"anchors": settings.anchors, "layers": len(settings.depths), "cells": settings.subdivision}
-        return self.evidence.error(*(Part(name, count) for name, count in counts.items())).value
+        return self.evidence.error(*(Part(*both) for both in zip(COUNTED, counted(settings), strict=True))).value
 
     def trace(self, trial: Trial, seed: int) -> Light:
         """Light of a ``trial``, by the family's classes, from a ``seed``."""

@@ -1,7 +1,8 @@
 """From-camera light, followed from the camera's side: of lamps, in mirrors, and over sharp turns before the sensor.
 
-A path starts at the sensor's centre, goes through a cell of directions, and connects to the lights at its vertices; a
-connection to the projector names the projector pixel that it used. The mask and the sensor pixels are applied
+A path starts at the sensor - its centre, a random point, or each of several anchors -, goes through a cell of
+directions, and connects to the lights at its vertices; a connection to the projector names the projector pixel that it
+used. The mask and the sensor pixels are applied
 afterwards in closed form (:mod:`mitsim.optics`).
 
 Value collected, for tan-angle t (the integrand of the reference estimator without its mask)::
@@ -27,13 +28,13 @@ import mitsuba as mi
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.cells import CellAxis, CellGrid
 from mitsim.transport.connection import Connection, ProjectorConnector
-from mitsim.transport.coordinates import x_y
+from mitsim.transport.coordinates import rows_columns, x_y
 from mitsim.transport.histogram import Deposits, Sightings
 from mitsim.transport.panes import refracted_way
 from mitsim.transport.passage import Passage
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.receiver import sampled_wavelengths
+from mitsim.transport.receiver import SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 
 _MARGIN = 1e-4
@@ -56,7 +57,7 @@ class Paths:
 
 
 class FromCameraTracer(Tracer):
-    """From-camera light of a scene, at the sensor's centre."""
+    """From-camera light of a scene, at points of the sensor."""
 
     def __init__(
         self,
@@ -66,6 +67,7 @@ class FromCameraTracer(Tracer):
         grid: CellGrid,
         paths: Paths,
         geometry: CameraGeometry | None = None,
+        points: SensorPoints | None = None,
     ) -> None:
         """What is followed.
 
@@ -79,15 +81,18 @@ class FromCameraTracer(Tracer):
             which of them are followed.
         geometry
             stands in for the camera's own.
+        points
+            where from; the sensor's centre if not given.
         """
         self.geometry: CameraGeometry = geometry or camera.geometry
+        self.points = points or SensorPoints(self.geometry.half_width)
         self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
         self.connector, self.passage = ProjectorConnector(projector), Passage(scene)
 
     @property
     def lanes(self) -> int:
-        """Paths in one sample: one per cell."""
-        return self.grid.shape[0] * self.grid.shape[1]
+        """Paths in one sample: one per cell and anchor."""
+        return self.grid.shape[0] * self.grid.shape[1] * self.points.count
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         further = self.paths.mirrors or self.paths.interreflection or self.passage.open
@@ -102,8 +107,10 @@ class _Walk(Walk):
         *("straight", "since", "behind_glass", "rng", "inverse_depth", "came_from", "came_pdf", "kept"),
     )
 
-    def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, cell: mi.UInt32) -> None:
+    def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
         super().__init__(tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection)
+        cell, row, column = tracer.points.of(lane, tracer.grid.shape[0] * tracer.grid.shape[1])
+        self.anchor = row, column
         self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
         self.connector = tracer.connector
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
@@ -119,17 +126,19 @@ class _Walk(Walk):
     # ---- the camera's side ------------------------------------------------------------------------------------------
 
     def _aim(self, cell: mi.UInt32, jitter: mi.Point2f) -> None:
-        """Rays from the sensor's centre through the cells, and the weight of each."""
+        """Rays from the sensor through the cells, and the weight of each."""
         tracer, grid = self.tracer, self.tracer.grid
         columns = dr.opaque(mi.UInt32, grid.shape[1])
-        self.row = _place(grid.rows, cell // columns, jitter.x)
-        self.column = _place(grid.columns, cell % columns, jitter.y)
+        sensor = tracer.points.at(*self.anchor, self.rng)
+        self.start, nearness = rows_columns(sensor.x, sensor.y), dr.opaque(mi.Float, 1 / tracer.points.distance)
+        self.row = _place(grid.rows, cell // columns, jitter.x) - self.start[0] * nearness
+        self.column = _place(grid.columns, cell % columns, jitter.y) - self.start[1] * nearness
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
         wavelengths, spectral = sampled_wavelengths(tracer.camera, self.rng)
         to_world = tracer.camera.world_transform()
         direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
-        self.ray = mi.Ray3f(to_world @ mi.Point3f(0), to_world @ direction, 0.0, wavelengths)
+        self.ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
         self.active = (dr.abs(self.row) <= stop) & (dr.abs(self.column) <= stop)
         # dt of a cell times (1 + t^2)^-2, and a pixel's response cos^n.
@@ -260,7 +269,7 @@ class _Walk(Walk):
     # ---- light that is kept -----------------------------------------------------------------------------------------
 
     def _radiance(self, light: mi.Spectrum) -> mi.Float:
-        """One number for the light of a connection, as irradiance at the sensor's centre."""
+        """One number for the light of a connection, as irradiance where the path started."""
         return panchromatic(mi.unpolarized_spectrum(light) * self.strength * self.weight)
 
     def _lamps(self) -> mi.UInt32:
@@ -278,8 +287,9 @@ class _Walk(Walk):
             self._keep_seen("indirect", active & (surfaces > 1), value * self.part, pixel)
 
     def _keep_seen(self, kind: str, active: mi.Bool, value: mi.Float, pixel: mi.UInt32) -> None:
-        light = dr.select(active, value, 0)
-        self._keep(kind, Sightings(light, pixel, self.row, self.column, self.inverse_depth))
+        # Filed as the sensor's centre sees it.
+        row, column = (t + s * self.inverse_depth for t, s in zip((self.row, self.column), self.start, strict=True))
+        self._keep(kind, Sightings(dr.select(active, value, 0), pixel, row, column, self.inverse_depth))
 
 
 def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:

@@ -1,8 +1,9 @@
 """Indirect light from the projector's side: every pixel's rays, followed over any number of surfaces to the sensor.
 
-At each surface after the first the light that a path carries is connected to the sensor's centre
-(:mod:`mitsim.transport.receiver`), so every path that meets a second surface counts, and it counts for its own pixel.
-Of the connections of a path one is handed out, drawn in proportion to its light, and it carries the light of all.
+At each surface after the first the light that a path carries is connected to the sensor: its centre, a random point,
+or each of several anchors, for which a path is the same (:mod:`mitsim.transport.receiver`). So every path that meets a
+second surface counts, and it counts for its own pixel. Of the connections of a path one is handed out, drawn in
+proportion to its light, and it carries the light of all.
 
 Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side
 (:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.paths.camera_part` divides it.
@@ -20,12 +21,12 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.receiver import Receiver, sampled_wavelengths
+from mitsim.transport.receiver import Receiver, SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 
 
 class IndirectTracer(Tracer):
-    """Indirect light of a projector, and its caustics, at the sensor's centre."""
+    """Indirect light of a projector, and its caustics, at points of the sensor."""
 
     def __init__(
         self,
@@ -35,6 +36,7 @@ class IndirectTracer(Tracer):
         mirrors: bool,
         interreflection: bool,
         geometry: CameraGeometry | None = None,
+        points: SensorPoints | None = None,
     ) -> None:
         """What is followed.
 
@@ -46,14 +48,17 @@ class IndirectTracer(Tracer):
             paths over delta reflections and transmissions, and over other surfaces.
         geometry
             stands in for the camera's own.
+        points
+            where to; the sensor's centre if not given.
         """
         self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
+        self.points = points or SensorPoints(self.receiver.geometry.half_width)
 
     @property
     def lanes(self) -> int:
-        """Paths of one sample: one per projector pixel."""
-        return self.projector.n**2
+        """Paths of one sample: one per projector pixel and anchor."""
+        return self.projector.n**2 * self.points.count
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         return _Walk(self, seed, sample, lane).deposits(further=True)
@@ -64,9 +69,11 @@ class _Walk(Walk):
 
     STATE = ("active", "ray", "strength", "bounce", "scattered", "straight", "rng", "kept")
 
-    def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> None:
+    def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
         super().__init__(tracer.receiver.passage, tracer.mirrors, tracer.interreflection)
-        self.tracer, self.pixel = tracer, pixel
+        self.tracer = tracer
+        pixel, row, column = tracer.points.of(lane, tracer.projector.n**2)
+        self.pixel, self.anchor = pixel, (row, column)
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, self.rng = streams(seed, pixel, sample)
         self.first_turn = stratified(sample, shared)
@@ -76,6 +83,7 @@ class _Walk(Walk):
         self.flux = tracer.rays.flux(pixel, wavelengths) * spectral
         self.strength, self.active = mi.Spectrum(1), mi.Bool(True)
         self.bounce, self.scattered = mi.UInt32(0), mi.UInt32(0)
+        self.sensor = tracer.points.at(*self.anchor, self.rng)
 
     def vertex(self, first: bool) -> None:
         si = self.scene.ray_intersect(self.ray, self.active)
@@ -85,9 +93,9 @@ class _Walk(Walk):
         self._leave(si, first)
 
     def _connect(self, si: mi.SurfaceInteraction3f) -> None:
-        """Light that this surface sends to the sensor's centre."""
+        """Light that this surface sends to the sensor."""
         # Light that has met nothing but what it passes is the direct tracer's.
-        reception = self.tracer.receiver.receive(si, -self.ray.d, mi.Point3f(0), self.active & ~self.straight)
+        reception = self.tracer.receiver.receive(si, -self.ray.d, self.sensor, self.active & ~self.straight)
         value = panchromatic(reception.irradiance * self.flux * self.strength)
         caustic = self.scattered == 0
         value *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))

@@ -103,7 +103,8 @@ class Walk(ABC):
 
     Of each kind of light one connection a path is kept. ``STATE`` names the attributes that change on the way; the
     first tells which paths still go on. ``straight`` are those that have only passed surfaces so far
-    (:mod:`mitsim.transport.passage`): their light is direct light's own.
+    (:mod:`mitsim.transport.passage`): their light is direct light's own. ``anchor`` is the row and the column of that
+    which each path is followed to.
     """
 
     STATE: ClassVar[tuple[str, ...]]
@@ -113,6 +114,7 @@ class Walk(ABC):
     bounce: mi.UInt32
     straight: mi.Bool
     rng: mi.PCG32
+    anchor: tuple[mi.UInt32, mi.UInt32]
 
     def __init__(self, passage: Passage, mirrors: bool, interreflection: bool) -> None:
         """Paths before their first surface.
@@ -179,7 +181,7 @@ class Walk(ABC):
         if further:
             self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
         dr.eval(self.kept)
-        return [Deposits.fetched(seen, _KINDS[kind]) for kind, seen in self.kept.items()]
+        return [Deposits.fetched(seen, _KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
 
     def _body(self, *values: object) -> tuple[object, ...]:
         self._load(values)

@@ -13,16 +13,68 @@ that the sensor seems to see (:mod:`mitsim.transport.panes`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitsim.core.arrays import FloatArray
+from mitsim.optics.anchors import anchor_positions
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.coordinates import rows_columns
+from mitsim.transport.coordinates import rows_columns, x_y
 from mitsim.transport.histogram import Sightings
 from mitsim.transport.panes import refracted_way
 from mitsim.transport.passage import Passage
+
+
+@dataclass(frozen=True)
+class SensorPoints:
+    """Where on the sensor light is followed to: its centre, several anchors, or random points that are filed as one.
+
+    Attributes
+    ----------
+    half_width
+        of the sensor [mm].
+    anchors
+        a side; one is the centre.
+    spread
+        whether random points stand in for the one anchor: their light is the mean over the sensor.
+    distance
+        [mm] at which paths that start there are aimed at the same cells.
+    """
+
+    half_width: float
+    anchors: int = 1
+    spread: bool = False
+    distance: float = math.inf
+
+    @property
+    def count(self) -> int:
+        """Connections of a path in all."""
+        return self.anchors**2
+
+    @property
+    def positions(self) -> FloatArray:
+        """(anchors,) along an axis [mm]."""
+        return anchor_positions(self.anchors, self.half_width)
+
+    def of(self, lane: mi.UInt32, paths: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """A lane's path of so many ``paths``, and row and column of its anchor."""
+        count, anchors = dr.opaque(mi.UInt32, paths), dr.opaque(mi.UInt32, self.anchors)
+        anchor = lane // count
+        return lane % count, anchor // anchors, anchor % anchors
+
+    def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
+        """Anchors in the camera's frame, or random points drawn by ``rng``."""
+        if self.spread:
+            side = 2 * dr.opaque(mi.Float, self.half_width)
+            return mi.Point3f((rng.next_float32() - 0.5) * side, (rng.next_float32() - 0.5) * side, 0)
+        if self.anchors == 1:
+            return mi.Point3f(0)
+        positions = mi.Float(self.positions.astype(np.float32))
+        return mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
 
 
 @dataclass

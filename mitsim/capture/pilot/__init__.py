@@ -13,6 +13,7 @@ from mitsim.capture import effects
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import LOOKS, Changes, Evidence, Forming, Part, Settings
 from mitsim.capture.pilot.direct import AnchoredLight, FineLight
+from mitsim.capture.pilot.followed import FollowedLight
 from mitsim.capture.pilot.looks import Sample
 from mitsim.capture.pilot.reach import light_reach
 from mitsim.capture.pilot.sharp import sharp_pixels
@@ -26,14 +27,15 @@ from mitsim.scene.darkness import why_dark
 from mitsim.transport.left_out import left_out_light
 from mitsim.transport.lobes import SharpLight, sharp_light
 
-STAGES = ("cells", "effects", "anchors")
-"""What is looked at apart: cells and layers of direct light, effects switched off, anchors."""
+STAGES = ("cells", "effects", "anchors", "followed")
+"""What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light."""
 _STAGE_OF = {
     "cells": "cells",
     "layers": "cells",
     "anchors": "anchors",
     "anchored cells": "anchors",
     "anchored layers": "anchors",
+    "followed_anchors": "followed",
 }
 FINER = 4
 """Samples of a stage over those of the look before: standard errors are halved at least."""
@@ -52,7 +54,7 @@ _ALIGNED = 1e-6
 
 
 class Look:
-    """A look at a scene, as short as it can be at first; each of its three stages is repeated with more samples.
+    """A look at a scene, as short as it can be at first; each of its four stages is repeated with more samples.
 
     Parameters
     ----------
@@ -104,6 +106,10 @@ class Look:
         elif stage == "anchors":
             connections = sum(part.count**2 for part in self.anchored.changes if part.name == stage)
             paths, changes = FIXED.anchored * shown * finer.anchored * connections, len(self.anchored.changes)
+        elif stage == "followed":
+            connections = sum(part.count**2 for part in self.followed.changes)
+            lanes = sum(self.switched.lanes.values())
+            paths, changes = FIXED.followed * lanes * finer.followed * connections, len(self.followed.changes)
         else:
             followed = sum(getattr(FIXED, name) * lanes for name, lanes in self.switched.lanes.items())
             paths, changes = FIXED.direct * pixels * finer.direct + followed * finer.followed, len(self.present)
@@ -118,10 +124,15 @@ class Look:
         if stage == "cells":
             self.fine = FineLight(bench, base, sample, self.accuracy, seed)
         elif stage == "effects":
-            everything = replace(base, effects=frozenset(self.present), subdivision=2)
-            self.switched = SwitchedEffects(bench, everything, sample, seed, self.fine.judging)
+            self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
+        elif stage == "followed":
+            self.followed = FollowedLight(bench, self._everything, sample, self.accuracy, seed)
         else:
             self.anchored = AnchoredLight(bench, base, sample, self.accuracy, seed, self.fine.judging)
+
+    @property
+    def _everything(self) -> Settings:
+        return replace(self._base, effects=frozenset(self.present), subdivision=2)
 
     @cached_property
     def forming(self) -> Forming:
@@ -136,7 +147,7 @@ class Look:
     def evidence(self) -> Evidence:
         """What has been found."""
         fine, switched, anchored = self.fine, self.switched, self.anchored
-        seen = {**anchored.changes, **fine.changes, **switched.changes}
+        seen = {**anchored.changes, **fine.changes, **switched.changes, **self.followed.changes}
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
         return Evidence(
@@ -155,6 +166,7 @@ class Look:
             reach=self._base.reach,
             sharp=apart,
             sharp_light=switched.sharp_effort(),
+            followed=self.followed.effort(light),
         )
 
 
