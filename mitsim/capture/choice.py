@@ -343,7 +343,7 @@ class _Table:
 
 
 def counted(settings: Settings) -> tuple[int, int, int, int]:
-    """The numbers that :data:`COUNTED` names."""
+    """The numbers in ``settings`` that :data:`COUNTED` names."""
     return settings.anchors, len(settings.depths), settings.subdivision, settings.followed_anchors
 
 

@@ -48,6 +48,8 @@ _LOST = 0.1
 pixels may have it, and their frames are then off by ten times as much."""
 _LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
+_BY_CHANCE = 1.5
+"""Ratio of the variances of two halves of 16 shots that eight groups of them show by chance in one of twenty."""
 _REHEARSED = 2**16
 """Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes."""
 
@@ -327,10 +329,10 @@ def trace_light(
 
 
 def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> float:
-    """How much larger the error of all shots of a ``lighting`` is than that of those ``checked``, at least 1.
+    """How much larger the error of all shots of a ``lighting`` is than that of those ``checked``; 1 if by chance alone.
 
-    By what the groups differ in the total light of each shot. A heavy path that no checked shot sees shows there, and
-    forms no frame.
+    By what the groups of the ``light`` differ in the total light of each shot: a heavy path that no checked shot sees
+    shows there, without forming a frame.
     """
     rows = np.zeros(int(light.labels.max()) + 1, dtype=np.int64)
     rows[light.labels] = lighting.labels
@@ -340,7 +342,7 @@ def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> float:
         return float((totals @ shots.weights.T).var(axis=0).mean())
 
     of_checked = spread(checked)
-    return math.sqrt(max(spread(lighting) / of_checked, 1.0)) if of_checked else 1.0
+    return math.sqrt(max(spread(lighting) / of_checked / _BY_CHANCE, 1.0)) if of_checked else 1.0
 
 
 class _Group:

@@ -61,13 +61,21 @@ class SensorPoints:
         return anchor_positions(self.anchors, self.half_width)
 
     def of(self, lane: mi.UInt32, paths: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """A lane's path of so many ``paths``, and row and column of its anchor."""
+        """Path of each ``lane``, of so many ``paths`` to each anchor, and row and column of the anchor."""
         count, anchors = dr.opaque(mi.UInt32, paths), dr.opaque(mi.UInt32, self.anchors)
         anchor = lane // count
         return lane % count, anchor // anchors, anchor % anchors
 
     def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
-        """Anchors in the camera's frame, or random points drawn by ``rng``."""
+        """Anchors in the camera's frame, or random points.
+
+        Parameters
+        ----------
+        row, column
+            of the anchor.
+        rng
+            draws the random points.
+        """
         if self.spread:
             side = 2 * dr.opaque(mi.Float, self.half_width)
             return mi.Point3f((rng.next_float32() - 0.5) * side, (rng.next_float32() - 0.5) * side, 0)

@@ -42,6 +42,7 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
         ({"anchors": 2.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
         ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 3.0}, 3 * products(5, 3) + 3 * products(10, 3)),
         ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
+        ({"followed_anchors": 3.0, "coarse_cells": 2.0}, products(5, 3) + products(60, 3)),
         ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
     ],
 )

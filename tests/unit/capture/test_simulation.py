@@ -10,11 +10,11 @@ import pytest
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Settings
-from mitsim.capture.simulation import Simulation
+from mitsim.capture.simulation import AT_ANCHORS, Simulation
 from mitsim.optics.frames import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.rig.patterns import Lighting
-from mitsim.transport.histogram import Deposits
+from mitsim.transport.histogram import AMBIENT, Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z, BLACK = 16, 400.0, 0.01
@@ -158,10 +158,31 @@ def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
     light = made.file_anchored(made.anchored.trace(2, 0, 4), np.zeros(N * N, dtype=np.int64), 4).coarse
     rows, columns = made.coarse.bundle.cells
     found = light[[0]].toarray().reshape(2, rows, 2, columns)
-    mean = np.einsum("a,b,ayby->", made.mean_weights, made.mean_weights, found[:, :1, :, :1])
-    total = np.einsum("a,b,aybx->yx", made.mean_weights, made.mean_weights, found)
-    assert abs(mean) < 1e-12 and np.abs(total).max() < 1e-12 and np.abs(found).max() > 1e-12
-    assert made.mean_weights.sum() == pytest.approx(1)
+    weights = [0.5, 0.5]  # linear interpolation, over the sensor
+    assert np.abs(np.einsum("a,b,aybx->yx", weights, weights, found)).max() < 1e-12 and np.abs(found).max() > 1e-12
+
+
+def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> None:
+    """With the same light at all anchors nothing is left beyond the mean; ambient light is seen from random points."""
+    made = simulation(bench, "interreflection", "mirrors", "ambient", followed_anchors=2)
+    stages = made.tracers()
+    assert set(stages) == {"direct", "indirect", "from_camera", *AT_ANCHORS}
+    labels = np.zeros(N * N, dtype=np.int64)
+    assert not any((stages[name].tracer.trace(1, 0, 16).kind == AMBIENT).any() for name in AT_ANCHORS)
+    rng = np.random.default_rng(1)
+    number, place = rng.integers(0, 2, (3, 200)), rng.uniform(-0.14, 0.14, (2, 200))
+    found = Deposits(0 * number[0], *number[:2], *place, np.full(200, 1 / Z), rng.random(200), 1 + number[2])
+    light = made.file_at_anchors(found, labels, 16).followed[[0]].toarray()
+    rows, columns = made.followed.bundle.cells
+    weights = [0.5, 0.5]
+    assert np.abs(np.einsum("a,b,aybx->yx", weights, weights, light.reshape(2, rows, 2, columns))).max() < 1e-12
+    one = found.where((found.anchor_row == 0) & (found.anchor_column == 0))
+    same = [
+        replace(one, anchor_row=one.anchor_row + a, anchor_column=one.anchor_column + b) for a, b in np.ndindex(2, 2)
+    ]
+    assert np.abs(made.file_at_anchors(Deposits.joined(same), labels, 16).followed.data).max(initial=0) < 1e-15
+    ambient = [made.from_camera.trace(seed, 0, 64) for seed in range(2)]
+    assert all((one.kind == AMBIENT).any() for one in ambient)
 
 
 def test_flux_counts_each_pixels_direct_light(bench: Bench) -> None:

@@ -17,6 +17,7 @@ from mitsim.transport.cells import aligned_grid
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.receiver import SensorPoints
 from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -100,14 +101,55 @@ def test_both_sides_together_find_all_light(shared_scene: Callable[..., Path], m
         assert abs(total - other) < bound
 
 
-def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Callable[..., Path]) -> None:
+CORNER = f"""<shape type="rectangle"><transform name="to_world"><scale x="60" y="60"/><rotate y="1" angle="90"/>
+    <translate x="-30" z="360"/></transform>{SHINY.replace("0.05", "0.2")}</shape>"""
+
+
+def test_both_sides_find_the_same_light_at_every_anchor(
+    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside a shiny wall, on a sensor of 24 mm: how much, and in which mean direction and depth the centre files it.
+
+    (Planted: the camera's paths filed as their start sees them; half the distance between their aims.)
+    """
+    bench = open_bench(shared_scene("wall", extra=CORNER, pitch=0.375, mask_feature=0.3), for_render=True)
+    loaded, geometry = bench.loaded, bench.geometry
+    points = SensorPoints(geometry.half_width, 2, distance=geometry.scene_distance)
+    grid = aligned_grid(*bench.windows, 2 * N, 1, geometry.reach(geometry.scene_distance))
+    parts = loaded.scene, loaded.camera, bench.projector_optics
+    sides = (
+        (IndirectTracer(*parts, False, True, points=points), 1e6),
+        (FromCameraTracer(*parts, grid, Paths(interreflection=True), points=points), 1e-6),
+    )
+    found = np.zeros((2, SEEDS, 4, 4))
+    for side, (tracer_, sharp) in enumerate(sides):
+        monkeypatch.setattr(paths, "_SHARP", sharp)
+        for seed in range(SEEDS):
+            light = tracer_.trace(seed, 0, 256)
+            anchor = 2 * light.anchor_row + light.anchor_column
+            for index, weight in enumerate((1.0, light.row, light.column, light.inverse_depth)):
+                found[side, seed, index] = np.bincount(anchor, light.value * weight / 256, 4)
+    found[:, :, 1:] /= found[:, :, :1]
+    means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
+    bound = SIGMAS * np.hypot(*errors)
+    assert (np.abs(means[0] - means[1]) < bound).all()
+    total, *places = bound
+    assert (total < 0.1 * means[0, 0]).all(), "of all light"
+    assert np.max(places[:2]) < 0.1 * np.ptp(means[0, 1:3]) and (places[2] < 0.05 * means[0, 3]).all()
+    assert np.ptp(means[0, 0]) > 0.05 * means[0, 0].mean(), "the anchors see different light"
+
+
+@pytest.mark.parametrize("anchors", [1, 3])
+def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Callable[..., Path], anchors: int) -> None:
     """A mirror wall x = -40 throws light on the sheet, which seems to come from the projector's image at x = -140.
 
     Each ray carries pi scale (0.3 / n)^2 to its place on the sheet, wherever that is, and the sheet sends the camera
-    0.5 / pi cos^2 / r^2 of it.
+    0.5 / pi cos^2 / r^2 of it, from wherever on the sensor.
     """
     bench = open_bench(shared_scene("caustic", extra=MIRROR))
-    found = tracer(bench, mirrors=True, interreflection=False).trace(2, 0, 64)
+    parts, points = (bench.loaded.scene, bench.loaded.camera), SensorPoints(bench.geometry.half_width, anchors)
+    found = IndirectTracer(*parts, bench.projector_optics, True, False, points=points).trace(2, 0, 64)
+    assert {*found.anchor_row, *found.anchor_column} == set(range(anchors))
     assert found.value.size > 1000 and (found.kind == DIRECT).all()
     places = np.stack([-found.column, -found.row, np.ones(found.value.size)], axis=1) / found.inverse_depth[:, None]
     assert places[:, 2] == pytest.approx(np.full(len(places), 400), rel=1e-5)
@@ -120,7 +162,8 @@ def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Call
     slope_x, slope_y = way[:, 0] / way[:, 2], way[:, 1] / way[:, 2]
     assert np.abs(slope_y - (0.15 - (row + 0.5) / N * 0.3)).max() < 0.1501 / N
     assert np.abs(slope_x - (column + 0.5) / N * 0.3).max() < 0.152 / N
-    r2 = np.square(places).sum(axis=1)
+    at = np.stack([-points.positions[found.anchor_column], -points.positions[found.anchor_row]], axis=1)
+    r2 = np.square(places[:, :2] - at).sum(axis=1) + np.square(places[:, 2])
     expected = np.pi * 111000 * (0.3 / N) ** 2 * 0.5 / np.pi * 400**2 / r2**2
     assert found.value == pytest.approx(expected, rel=1e-4)
 
