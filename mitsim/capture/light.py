@@ -23,7 +23,7 @@ from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames, monte_carlo_bound, monte_carlo_error
+from mitsim.optics.frames import ExpectedFrames, bound_of, monte_carlo_bound, monte_carlo_error
 from mitsim.rig.patterns import Lighting
 
 if TYPE_CHECKING:
@@ -314,11 +314,11 @@ def trace_light(
         )
         # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
         expected = light.frames(checked, seed, leaking=False)
-        beyond = _unchecked(light, lighting, checked)
-        error = beyond * monte_carlo_error(expected)
+        more, bound = _unchecked(light, lighting, checked)
+        error = more * monte_carlo_error(expected)
         # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
         target = sampling.target(expected) if sampling.target else plan.sampling_target
-        seen = error if sampling.target else beyond * monte_carlo_bound(expected)
+        seen = error if sampling.target else bound * monte_carlo_bound(expected)
         progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
         if seen <= target or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=seen <= target)
@@ -328,21 +328,22 @@ def trace_light(
         rounds *= min(max(1.05 * growth, 1.1), _LARGEST_GROWTH)
 
 
-def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> float:
-    """How much larger the error of all shots of a ``lighting`` is than that of those ``checked``; 1 if by chance alone.
+def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
+    """How much larger the error of all shots of a ``lighting``, and its bound, are than those of the shots ``checked``.
 
     By what the groups of the ``light`` differ in the total light of each shot: a heavy path that no checked shot sees
-    shows there, without forming a frame.
+    shows there, without forming a frame. What may be chance counts as 1.
     """
     rows = np.zeros(int(light.labels.max()) + 1, dtype=np.int64)
     rows[light.labels] = lighting.labels
     totals = np.array([np.bincount(rows, group.totals[:-1], lighting.weights.shape[1]) for group in light.groups])
-
-    def spread(shots: Lighting) -> float:
-        return float((totals @ shots.weights.T).var(axis=0).mean())
-
-    of_checked = spread(checked)
-    return math.sqrt(max(spread(lighting) / of_checked / _BY_CHANCE, 1.0)) if of_checked else 1.0
+    totals -= totals.mean(axis=0)
+    every, some = (np.square(totals @ shots.weights.T).mean(axis=1) for shots in (lighting, checked))
+    if not some.any():
+        return 1.0, 1.0
+    ratios = every.sum() / some.sum(), (bound_of(every, 1.0) / bound_of(some, 1.0)) ** 2
+    error, bound = (math.sqrt(max(ratio / _BY_CHANCE, 1.0)) for ratio in ratios)
+    return error, bound
 
 
 class _Group:

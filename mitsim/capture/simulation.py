@@ -410,19 +410,26 @@ class Simulation:
         first = len(rows)
         black = self.physics.black_level if leaking else 0.0
         emitted = black + (1 - black) * lighting.weights
-        lights, ambient = [Filed(self.fine.optics, tuple(group.fine[:first] for group in groups))], []
+        lights, ambient = [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))], []
         if self.settings.anchors > 1:
-            lights.append(Filed(self.coarse.optics, tuple(group.coarse[:first] for group in groups)))
+            lights.append(Filed(self.coarse.optics, tuple(_rows(group.coarse, 0, first) for group in groups)))
         if self.settings.sharp:
-            lights.append(Filed(self.sharp.optics, tuple(group.sharp[:first] for group in groups)))
+            lights.append(Filed(self.sharp.optics, tuple(_rows(group.sharp, 0, first) for group in groups)))
         if self.settings.followed_anchors > 1:
-            lights.append(Filed(self.followed.optics, tuple(group.followed[:first] for group in groups)))
+            lights.append(Filed(self.followed.optics, tuple(_rows(group.followed, 0, first) for group in groups)))
         if self.physics.interreflection:
-            lights.append(Filed(self.smooth.optics, tuple(group.smooth[:first] for group in groups)))
+            lights.append(Filed(self.smooth.optics, tuple(_rows(group.smooth, 0, first) for group in groups)))
         if self.physics.lamps:
-            ambient.append(Filed(self.ambient.optics, tuple(group.fine[first:] for group in groups)))
+            ambient.append(Filed(self.ambient.optics, tuple(_rows(group.fine, first, first + 1) for group in groups)))
         glint = self.glint_frames(lighting.labels)
         return ExpectedFrames(lights, Lighting(rows, emitted), seed, ambient, glint)
+
+
+def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:
+    """Rows ``first`` .. ``last`` - 1 of ``light``, not copied."""
+    start, stop = light.indptr[first], light.indptr[last]
+    entries = light.data[start:stop], light.indices[start:stop], light.indptr[first : last + 1] - start
+    return sparse.csr_array(entries, shape=(last - first, light.shape[1]), copy=False)
 
 
 def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:

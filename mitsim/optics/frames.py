@@ -371,7 +371,9 @@ def _formed(lights: Sequence[Filed], basis: sparse.csr_array, seed: int) -> tupl
 
 
 def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_array:
-    """``basis @ light``."""
+    """``basis @ light``; ``light`` itself where each row stays what it is."""
+    if basis.nnz == len(basis.indices) == basis.shape[1] and not (basis - sparse.eye_array(*basis.shape)).nnz:
+        return light
     if light.shape[1] <= _MOST_COLUMNS:
         return basis @ light
     places, indices = np.unique(light.indices, return_inverse=True)
