@@ -18,7 +18,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.choice import cheapest, doubt
 from mitsim.capture.evidence import EVEN, GROUPS, Evidence, Settings, even
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
-from mitsim.capture.simulation import AT_ANCHORS, FiledLight, Simulation
+from mitsim.capture.simulation import AT_ANCHORS, LANES_AT_ONCE, FiledLight, Simulation
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
@@ -46,8 +46,6 @@ _VIEW_SAMPLES = 64
 _LOST = 0.1
 """Part of the accuracy that light beyond all cells may have: it falls on one edge of the sensor, so a hundredth of the
 pixels may have it, and their frames are then off by ten times as much."""
-_LANES_AT_ONCE = 2**21
-"""Paths whose light is held in memory at a time."""
 _BY_CHANCE = 1.5
 """Ratio of the variances of two halves of 16 shots that eight groups of them show by chance in one of twenty."""
 _REHEARSED = 2**16
@@ -363,7 +361,7 @@ class _Group:
             samples = max(rounds * stage.predicted, 1.0)
             wanted, seed = math.ceil(even(samples) if name in EVEN else samples), integer(self.seed, stage.stream)
             while (done := self.done.get(name, 0)) < wanted:
-                count = min(max(1, _LANES_AT_ONCE // stage.tracer.lanes), wanted - done)
+                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted - done)
                 deposits = stage.tracer.trace(seed, done, count)
                 light = stage.file(deposits, self.labels, 1)
                 self._sums[name] = self._sums[name] + light if name in self._sums else light

@@ -14,6 +14,7 @@ from scipy.ndimage import uniform_filter
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import Physics, names
 from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.simulation import LANES_AT_ONCE
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.rig.recipe import load_recipe
@@ -36,8 +37,6 @@ over smooth light. Too high a guess costs another round, too low a one some rays
 _MOST_RAYS, _MOST_SAMPLES = 2**23, 128
 """Rays of each flux, and samples a pixel where that is more, beyond which it is left as it is: some three seconds on
 two cores. The standard error tells how good it is then."""
-_LANES_AT_ONCE = 2**21
-"""Rays whose light is held in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +147,7 @@ class _Flux:
                 self._sample(pixels[self._samples[pixels] == done], done, done)
 
     def _sample(self, pixels: np.ndarray[tuple[int], np.dtype[np.int64]], first: int, samples: int) -> None:
-        tracer, at_once = self._tracer.at(pixels), max(1, _LANES_AT_ONCE // len(pixels))
+        tracer, at_once = self._tracer.at(pixels), max(1, LANES_AT_ONCE // len(pixels))
         for sums, seed in zip(self._sums, self._seeds, strict=True):
             for start in range(first, first + samples, at_once):
                 found = tracer.trace(seed, start, min(at_once, first + samples - start))

@@ -162,8 +162,8 @@ def test_light_does_not_depend_on_how_many_paths_are_held_at_once(
     lighting = bench.family("dots:2").lighting
     plan = make_plan(bench, lighting, 5e-2, 3, {"diffraction": False})
     found = []
-    for lanes in (light._LANES_AT_ONCE, light._LANES_AT_ONCE, 300):
-        monkeypatch.setattr(light, "_LANES_AT_ONCE", lanes)
+    for lanes in (light.LANES_AT_ONCE, light.LANES_AT_ONCE, 300):
+        monkeypatch.setattr(light, "LANES_AT_ONCE", lanes)
         one = trace_light(bench, plan, lighting, 3)
         found.append(np.stack([frame.irradiance for frame in one.frames(lighting, 3)]))
     assert np.array_equal(found[0], found[1])

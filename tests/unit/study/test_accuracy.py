@@ -114,7 +114,7 @@ def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
     lighting = bench.family(PATTERNS).lighting
     plan = make_plan(bench, lighting, 1e-3, SEED)
     evidence = pilot.measure(bench, lighting, 1e-3, SEED)
-    samples = {"direct_samples", "anchored_samples", "indirect_samples", "from_camera_samples"}
+    samples = {"direct_samples", "anchored_samples", "indirect_samples", "from_camera_samples", "followed_samples"}
     turned = {
         "samples": samples,
         "cells": {"subdivision"},
