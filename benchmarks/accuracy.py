@@ -7,13 +7,15 @@ the plan at 3e-4, and coarse cells as fine as the rest. With r1, r2 its two halv
 squared error of all frames a without the noise of the answer; its standard error is the jackknife's over shots.
 Captures are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version to
 be timed and judged beside this one. What FILE and the answers beside it hold already is not repeated, so the work can
-be cut short at any time; ``--answers`` makes those alone, which need no idle machine.
+be cut short at any time; ``--answers`` makes those alone, which need no idle machine. ``--seeds N`` tells of how many
+captures with other seeds the error lies within the accuracy, and below the bound that the run states; it is not timed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -28,11 +30,13 @@ import numpy.typing as npt
 
 import mitsim as ms
 from mitsim.capture.choice import predicted
+from mitsim.capture.evidence import Estimate
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.light import Sampling, make_plan, trace_light
 from mitsim.core.framefile import read_frame
 from mitsim.core.job import Job
 from mitsim.core.seeds import integer
+from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
 from mitsim.study.knobs import Stand
 
 SCENES = (
@@ -122,6 +126,27 @@ def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None) -> di
     }
 
 
+def covered(scene: str, accuracy: float, seeds: int, halves: Frames) -> dict[str, Any]:
+    """Errors and stated bounds of captures with ``seeds`` other seeds, and how many hold."""
+    bench, rows = ms.open_bench(scene), []
+    for seed in range(1, seeds + 1):
+        family = bench.family(PATTERNS, SEED)
+        plan = make_plan(bench, family.lighting, accuracy, seed)
+        expected = trace_light(bench, plan, family.lighting, seed, Sampling(by_pixel=False)).frames(family.lighting, 0)
+        square, _ = squared_error(np.array([frame.irradiance for frame in expected]), halves)
+        noise = Estimate(monte_carlo_error(expected), monte_carlo_bound(expected))
+        rows.append((math.sqrt(max(square, 0)), *plan.total(noise)))
+    errors, totals, bounds = np.array(rows).T
+    return {
+        "seeds": seeds,
+        "within_accuracy": int((errors <= accuracy).sum()),
+        "within_bound": int((errors <= bounds).sum()),
+        "errors": errors.tolist(),
+        "totals": totals.tolist(),
+        "bounds": bounds.tolist(),
+    }
+
+
 class _Unit:
     """A frame of 1 W m^-2."""
 
@@ -135,6 +160,7 @@ def main() -> None:
     parser.add_argument("--accuracy", action="append", type=float, default=[])
     parser.add_argument("--old", type=Path)
     parser.add_argument("--answers", action="store_true")
+    parser.add_argument("--seeds", type=int, default=0)
     parser.add_argument("--noise", type=float, default=NOISE)
     options = parser.parse_args()
     found = json.loads(options.json.read_text()) if options.json.exists() else {}
@@ -143,7 +169,12 @@ def main() -> None:
         kept = options.json.with_suffix(f".{Path(scene).stem}.npy")
         if not kept.exists():
             np.save(kept, answer(scene, options.noise))
-        for accuracy in () if options.answers else options.accuracy or ACCURACIES:
+        for accuracy in (options.accuracy or ACCURACIES) if options.seeds else ():
+            if (key := f"seeds {accuracy:g}") not in rows:
+                rows[key] = row = covered(scene, accuracy, options.seeds, np.load(kept))
+                print(f"{scene} {accuracy:g}: within {row['within_accuracy']}, {row['within_bound']} of {row['seeds']}")
+                options.json.write_text(json.dumps(found, indent=1))
+        for accuracy in () if options.answers or options.seeds else options.accuracy or ACCURACIES:
             for name, tree in (("new", None), ("old", options.old)):
                 key = f"{name} {accuracy:g}"
                 if key in rows or (name == "old" and tree is None):

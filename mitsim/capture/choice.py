@@ -26,7 +26,10 @@ _MARGIN = 0.92
 """Part of the accuracy that is planned for: sampling knows its own error to a few percent, and the frames that the
 pilot looks at differ from the family's by as much."""
 _LEAST_SAMPLING = 0.7
-"""Part of the accuracy that sampling aims for where nothing fits, and precision would be lost on it."""
+"""Part of the accuracy that sampling aims for where nothing fits; or half of what is left out or coarse, if that is
+more: it then adds an eighth to the total."""
+_AS_GOOD = 1.1
+"""Where nothing fits, settings whose error is larger than the least by this count as good as it."""
 _COARSE_CELLS = (1, 2, 4, 8)
 """As for fine light."""
 _FEWEST_SAMPLES = 1.0
@@ -191,8 +194,8 @@ class _Table:
     @cached_property
     def best(self) -> int:
         """The best row."""
-        work = np.where(self.fits, self.work, 0.0)
-        return int(np.lexsort((self._avoidable, work, np.where(self.fits, 0.0, self._avoidable), ~self.fits))[0])
+        chosen = self.fits if self.fits.any() else self._avoidable <= _AS_GOOD * self._avoidable.min()
+        return int(np.lexsort((self._avoidable, self.work, ~chosen))[0])
 
     def choice(self, index: int) -> Choice:
         """The choice of a row."""
@@ -297,7 +300,8 @@ class _Table:
     def target(self) -> FloatArray:
         """(m,) Monte Carlo error at which sampling may stop."""
         left = np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
-        return np.where(self.fits, np.sqrt(np.maximum(left, 0)), _LEAST_SAMPLING * self.accuracy)
+        otherwise = np.maximum(_LEAST_SAMPLING * self.accuracy, self._avoidable / 2)
+        return np.where(self.fits, np.sqrt(np.maximum(left, 0)), otherwise)
 
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import names
-from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE
-from mitsim.capture.simulation import LANES_AT_ONCE
 from mitsim.core.resources import Cost
 from mitsim.optics.frames import frames_in_memory
 from mitsim.rig.patterns import Lighting

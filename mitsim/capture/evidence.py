@@ -24,6 +24,8 @@ _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
 GROUPS = 8
 """Independent estimates of the light: eight tell their spread, the Monte Carlo error, to a quarter (1 / sqrt(14))."""
+LANES_AT_ONCE = 2**21
+"""Paths whose light is held in memory at a time."""
 LOOKS = 4
 """Independent looks of the pilot, the fewest whose spread tells a standard error worth its name."""
 SURE = 2.35

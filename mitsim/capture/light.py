@@ -16,9 +16,9 @@ import numpy as np
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.choice import cheapest, doubt
-from mitsim.capture.evidence import EVEN, GROUPS, Evidence, Settings, even
+from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Evidence, Settings, even
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
-from mitsim.capture.simulation import AT_ANCHORS, LANES_AT_ONCE, FiledLight, Simulation
+from mitsim.capture.simulation import AT_ANCHORS, FiledLight, Simulation
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas

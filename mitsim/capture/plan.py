@@ -275,7 +275,7 @@ class _Words:
     def warnings(self) -> tuple[str, ...]:
         """Why the frames will not keep the accuracy."""
         chosen, accuracy, missing = self.chosen, self.accuracy, self.evidence.unresolved
-        if chosen.systematic.bound <= accuracy:
+        if chosen.total.bound <= accuracy:
             return ()
         if missing > accuracy:
             return (
@@ -285,7 +285,7 @@ class _Words:
         parts = self._left()
         largest = max(parts, key=lambda name: parts[name])
         return (
-            f"predicted systematic error, below {chosen.systematic.bound:.1e}, exceeds the requested {accuracy:g}; "
+            f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
             f"largest: {largest}, {parts[largest]:.1e}",
         )
 

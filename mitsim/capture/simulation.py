@@ -37,8 +37,6 @@ _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 a shadow's fringes hardly move."""
 TRAYS = ("fine", "coarse", "smooth", "followed", "sharp")
 """Parts of an :class:`FiledLight`."""
-LANES_AT_ONCE = 2**21
-"""Paths whose light is held in memory at a time."""
 AT_ANCHORS = ("indirect at anchors", "from camera at anchors")
 """Names of the stages that follow light to every anchor."""
 _MOST_ROWS = 2**12

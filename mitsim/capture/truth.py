@@ -13,30 +13,21 @@ from scipy.ndimage import uniform_filter
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import Physics, names
-from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.simulation import LANES_AT_ONCE
+from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
+from mitsim.capture.prices import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_PART, TRUTH_SAMPLES
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.rig.recipe import load_recipe
 from mitsim.transport.direct import FluxTracer
 from mitsim.transport.histogram import DIRECT
 
-_PART = 1 / 6
-"""Of the error that the frames' own sampling leaves in any image, what the truth may be off by: it then adds at most
-0.12 dB to the error of the best image that a run could give."""
 _FINEST = 1e-4
 """Standard error below which the truth is not refined: 80 dB, where no image of a sensor with a full well comes."""
 _BOARD_PART = 0.5
 """Of the truth's error, what the board may bring: a quarter of its square, for a surface that converges quickly."""
-_FIRST_SAMPLES, _BOARD_SAMPLES = 8, 4
-"""Samples a pixel that each of the groups begins with. 64 in all show all but a corner of a hundredth of a pixel, which
-their spread would not tell of; a board has no corners."""
 _GAIN = 0.75
 """Part of its variance that a pixel loses when its samples are doubled: 0.5 of random points, 0.87 of stratified ones
 over smooth light. Too high a guess costs another round, too low a one some rays."""
-_MOST_RAYS, _MOST_SAMPLES = 2**23, 128
-"""Rays of each flux, and samples a pixel where that is more, beyond which it is left as it is: some three seconds on
-two cores. The standard error tells how good it is then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,32 +69,16 @@ def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatAr
         in any image of them.
     """
     effects = names(lambda effect: effect.in_truth) & settings.effects
-    board = _Flux(bench.with_board(load_recipe().board_reflectance), effects, seed, "board", _BOARD_SAMPLES)
+    board = _Flux(bench.with_board(load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
     unit = board.mean
-    target = max(_PART * _rms(_over(flux_error, unit)), _FINEST)
+    target = max(TRUTH_PART * _rms(_over(flux_error, unit)), _FINEST)
     board.refine(unit, _BOARD_PART * target)
-    scene = _Flux(bench, effects, seed, "scene", _FIRST_SAMPLES)
+    scene = _Flux(bench, effects, seed, "scene", TRUTH_SAMPLES)
     scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target)
     reflectance = _over(scene.mean, board.mean)
     error = np.hypot(_over(scene.standard_error, board.mean), reflectance * _over(board.standard_error, board.mean))
     shape = (bench.n, bench.n)
     return Truth(reflectance.reshape(shape), error.reshape(shape), board.mean, scene.rays + board.rays)
-
-
-def predicted_rays(pixels: int, samples: float, rate: float) -> float:
-    """Rays that :func:`trace_truth` will take for both fluxes.
-
-    Parameters
-    ----------
-    pixels
-        of the projector.
-    samples, rate
-        that each group of the frames' direct light takes a pixel, and the power of their number that its error falls
-        with.
-    """
-    first = GROUPS * pixels * (_FIRST_SAMPLES + _BOARD_SAMPLES)
-    wanted = GROUPS * pixels * samples * float(_PART ** (-1 / rate))
-    return min(first + wanted, max(_MOST_RAYS, _MOST_SAMPLES * pixels))
 
 
 class _Flux:
@@ -140,7 +115,7 @@ class _Flux:
             by_gain = np.argsort(-likely / self._samples, kind="stable")
             enough = int(np.searchsorted(_GAIN * np.cumsum(variance[by_gain]), excess)) + 1
             pixels = np.sort(by_gain[:enough])
-            most = max(_MOST_RAYS, _MOST_SAMPLES * len(variance))
+            most = max(MOST_RAYS, MOST_SAMPLES * len(variance))
             if self.rays + GROUPS * self._samples[pixels].sum() > most:
                 return
             for done in np.unique(self._samples[pixels]).astype(int):

@@ -36,6 +36,7 @@ class Effort:
     direct: int
     other: int
     anchors: int = 5
+    followed_anchors: int = 3
     layers: int = 8
     cells: int = 4
 
@@ -53,6 +54,7 @@ def answer(bench: Bench, shots: Lighting, depth: float, seed: int, effort: Effor
     """(groups, shots, pixels, pixels) frames with all that ``bench`` has, all ``depth`` [mm] of the light in layers."""
     names = frozenset(effects.present(bench)) - {"speckle"}
     base = Settings(depth, subdivision=effort.cells, effects=names, coarse_cells=2, coarse_layers=True)
+    base = replace(base, followed_anchors=effort.followed_anchors)
     settings = replace(base, anchors=effort.anchors, layers=_layers(bench, base, seed, effort.layers))
     simulation = Simulation(bench, settings)
     counts = {"direct": effort.direct, "anchored": max(1, effort.direct // 4)}

@@ -148,7 +148,7 @@ def test_a_scene_in_depth_is_exact_to_its_standard_error(shadowed: Bench) -> Non
 def test_the_boards_own_error_counts(bench: Bench) -> None:
     """A board of half the reflectance is the scene: where its flux is as uncertain as the board's, so is the ratio."""
     board = traced(bench.with_board(0.5), 0, np.inf)
-    alone = module._Flux(bench.with_board(0.5), frozenset(), 0, "board", module._BOARD_SAMPLES)
+    alone = module._Flux(bench.with_board(0.5), frozenset(), 0, "board", module.BOARD_SAMPLES)
     relative = (alone.standard_error / alone.mean).reshape(N, N)
     assert (board.standard_error > 0.999 * board.reflectance * relative).all()
     assert board.reflectance == pytest.approx(0.5 / 0.99, rel=2e-3)
@@ -158,9 +158,9 @@ def test_it_shares_no_error_with_the_frames(bench: Bench, printed: np.ndarray) -
     """Correlation over 256 pixels, with as many samples of each, below 4 / 16. (Planted: the frames' streams.)"""
     lighting = parse_patterns("dots:4", N).lighting
     plan = make_plan(bench, lighting, 1e-2, 0, dict.fromkeys(EFFECTS, False))
-    plan = replace(plan, settings=replace(plan.settings, direct_samples=float(module._FIRST_SAMPLES)))
+    plan = replace(plan, settings=replace(plan.settings, direct_samples=float(module.TRUTH_SAMPLES)))
     light = trace_light(bench, plan, lighting, 3, Sampling(by_pixel=False, target=lambda _: np.inf))
-    assert light.paths == 8 * N**2 * module._FIRST_SAMPLES, "the first round is what was predicted"
+    assert light.paths == 8 * N**2 * module.TRUTH_SAMPLES, "the first round is what was predicted"
     found, answer = trace_truth(bench, plan.settings, 3, np.full(N * N, np.inf)), exact(printed / 255)
     of_frames = (light.flux / found.board_flux).reshape(N, N) - answer
     of_truth = found.reflectance - answer
@@ -179,8 +179,8 @@ def test_it_is_refined_as_far_as_the_frames_need(bench: Bench, monkeypatch: pyte
 
 def test_rays_end_where_they_would_take_too_long(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """The truth then says how good it is, instead of taking an hour."""
-    monkeypatch.setattr(module, "_MOST_RAYS", 0)
-    monkeypatch.setattr(module, "_MOST_SAMPLES", 64)
+    monkeypatch.setattr(module, "MOST_RAYS", 0)
+    monkeypatch.setattr(module, "MOST_SAMPLES", 64)
     found = traced(bench, 0, 0.0)
     assert found.rays <= 2 * 64 * N**2 and found.error > 2e-4
 
