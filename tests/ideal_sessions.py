@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, Patterns, RunManifest
-from mitsim.core.runs import Capture, RunMemory, frame_name
+from mitsim.core.recorders import RunMemory, frame_name
+from mitsim.core.runs import Capture
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.status import Status, Verdict
@@ -74,7 +75,7 @@ class Bench:
         digital = Digital(
             exposure_s=gain, gain_dn_per_e=GAIN, black_level_dn=BLACK, dark_current_e_per_s=DARK / gain, **noise
         )
-        return memory.finish(RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files)))
+        return Capture.recorded(memory, RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files)))
 
     def calibrated(self, seed: int, error: float = CALIBRATION_ERROR) -> Factors:
         """Factors as a session finds them: each with independent noise of that relative ``error``."""

@@ -21,10 +21,10 @@ import numpy.typing as npt
 from mitsim.core.errors import MitsimError
 from mitsim.core.jsonfile import plain, read_json, write_json
 from mitsim.core.manifests import MANIFEST
-from mitsim.core.output import output_folder, sweep, whole_file
+from mitsim.core.output import PARTS, output_folder, sweep, whole_file
 
 KIND = "calibration"
-_SUFFIX = ".part.npz"
+_SUFFIX = PARTS.removeprefix("*")
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -67,7 +67,7 @@ class Checkpoint:
     def clear(self) -> None:
         """Remove the parts of a session that is complete."""
         if self.folder is not None:
-            for path in self.folder.glob(f"*{_SUFFIX}"):
+            for path in self.folder.glob(PARTS):
                 path.unlink()
 
     def _digest(self, data: memoryview) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +14,25 @@ import numpy as np
 from mitsim.capture.ambient import AmbientFrame, is_taken, shots_for
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
-from mitsim.capture.evidence import GROUPS, Estimate, Settings
-from mitsim.capture.exposer import Exposer, NoiseTarget, in_chunks
+from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.exposer import Exposer, NoiseTarget
 from mitsim.capture.light import Light, Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Request
-from mitsim.core.arrays import FloatArray
+from mitsim.capture.shooting import Shooting, Totals
 from mitsim.core.errors import ArgumentError
 from mitsim.core.framefile import Channel
 from mitsim.core.job import Job
-from mitsim.core.manifests import AmbientFile, Patterns, RunHead, RunManifest
 from mitsim.core.manifests import Digital as DigitalScale
-from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.core.runs import AMBIENT, Capture, RunFolder, RunMemory, claimed, frame_name
+from mitsim.core.manifests import Patterns, RunHead, RunManifest
+from mitsim.core.output import FRAMES
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.recorders import AMBIENT, Recorder, RunMemory, claimed, frame_name
+from mitsim.core.runs import Capture
 from mitsim.core.versions import DECIDING, versions
-from mitsim.optics.frames import ExpectedFrames, Frame, bound_of
-from mitsim.rig.patterns import Lighting, PatternFamily, Shot
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.rig.recipe import load_recipe
-from mitsim.sensor.chain import Digital
 
 _FIREFLIES = 0.8
 """Part of the variance in one of 8 groups: a single heavy path gives 0.875, and ordinary noise 0.2 to 0.4.
@@ -136,7 +137,7 @@ def capture(
     family = bench.family(request.patterns, request.seed)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     lighting = family.lighting
-    on_disk = sum(path.stat().st_size for path in Path(output).glob("frame_*.exr")) if output and resume else 0
+    on_disk = sum(path.stat().st_size for path in Path(output).glob(FRAMES)) if output and resume else 0
     place = Path(output) if output else None
     exposing = sum(frame_seconds(bench, len(family.shots)).values())
     first_look = frames_cost(bench, Settings(bench.geometry.scene_distance), lighting, exposing, on_disk)
@@ -156,7 +157,7 @@ def capture(
         expected = light.frames(lighting, request.seed)
         with job.clock.stage("optics"):
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
-            totals = _Totals.of(expected)
+            totals = Totals.of(expected)
         exposure_s = request.timing.choose(bench.rig, totals.peak)
         exposer = Exposer(bench.rig, exposure_s, request.seed, light.simulation.physics.speckle)
         digital = digital_scale(bench, exposure_s)
@@ -166,7 +167,7 @@ def capture(
             ambient = _ambient(request, family, expected, exposer)
         if ambient:
             _record_ambient(recorder, ambient, exposer)
-        shooting = _Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
+        shooting = Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
         shooting.shoot(expected, job)
         total = light.plan.total(totals.noise)
         manifest = RunManifest(
@@ -190,7 +191,7 @@ def capture(
             warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
             versions=versions(),
         )
-        return recorder.finish(manifest)
+        return Capture.recorded(recorder, manifest)
 
 
 def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
@@ -200,7 +201,7 @@ def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
 
 
 @contextmanager
-def _recorder(output: Path | None, head: RunHead, resume: bool) -> Iterator[RunFolder | RunMemory]:
+def _recorder(output: Path | None, head: RunHead, resume: bool) -> Iterator[Recorder]:
     if output is None:
         yield RunMemory()
         return
@@ -213,158 +214,6 @@ def _sampling(bench: Bench, request: Request) -> Sampling:
     return Sampling(by_pixel=False, target=NoiseTarget(bench.rig, request.timing, fraction) if fraction else None)
 
 
-@dataclass(frozen=True)
-class _Totals:
-    """Over all expected frames: brightest pixel [W m^-2], relative Monte Carlo error, most light below zero.
-
-    ``heaviest``: the largest part of the Monte Carlo variance that one group of the light brings; ``mc_bound``: what
-    that error is below, at 95 %.
-    """
-
-    peak: float
-    mc_error: float
-    removed: float
-    heaviest: float
-    mc_bound: float
-
-    @property
-    def noise(self) -> Estimate:
-        """The Monte Carlo error, and its bound."""
-        return Estimate(self.mc_error, self.mc_bound)
-
-    @classmethod
-    def of(cls, expected: ExpectedFrames) -> _Totals:
-        peak = energy = variance = removed = heaviest = 0.0
-        parts = np.zeros(GROUPS)
-        for frame in expected:
-            removed = max(removed, frame.removed)
-            peak = max(peak, float(frame.irradiance.max()))
-            energy += float(np.square(frame.irradiance).sum())
-            variance += frame.variance * frame.irradiance.size
-            heaviest += frame.heaviest * frame.variance * frame.irradiance.size
-            parts += np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
-        mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
-        return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
-
-
-@dataclass(frozen=True, eq=False)
-class _Exposed:
-    """One exposed shot: expected electrons, digital numbers, and the two noises [electrons, rms]."""
-
-    index: int
-    shot: Shot
-    electrons: FloatArray
-    digital: Digital
-    rendering_noise: float
-    sensor_noise: float
-
-
-class _Shooting:
-    """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept."""
-
-    def __init__(
-        self,
-        family: PatternFamily,
-        recorder: RunFolder | RunMemory,
-        exposer: Exposer,
-        ambient: AmbientFrame | None,
-        always: FloatArray,
-    ) -> None:
-        """Nothing is exposed yet.
-
-        Parameters
-        ----------
-        family, recorder, exposer
-            the shots, where they are kept, and the camera.
-        ambient
-            what is taken off the frames.
-        always
-            (pixels, pixels) expected electrons of ambient light, which is in every frame.
-        """
-        self.family, self.recorder, self.exposer = family, recorder, exposer
-        self.ambient, self.always = ambient, always
-        self.saturated, self.noise_ratio = 0, 0.0
-        self._noise_energy = self._energy = self._signal = self._light = 0.0
-
-    @property
-    def sensor_noise(self) -> float:
-        """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, from its closed form."""
-        return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
-
-    @property
-    def ambient_part(self) -> float:
-        """Ambient light in all light of the frames."""
-        return float(self.always.sum()) * len(self.family.shots) / self._light if self._light else 0.0
-
-    @property
-    def noise_to_signal(self) -> float:
-        """Noise of the frames less the ambient frame, ||noise|| / ||light of the projector||, over all frames."""
-        own = 0.0
-        if self.ambient is not None and not self.family.signed:
-            own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
-            own *= self.always.size * len(self.family.shots)
-        return math.sqrt((self._noise_energy + own) / self._signal) if self._signal else math.inf
-
-    @property
-    def ambient_file(self) -> AmbientFile | None:
-        """What the manifest says of the ambient frame."""
-        if self.ambient is None:
-            return None
-        return AmbientFile(file=AMBIENT, shots=self.ambient.shots, part=self.ambient_part, noise=self.noise_to_signal)
-
-    def shoot(self, expected: ExpectedFrames, job: Job) -> None:
-        """Expose and record in chunks, one thread a processor; stages are timed on the wall clock."""
-        chunks = in_chunks(enumerate(zip(self.family.shots, expected, strict=True)))
-        while True:
-            with job.clock.stage("optics"):
-                chunk = next(chunks, None)
-            if chunk is None:
-                return
-            with job.clock.stage("sensor"):
-                exposed = in_threads(self._expose, chunk)
-            with job.clock.stage("write"):
-                in_threads(self._record, exposed)
-            for shot in exposed:
-                if shot.rendering_noise:
-                    ratio = shot.rendering_noise / shot.sensor_noise if shot.sensor_noise else np.inf
-                    self.noise_ratio = max(self.noise_ratio, ratio)
-                self.saturated += self.exposer.saturated(shot.digital, shot.electrons)
-                self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
-                self._energy += float(np.square(shot.electrons).sum())
-                self._signal += float(np.square(shot.electrons - self.always).sum())
-                self._light += float(shot.electrons.sum())
-            job.progress("frames", (chunk[-1][0] + 1) / len(expected))
-
-    def _expose(self, item: tuple[int, tuple[Shot, Frame]]) -> _Exposed:
-        index, (shot, frame) = item
-        electrons = self.exposer.lit(frame, *shot.names)
-        return _Exposed(
-            index=index,
-            shot=shot,
-            electrons=electrons,
-            digital=self.exposer.digital(electrons, *shot.names),
-            rendering_noise=self.exposer.rendering_noise(frame),
-            sensor_noise=self.exposer.sensor_noise(electrons),
-        )
-
-    def _record(self, exposed: _Exposed) -> None:
-        if self.recorder.keeps(exposed.index):
-            return
-        metadata: dict[str, str | int | float] = {
-            "row": exposed.shot.row,
-            "column": exposed.shot.column,
-            "sign": exposed.shot.sign,
-            "exposure_s": self.exposer.exposure_s,
-            "rendering_noise_e": exposed.rendering_noise,
-            "seed": self.exposer.seed,
-        }
-        electrons = exposed.electrons.astype(np.float32)
-        # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
-        whole = exposed.digital.dtype == np.uint32
-        dn: Channel = exposed.digital.astype(np.uint32) if whole else exposed.digital.astype(np.float32)
-        self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)
-
-
 def _ambient(
     request: Request, family: PatternFamily, expected: ExpectedFrames, exposer: Exposer
 ) -> AmbientFrame | None:
@@ -373,7 +222,7 @@ def _ambient(
     return AmbientFrame.exposed(exposer, expected, request.ambient_shots or shots_for(family))
 
 
-def _record_ambient(recorder: RunFolder | RunMemory, ambient: AmbientFrame, exposer: Exposer) -> None:
+def _record_ambient(recorder: Recorder, ambient: AmbientFrame, exposer: Exposer) -> None:
     single = {"DN": ambient.digital, "electrons": ambient.electrons}
     channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
     recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposer.exposure_s, "seed": exposer.seed})
@@ -395,7 +244,7 @@ def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     )
 
 
-def _warnings(light: Light, totals: _Totals, shooting: _Shooting, request: Request) -> Iterator[str]:
+def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
     if not light.reached:
         yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
@@ -416,7 +265,7 @@ def _warnings(light: Light, totals: _Totals, shooting: _Shooting, request: Reque
         yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
 
 
-def _of_ambient_light(shooting: _Shooting) -> Iterator[str]:
+def _of_ambient_light(shooting: Shooting) -> Iterator[str]:
     part = f"{shooting.ambient_part:.1%} of the frames' light is ambient"
     if shooting.ambient is None and not shooting.family.signed:
         yield f"{part} and is not taken off (ambient_frame is no): an image of them shows it, and is wrong"

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import read_header
 from mitsim.core.jsonfile import parse_json
@@ -27,12 +28,14 @@ from mitsim.core.plainfile import check_plain
 
 Value = str | int | float
 Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
+Channels = Mapping[str, Channel]
+Metadata = Mapping[str, Value]
 
 _PREFIX = "mitsim."
 _stdout_lock = threading.Lock()
 
 
-def write_frame(path: Path | str, channels: Mapping[str, Channel], metadata: Mapping[str, Value]) -> None:
+def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> None:
     """Write a frame, all or nothing: the file appears under its name only when complete.
 
     Parameters
@@ -101,7 +104,57 @@ def checksum(path: Path | str) -> str:
     return digest.hexdigest()
 
 
-def _check_channels(channels: Mapping[str, Channel]) -> None:
+def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -> None:
+    """Check that a file is the one whose checksum was noted; files without one are taken as they are.
+
+    Parameters
+    ----------
+    folder, name
+        of the file.
+    checksums
+        SHA-256 by name.
+    remedy
+        what to do where they differ.
+
+    Raises
+    ------
+    MitsimError
+        when they differ, or the name leads out of the folder by a link.
+    """
+    if not (folder / name).resolve().is_relative_to(folder.resolve()):
+        raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
+    expected = checksums.get(name)
+    if expected is not None and checksum(folder / name) != expected:
+        raise MitsimError(f"{folder / name}: not the file that was written (its checksum differs); {remedy}")
+
+
+def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
+    """One channel of a frame in double precision.
+
+    Parameters
+    ----------
+    channels
+        of the frame, (rows, columns) each.
+    name
+        of the one that is needed.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when it is not there, or holds a value that is not finite.
+    """
+    if name not in channels:
+        raise MitsimError(f"{path}: channels are {', '.join(channels)}; {name} is needed")
+    values = channels[name].astype(np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(values)))
+    if bad:
+        raise MitsimError(f"{path}: {bad} values are not finite; capture or calibrate again")
+    return values
+
+
+def _check_channels(channels: Channels) -> None:
     if not channels:
         raise ValueError("write_frame: no channels given; a frame needs at least one")
     shapes = {np.shape(values) for values in channels.values()}

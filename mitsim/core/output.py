@@ -18,8 +18,8 @@ LOCK = ".mitsim.lock"
 """Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock."""
 _LONGEST_HEAD = 1 << 20
 """An unfinished manifest is a few kB; what is larger is not looked into."""
-_NO_SHOTS = {"truth.exr", "ambient.exr"}
-"""Images of a run that are none of its shots."""
+FRAMES, PARTS = "frame_*.exr", "*.part.npz"
+"""What an unfinished capture and an unfinished calibration have finished, as their folders name it."""
 
 
 @contextmanager
@@ -145,8 +145,9 @@ def _unfinished(folder: Path) -> str:
         return ""
     if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
         return ""
-    frames = len({path.name for path in folder.glob("*.exr")} - _NO_SHOTS)
-    return f": an unfinished {manifest.get('kind')} with {frames} finished frames; go on with resume=True"
+    kind = manifest.get("kind")
+    name, pattern = ("parts", PARTS) if kind == "calibration" else ("frames", FRAMES)
+    return f": an unfinished {kind} with {len([*folder.glob(pattern)])} finished {name}; go on with resume=True"
 
 
 def _try_writing(path: Path, folder: Path) -> None:

@@ -1,17 +1,10 @@
-"""Captures in memory and on disk: shots of a pattern family in, one object out that reads the same from either.
-
-A capture is recorded by a :class:`RunFolder` or a :class:`RunMemory`, which take the same calls; each ends in a
-:class:`Capture`.
-"""
+"""Captures in memory and on disk: shots of a pattern family in, one object out that reads the same from either."""
 
 from __future__ import annotations
 
 import hashlib
 import shutil
-import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,79 +13,14 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import Channel, Value, checksum, read_frame, write_frame
-from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, read_manifest, write_manifest
-from mitsim.core.output import output_folder, sweep
+from mitsim.core.framefile import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify
+from mitsim.core.manifests import MANIFEST, RunManifest, read_manifest
+from mitsim.core.measurement import Ambient, Measurement
 from mitsim.core.pictures import card, scaled, span
+from mitsim.core.recorders import AMBIENT, TRUTH, Recorder, claimed
 
-TRUTH, AMBIENT = "truth.exr", "ambient.exr"
-Channels = Mapping[str, Channel]
-Metadata = Mapping[str, Value]
 _SHOWN = 3
 """Frames that a notebook shows: with the truth they fill a line."""
-
-
-def frame_name(index: int) -> str:
-    """File name of shot number ``index`` in its run folder."""
-    return f"frame_{index:05d}.exr"
-
-
-@dataclass(frozen=True, eq=False)
-class Ambient:
-    """What a camera sees with the projector off, as it is taken off every frame of a run.
-
-    Attributes
-    ----------
-    rate
-        (rows, columns) mean over the shots [electrons/s].
-    variance
-        (rows, columns) of that mean [(electrons/s)^2], of what the manifest states of the sensor's noise. It is one
-        draw, the same in all frames.
-    shots
-        that were averaged.
-    """
-
-    rate: FloatArray
-    variance: FloatArray
-    shots: int
-
-
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """What was measured under one pattern.
-
-    Attributes
-    ----------
-    frame
-        (rows, columns) [electrons/s], of a signed pattern the difference of its halves; of others without ambient
-        light.
-    row, column
-        indices (i, j) of the pattern.
-    light
-        (rows, columns) [electrons/s] sum of its shots as they were read: what their shot noise is of.
-    shots
-        their number.
-    saturated
-        readings of them at the full well or the ADC's end.
-    """
-
-    frame: FloatArray
-    row: int
-    column: int
-    light: FloatArray
-    shots: int
-    saturated: int
-
-    def __add__(self, other: Measurement) -> Measurement:
-        """Both halves of a signed pattern as one measurement."""
-        shots, saturated = self.shots + other.shots, self.saturated + other.saturated
-        return Measurement(self.frame + other.frame, self.row, self.column, self.light + other.light, shots, saturated)
-
-    @property
-    def power(self) -> FloatArray:
-        """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
-        # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
-        return np.square(self.light) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
 
 
 class Capture:
@@ -125,6 +53,11 @@ class Capture:
         """
         self.manifest, self.folder = manifest, folder
         self._memory = dict(memory or {})
+
+    @classmethod
+    def recorded(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
+        """The capture whose shots a ``recorder`` has, finished by its ``manifest``."""
+        return cls(recorder.finish(manifest), recorder.folder, dict(sorted(recorder.files.items())))
 
     @property
     def name(self) -> str:
@@ -282,7 +215,7 @@ class Capture:
                 also = () if ambient is None else (ambient.file,)
                 for name in (*(shot.file for shot in self.manifest.patterns.captures), *also, TRUTH, MANIFEST):
                     if (self.folder / name).is_file():
-                        shutil.copyfile(self.folder / name, run.path / name)
+                        shutil.copyfile(self.folder / name, run.folder / name)
             else:
                 run.begin()
                 for index, shot in enumerate(self.manifest.patterns.captures):
@@ -291,7 +224,7 @@ class Capture:
                     if name in self._memory:
                         run.write(name, *self._memory[name])
                 run.finish(self.manifest)
-        return run.path
+        return run.folder
 
     def __repr__(self) -> str:
         return f"Capture({self._family}: {self._size}, {self.folder or 'in memory'})"
@@ -341,264 +274,5 @@ def load_run(folder: Path | str) -> Capture:
     return Capture(read_manifest(Path(folder), RunManifest), Path(folder))
 
 
-def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -> None:
-    """Check that a file is the one whose checksum was noted; files without one are taken as they are.
-
-    Parameters
-    ----------
-    folder, name
-        of the file.
-    checksums
-        SHA-256 by name.
-    remedy
-        what to do where they differ.
-
-    Raises
-    ------
-    MitsimError
-        when they differ, or the name leads out of the folder by a link.
-    """
-    if not (folder / name).resolve().is_relative_to(folder.resolve()):
-        raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
-    expected = checksums.get(name)
-    if expected is not None and checksum(folder / name) != expected:
-        raise MitsimError(f"{folder / name}: not the file that was written (its checksum differs); {remedy}")
-
-
-def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
-    """One channel of a frame in double precision.
-
-    Parameters
-    ----------
-    channels
-        of the frame, (rows, columns) each.
-    name
-        of the one that is needed.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        when it is not there, or holds a value that is not finite.
-    """
-    if name not in channels:
-        raise MitsimError(f"{path}: channels are {', '.join(channels)}; {name} is needed")
-    values = channels[name].astype(np.float64)
-    bad = int(np.count_nonzero(~np.isfinite(values)))
-    if bad:
-        raise MitsimError(f"{path}: {bad} values are not finite; capture or calibrate again")
-    return values
-
-
-class RunMemory:
-    """Records a capture in memory; the same calls as :class:`RunFolder`."""
-
-    def __init__(self) -> None:
-        self._files: dict[str, tuple[Channels, Metadata]] = {}
-
-    def begin(self) -> None:
-        """Nothing is there yet."""
-
-    def keeps(self, index: int) -> bool:
-        """Whether shot number ``index`` is there already: never."""
-        return False
-
-    def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Keep one shot.
-
-        Parameters
-        ----------
-        index
-            its number.
-        channels, metadata
-            of its file, (rows, columns) each.
-        """
-        self._files[frame_name(index)] = channels, metadata
-
-    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Keep a file of the run.
-
-        Parameters
-        ----------
-        name
-            of the file.
-        channels, metadata
-            of it, (rows, columns) each.
-        """
-        self._files[name] = channels, metadata
-
-    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
-        """Keep the truth.
-
-        Parameters
-        ----------
-        reflectance, board
-            (n, n), relative to a board of that reflectance.
-        standard_error
-            (n, n) of it, where known.
-        """
-        self._files[TRUTH] = _truth(reflectance, board, standard_error)
-
-    def finish(self, manifest: RunManifest) -> Capture:
-        """The capture of that ``manifest``."""
-        return Capture(manifest, memory=dict(sorted(self._files.items())))
-
-
-class RunFolder:
-    """Records a capture in a folder, whole, resumable and checked; made by :func:`claimed`.
-
-    A frame is kept on resume when it is the one that a finished run's checksum names, or, in an interrupted run, when
-    it is readable, carries this run's digest, and its pixels have the checksum that was noted with it.
-    """
-
-    def __init__(self, path: Path, head: RunHead, known: Mapping[str, str]) -> None:
-        """A run in its folder.
-
-        Parameters
-        ----------
-        path, head
-            of the folder, and the configuration.
-        known
-            checksums of an earlier, finished run, by file name.
-        """
-        self.path, self.head = path, head
-        self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
-
-    def begin(self) -> None:
-        """Mark the folder as an unfinished run of this configuration, and clear what a killed process left."""
-        sweep(self.path)
-        configuration, digest = self.head.configuration, self.head.configuration_sha256
-        head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
-        write_manifest(self.path, head)
-
-    def keeps(self, index: int) -> bool:
-        """Whether shot number ``index`` is there already; it then counts as written."""
-        name = frame_name(index)
-        path = self.path / name
-        if not path.is_file():
-            return False
-        actual = checksum(path)
-        same = self._known[name] == actual if name in self._known else self._is_ours(path, index)
-        if same:
-            self._note(name, actual)
-        return same
-
-    def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Write one shot, whole or not at all.
-
-        Parameters
-        ----------
-        index
-            its number.
-        channels, metadata
-            of its file, (rows, columns) each.
-        """
-        self.write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
-
-    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
-        """Write the truth.
-
-        Parameters
-        ----------
-        reflectance, board
-            (n, n), relative to a board of that reflectance.
-        standard_error
-            (n, n) of it, where known.
-        """
-        self.write(TRUTH, *_truth(reflectance, board, standard_error))
-
-    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Write a file of the run.
-
-        Parameters
-        ----------
-        name
-            of the file.
-        channels, metadata
-            of it, (rows, columns) each.
-        """
-        write_frame(self.path / name, channels, metadata)
-        self._note(name, checksum(self.path / name))
-
-    def finish(self, manifest: RunManifest) -> Capture:
-        """Write the ``manifest`` of the finished run, with checksums; the capture that lies there."""
-        checksums = dict(sorted(self._checksums.items()))
-        manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
-        write_manifest(self.path, manifest)
-        return Capture(manifest, self.path)
-
-    def _note(self, name: str, value: str) -> None:
-        with self._lock:
-            self._checksums[name] = value
-
-    def _is_ours(self, path: Path, index: int) -> bool:
-        try:
-            channels, metadata = read_frame(path)
-        except MitsimError:
-            return False
-        return all(metadata.get(key) == value for key, value in self._identity(index, channels).items())
-
-    def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
-        """What tells a frame from one of another run, another place in this one, or one that was damaged."""
-        return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": _pixels(channels)}
-
-
-def _truth(
-    reflectance: FloatArray, board: float, standard_error: FloatArray | None
-) -> tuple[dict[str, Channel], Metadata]:
-    channels: dict[str, Channel] = {"reflectance": reflectance.astype(np.float32)}
-    if standard_error is not None:
-        channels["standard_error"] = standard_error.astype(np.float32)
-    return channels, {"board_reflectance": board}
-
-
 def _size(shape: tuple[int, ...]) -> str:
     return "x".join(map(str, shape))
-
-
-def _pixels(channels: Channels) -> str:
-    """SHA-256 of the channels' names and values: in an interrupted run no manifest holds checksums of files yet."""
-    digest = hashlib.sha256()
-    for name, values in sorted(channels.items()):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(values).tobytes())
-    return digest.hexdigest()
-
-
-@contextmanager
-def claimed(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
-    """A folder for a run, checked before any work; if that fails before writing, a new folder is removed.
-
-    Parameters
-    ----------
-    path
-        of the folder.
-    head
-        the configuration of the run.
-    resume
-        whether the folder may hold an unfinished or finished run of the same configuration.
-
-    Raises
-    ------
-    MitsimError
-        for a place that cannot be written, that holds something else, or, with ``resume``, another configuration.
-    """
-    known: Mapping[str, str] = {}
-    again = resume and (path / MANIFEST).is_file()
-    if again:
-        known = _checked(path, head)
-    with output_folder(path, overwrite=again) as folder:
-        yield RunFolder(folder, head, known)
-
-
-def _checked(path: Path, head: RunHead) -> Mapping[str, str]:
-    """Checksums of the frames of a finished run of the same configuration; none of an interrupted one."""
-    before = read_head(path)
-    if before.configuration_sha256 != head.configuration_sha256:
-        changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
-        raise MitsimError(
-            f"resume=True: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
-            "use the same options, or another folder"
-        )
-    return read_manifest(path, RunManifest).checksums if before.status == "complete" else {}

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.sides import IndexArray, Side
+from mitsim.reconstruct.sides import Halves, Side, Strips
 
 _LARGEST = 1e100
 """Largest norm of a frame, and one over the smallest: its square, the energy, is then told from 0 and infinity."""
@@ -133,14 +133,20 @@ def _out_of_range(name: str, values: FloatArray) -> str:
     )
 
 
-def _project(
-    frame: FloatArray, left: FloatArray, right: FloatArray, halves: tuple[tuple[IndexArray, ...], ...]
-) -> FloatArray:
-    """left^T frame right by ``halves`` of the rows and of the columns, the thinner factor first: the frame is then read
-    with the least arithmetic."""
+def _project(frame: FloatArray, left: FloatArray, right: FloatArray, halves: tuple[Halves, Halves]) -> FloatArray:
+    """(2, 2, c, c') left^T frame right by ``halves`` of the rows and of the columns, the thinner factor first: the
+    frame is then read with the least arithmetic, and never copied."""
     rows, columns = halves
     if left.shape[1] < right.shape[1]:
-        partial = [left[half].T @ frame[half] for half in rows]
-        return np.array([[part[:, half] @ right[half] for half in columns] for part in partial])
-    partial = [frame[:, half] @ right[half] for half in columns]
-    return np.array([[left[half].T @ part[half] for part in partial] for half in rows])
+        seen = [_product(left, frame, strips) for strips in rows]
+        return np.array([[_product(part.T, right, strips) for strips in columns] for part in seen])
+    seen = [_product(frame.T, right, strips) for strips in columns]
+    return np.array([[_product(left, part, strips) for part in seen] for strips in rows])
+
+
+def _product(first: FloatArray, second: FloatArray, strips: Strips) -> FloatArray:
+    """first^T second over the rows in ``strips``."""
+    total = np.zeros((first.shape[1], second.shape[1]))
+    for strip in strips:
+        total += first[strip].T @ second[strip]
+    return total

@@ -15,7 +15,7 @@ from enum import Enum
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.runs import Measurement
+from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.sides import IndexArray, group_pixels
 

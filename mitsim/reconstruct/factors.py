@@ -13,11 +13,11 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.framefile import checksum, read_frame, write_frame
+from mitsim.core.framefile import checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.manifests import CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.output import output_folder
 from mitsim.core.pictures import card, scaled, span
-from mitsim.core.runs import Capture, finite_channel, verify
+from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import centred_columns
 from mitsim.reconstruct.calibration import Estimate, squared_condition
 from mitsim.reconstruct.status import Status, Verdict

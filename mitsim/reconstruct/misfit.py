@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.runs import Measurement
+from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
 from mitsim.reconstruct.noise import FrameNoise

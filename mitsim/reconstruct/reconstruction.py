@@ -15,11 +15,12 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.jsonfile import read_json, write_json
+from mitsim.core.measurement import Measurement
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.pictures import card, png
 from mitsim.core.resources import Cost, Limits
-from mitsim.core.runs import Capture, Measurement
+from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors

@@ -25,6 +25,8 @@ from mitsim.core.errors import MitsimError
 IndexArray = npt.NDArray[np.intp]
 Method = Literal["svd", "gram"]
 Structure = Literal["auto", "block", "full"]
+Strips = tuple[slice, ...]
+Halves = tuple[Strips, Strips]
 _STRIPS = 8
 """Strips of sensor rows that alternate between the two halves: some on either side of all that varies slowly over the
 sensor, and each wider than a feature of the mask or a neighbour's crosstalk."""
@@ -101,10 +103,12 @@ class Side:
         return len(self.singular) if self.projected else self.scene_size
 
     @cached_property
-    def halves(self) -> tuple[IndexArray, IndexArray]:
-        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.halves` holds against each other."""
-        odd = np.arange(self.sensor_size) // -(-self.sensor_size // _STRIPS) % 2 == 1
-        return np.flatnonzero(~odd), np.flatnonzero(odd)
+    def halves(self) -> Halves:
+        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.halves` holds against each other, as strips: an
+        array of them would copy each frame that it picks from."""
+        width = -(-self.sensor_size // _STRIPS)
+        strips = tuple(slice(first, first + width) for first in range(0, self.sensor_size, width))
+        return strips[::2], strips[1::2]
 
     @cached_property
     def first_half(self) -> FloatArray:
@@ -112,7 +116,7 @@ class Side:
         size = self.accumulated_size
         gram = np.zeros((size, size))
         for slab in self.slabs:
-            rows = slab.matrix[self.halves[0]]
+            rows = np.concatenate([slab.matrix[strip] for strip in self.halves[0]])
             columns = np.arange(size)[slab.columns]
             gram[np.ix_(columns, columns)] += rows.T @ rows
         if self.projected:

@@ -22,7 +22,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, read_frame
 from mitsim.core.job import Clock, Job
 from mitsim.core.jsonfile import write_json
-from mitsim.core.runs import Capture, frame_name
+from mitsim.core.recorders import frame_name
+from mitsim.core.runs import Capture
 from mitsim.core.versions import versions
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.recipe import load_recipe

@@ -1,7 +1,7 @@
 """A scene's bytes in; the place of every tag out, or a refusal of what Mitsuba's parser must not be given.
 
 Mitsuba's parser reads the scene (:mod:`mitsim.scene.guard.check`). Left to this module is what that does not do
-(names of cases in tests/hard/hostile.py): it calls itself for each level, until its stack overflows ("depth of
+(names of cases in tests/hard/hostile/): it calls itself for each level, until its stack overflows ("depth of
 100000"). It opens what ``<include>`` and ``<spectrum>`` name while it reads, a pipe or a file outside too ("included
 pipe", "include above"), and each include again ("million includes"); ``<path>`` lets it find native code. It reads
 ``$albedo2`` as the value of ``$albedo`` and a 2 ("longer name with a known beginning"), an empty number as 0 ("empty

@@ -129,7 +129,8 @@ def test_a_name_that_is_not_utf8_is_refused_before_work(tmp_path: Path, kind: st
 def test_an_unfinished_calibration_is_not_to_be_emptied(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('{"kind": "calibration", "status": "incomplete"}')
     (tmp_path / "left.exr").touch()
-    with pytest.raises(MitsimError, match="an unfinished calibration with 1 finished frames; go on with resume=True"):
+    (tmp_path / "responses.part.npz").touch()
+    with pytest.raises(MitsimError, match="an unfinished calibration with 1 finished parts; go on with resume=True"):
         output.prepare_output(tmp_path)
     for text in ("{", "[" * 100_000, "[1]", '{"status": "complete"}'):
         (tmp_path / "manifest.json").write_text(text)

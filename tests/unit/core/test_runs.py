@@ -11,14 +11,15 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
-from mitsim.core.runs import Capture, RunFolder, RunMemory, claimed, frame_name, load_run
+from mitsim.core.recorders import Recorder, RunMemory, claimed, frame_name
+from mitsim.core.runs import Capture, load_run
 from mitsim.rig.patterns import parse_patterns
 
 N, PIXELS = 6, 5
 CONFIGURATION = {"scene": "none", "seed": 3}
 
 
-def recorded(to: RunFolder | RunMemory, patterns: str = "hadamard:2") -> Capture:
+def recorded(to: Recorder, patterns: str = "hadamard:2") -> Capture:
     """Frames of random numbers, recorded as `mitsim capture` does."""
     family = parse_patterns(patterns, N)
     rng = np.random.default_rng(8)
@@ -31,7 +32,8 @@ def recorded(to: RunFolder | RunMemory, patterns: str = "hadamard:2") -> Capture
         assert not to.keeps(index)
         to.write_frame(index, {"DN": dn, "electrons": electrons}, metadata)
     head = RunHead.of(CONFIGURATION)
-    return to.finish(
+    return Capture.recorded(
+        to,
         RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
@@ -40,7 +42,7 @@ def recorded(to: RunFolder | RunMemory, patterns: str = "hadamard:2") -> Capture
             patterns=Patterns.of(family, [frame_name(index) for index in range(len(family.shots))]),
             plan={"effects": []},
             warnings=("too dark",),
-        )
+        ),
     )
 
 
@@ -143,6 +145,6 @@ def test_a_truth_of_before_has_no_standard_error() -> None:
     """Nor has a real camera's capture."""
     record = RunMemory()
     record.write_truth(np.full((N, N), 0.5), 0.99)
-    shots = Capture(recorded(RunMemory()).manifest, memory=record._files)
+    shots = Capture(recorded(RunMemory()).manifest, memory=record.files)
     assert shots.truth is not None and shots.truth_standard_error is None
     assert Capture(shots.manifest, memory={}).truth_standard_error is None

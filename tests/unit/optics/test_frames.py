@@ -18,7 +18,10 @@ from mitsim.optics.frames import (
     Filed,
     FrameOptics,
     _probes,
+    _product,
     bound_of,
+    formed_frames,
+    monte_carlo_bound,
     monte_carlo_error,
 )
 from mitsim.optics.shadow import Directions
@@ -299,16 +302,17 @@ def test_the_predicted_variance_is_the_actual_one(groups: int) -> None:
 
 
 def test_what_interpolation_leaves_below_zero_is_reported() -> None:
-    light = sparse.csr_array(np.where(np.arange(CELLS**2) == 0, -1.0, 1.0)[None, :].repeat(PIXELS, 0))
+    """As a part of the light that is left. Half of the cells are darker than nothing here."""
+    light = sparse.csr_array(np.where(np.arange(CELLS**2) % CELLS < CELLS // 2, -1.0, 1.5)[None, :].repeat(PIXELS, 0))
     weights = np.array([[1.0, 0, 0, 0]])
     optics = small_optics()
     (frame,) = expected_frames(optics, [light, light], LABELS, weights, 0)
     raw = optics.frame(np.arange(CELLS**2), 4 * light.toarray()[0])
-    assert (raw < 0).any() == (frame.removed > 0)
+    below = raw < 0
+    assert 0.1 < below.mean() < 0.9
+    assert frame.removed == pytest.approx(-raw[below].sum() / raw[~below].sum(), rel=1e-12)
     assert np.array_equal(frame.irradiance, np.maximum(raw, 0))
-    only = sparse.csr_array(-light * (np.arange(CELLS**2) == 0))
-    dark = sparse.csr_array(light * (np.arange(CELLS**2) == 0))
-    assert only.sum() == PIXELS and dark.sum() == -PIXELS
+    dark = sparse.csr_array(-abs(light))
     (frame,) = expected_frames(optics, [dark, dark], LABELS, weights, 0)
     assert not frame.irradiance.any() and frame.removed == 0.0
 
@@ -351,6 +355,9 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     always = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
     alike(lit, expected_frames(optics, more, np.append(labels, weights.shape[1]), always, 5))
     assert next(iter(lit)).variance > 0 and plain[1].variance == 0
+    assert np.allclose(lit.projector_off.irradiance, expected, rtol=1e-10) and lit.projector_off.variance == 0
+    dark = expected_frames(optics, groups, labels, weights, 5).projector_off
+    assert dark.irradiance.shape == expected.shape and not dark.irradiance.any()
 
 
 def test_ambient_light_of_two_kinds() -> None:
@@ -412,10 +419,51 @@ def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
         assert found.variance == pytest.approx(plain.variance, rel=1e-12)
 
 
+@pytest.mark.parametrize("family", BESIDE)
+def test_each_group_makes_frames_by_itself(family: str) -> None:
+    """Those of a capture whose light is that group alone, with its ambient light and what is exact."""
+    labels, weights = BESIDE[family]
+    optics, groups, lamps = small_optics(8), random_groups(3, 7, 0.1), ambient_groups(3)
+    columns, brought = np.array([1, 6]), np.random.default_rng(3).random((2, 8, 8))
+    exact = ClassFrames(np.array([1, 3]), brought)
+    found = expected_frames(optics, groups, labels, weights, 0, ambient=[Filed(optics, lamps)], glint=exact).by_group(
+        columns
+    )
+    assert found.shape == (3, len(weights), 8, 2)
+    for frames, group, lamp in zip(found, groups, lamps, strict=True):
+        alone = expected_frames(optics, [group], labels, weights, 0, ambient=[Filed(optics, (lamp,))], glint=exact)
+        for frame, expected in zip(frames, alone, strict=True):
+            assert np.allclose(frame, expected.irradiance[:, columns], rtol=1e-10)
+
+
+@pytest.mark.parametrize(("family", "formed"), [("mixed", 4), ("by capture", 6)])
+def test_frames_are_formed_as_often_as_is_promised(family: str, formed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every frame is asked for twice: to find the brightest pixel, and to expose it."""
+    labels, weights = BESIDE[family]
+    count, frame = [], FrameOptics.frame
+    monkeypatch.setattr(FrameOptics, "frame", lambda *arguments: count.append(0) or frame(*arguments))
+    frames = expected_frames(small_optics(8), random_groups(1, 7), labels, weights, 0)
+    for _ in range(2):
+        assert len(list(frames)) == len(weights)
+    assert len(count) == formed == formed_frames(labels.max() + 1, len(weights))
+
+
+def test_light_in_very_many_places_is_mixed_where_it_is() -> None:
+    """Places beyond 2^22 take a product of their own, which never makes a line for each of them."""
+    rng = np.random.default_rng(6)
+    rows, places = rng.integers(0, PIXELS, 300), rng.integers(0, 2**23, 300)
+    light = sparse.csr_array((rng.random(300), (rows, places)), shape=(PIXELS, 2**23))
+    basis = sparse.csr_array(rng.random((3, PIXELS)))
+    found = _product(basis, light)
+    assert found.shape == (3, 2**23) and abs(found - basis @ light).max() < 1e-15
+    dark = _product(basis, sparse.csr_array((PIXELS, 2**23)))
+    assert dark.shape == (3, 2**23) and dark.nnz == 0
+
+
 def test_one_group_has_no_variance_to_tell() -> None:
     frames = expected_frames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
     assert all(frame.variance == 0 and frame.irradiance.any() for frame in frames)
-    assert monte_carlo_error(frames) == 0
+    assert monte_carlo_error(frames) == monte_carlo_bound(frames) == 0
 
 
 def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() -> None:

@@ -13,8 +13,9 @@ import mitsim.reconstruct
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame
 from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHead, RunManifest
+from mitsim.core.recorders import RunMemory, frame_name
 from mitsim.core.resources import Cost
-from mitsim.core.runs import Capture, RunMemory, frame_name, load_run
+from mitsim.core.runs import Capture, load_run
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from mitsim.reconstruct.status import Status, Verdict
@@ -43,14 +44,15 @@ def shots(factors: Factors) -> Capture:
     memory.write_truth(scene, 0.99)
     head = RunHead.of({"seed": 2})
     files = [frame_name(index) for index in range(len(family.shots))]
-    return memory.finish(
+    return Capture.recorded(
+        memory,
         RunManifest(
             configuration=head.configuration,
             configuration_sha256=head.configuration_sha256,
             camera={"name": "bench"},
             digital=Digital(exposure_s=1e4, gain_dn_per_e=1.0, black_level_dn=0.0, dark_current_e_per_s=0.0),
             patterns=Patterns.of(family, files),
-        )
+        ),
     )
 
 

@@ -29,11 +29,11 @@ from mitsim.study.solver_cost import (
 SEED, K = 5, 2
 
 
-def small_problem(condition: float = 100.0, k: int = K) -> Problem:
+def small_problem(condition: float = 100.0, k: int = K, seed: int = SEED) -> Problem:
     """n = 10, m = 24, singular values of Phi from 1 down to 1 / condition."""
-    rng = stream(SEED, "factor")
+    rng = stream(seed, "factor")
     u, v = (np.linalg.qr(rng.normal(size=(rows, 10)))[0] for rows in (24, 10))
-    return make_problem((u * np.geomspace(1, 1 / condition, 10)) @ v.T, k, SEED)
+    return make_problem((u * np.geomspace(1, 1 / condition, 10)) @ v.T, k, seed)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_precision_lost_is_what_rounding_predicts(rows: tuple[SolverRow, ...], l
         (method, precision): find(rows, method=method, precision=precision, layout=layout, lambda_rel=LAMBDAS[-1]).error
         for method, precision in product(METHODS, PRECISIONS)
     }
-    assert error["svd", "float64"] < 1e4 * eps and error["gram", "float64"] > 30 * error["svd", "float64"]
+    assert error["svd", "float64"] < 1e4 * eps
     for method in METHODS:
         assert error[method, "float64"] < 1e-3 * error[method, "float32 frames"]
         assert 0.01 * single < error[method, "float32 frames"] < 1e4 * single
@@ -124,6 +124,22 @@ def test_precision_lost_is_what_rounding_predicts(rows: tuple[SolverRow, ...], l
     assert error["gram", "float32 frames"] == pytest.approx(error["svd", "float32 frames"], rel=1e-2)
     assert 10 * error["svd", "float32 products"] < error["gram", "float32 products"] < 5e-4
     assert error["svd", "float32 products"] > error["svd", "float32 frames"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_gram_matrices_lose_more_digits(layout: str) -> None:
+    """By the condition number, 1e4, at most. How much of that a problem loses is chance: 11 to 1460 times the error of
+    singular values in 12 problems, and another order of the same sums moves each by a factor of two. So eight problems
+    are held together: geometric means 76 to 110, with a standard error of 45 %."""
+    ratios = []
+    for seed in range(8):
+        rows = time_solver(seed, lambda stage, part: None, small_problem(seed=seed), repeats=1)
+        svd, gram = (
+            find(rows, method=method, precision="float64", layout=layout, lambda_rel=LAMBDAS[-1]).error
+            for method in ("svd", "gram")
+        )
+        ratios.append(gram / svd)
+    assert 25 < math.exp(np.log(ratios).mean()) < 1e4 and min(ratios) > 3
 
 
 def test_errors_do_not_depend_on_the_run(rows: tuple[SolverRow, ...]) -> None:

@@ -1,34 +1,48 @@
 """The command line: parse, call the Python face, print. No physics; heavy imports happen in the verb that needs them.
 
 Options that make up a request come from :class:`mitsim.capture.request.Request`, so that they are the same in Python.
-Errors of the library speak of arguments; :func:`_spoken` writes them as the options that they are here.
+Errors of the library speak of arguments; :func:`~mitsim.cli.options.spoken` writes them as options.
 """
 
 from __future__ import annotations
 
 import errno
-import json
 import math
-import re
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 import mitsim
+from mitsim.cli.options import (
+    DAY,
+    Accuracy,
+    Camera,
+    Defines,
+    Effects,
+    Json,
+    MaxMemory,
+    MaxSeconds,
+    Outside,
+    Patterns,
+    Projector,
+    Quiet,
+    Resume,
+    Scene,
+    Seed,
+    Variant,
+    bench_of,
+    job_of,
+    number_of,
+    request_of,
+    spoken,
+)
+from mitsim.cli.screen import finish, print_plan
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import MitsimError
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped
-
-if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench
-    from mitsim.capture.plan import Plan
-    from mitsim.core.arrays import Progress
-    from mitsim.core.job import Job
 
 app = typer.Typer(
     name="mitsim",
@@ -40,37 +54,6 @@ app = typer.Typer(
 )
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_OPTIONS = {"lam": "lambda"}
-"""Options that are not called like the argument."""
-_BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
-
-Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
-Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
-Variant = Annotated[
-    str,
-    typer.Option(
-        help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral", callback=lambda name: _variant(name)
-    ),
-]
-Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
-Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
-Seed = Annotated[int, typer.Option(help="root of every random stream")]
-Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
-Camera = Annotated[str | None, typer.Option(help="camera electronics: name or TOML file", metavar="NAME|FILE")]
-Projector = Annotated[str | None, typer.Option(help="projector: name or TOML file", metavar="NAME|FILE")]
-Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
-Outside = Annotated[bool, typer.Option("--allow-outside-files", help="let the scene read files outside its own folder")]
-Resume = Annotated[bool, typer.Option("--resume", help="go on where an interrupted one of the same options stopped")]
-MaxSeconds = Annotated[float, typer.Option("--max-seconds", help="refuse work that would take longer")]
-MaxMemory = Annotated[
-    float | None,
-    typer.Option(
-        "--max-memory", help="refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
-    ),
-]
-DAY = 86400.0
-"""Work that would take longer is a mistake, unless it is asked for."""
 
 
 def run() -> None:
@@ -78,7 +61,7 @@ def run() -> None:
     try:
         code = app(standalone_mode=False)
     except MitsimError as error:
-        _fail(_spoken(error))
+        _fail(spoken(error))
     except (typer.Abort, KeyboardInterrupt):
         code = INTERRUPTED
     except MemoryError:
@@ -96,18 +79,6 @@ def run() -> None:
     if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
         end_stopped()
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def _spoken(error: MitsimError) -> str:
-    """The message of an error with its arguments written as options."""
-    text = str(error)
-    if isinstance(error, ArgumentError):
-        option = _OPTIONS.get(error.argument, error.argument).replace("_", "-")
-        text = f"--{option}{text.removeprefix(error.argument)}"
-    text = re.sub(r"^parameter (?=\w+=)", "-D ", text)
-    return re.sub(
-        r"(?<!-)\b(\w+(?==True)|max_seconds|max_memory)(=True)?", lambda m: "--" + m[1].replace("_", "-"), text
-    )
 
 
 def _usage(error: Any) -> str:
@@ -155,11 +126,11 @@ def demo(
     from mitsim.study.demo import demo as run_demo
 
     request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
-    with _job(quiet or as_json) as job:
+    with job_of(quiet or as_json) as job:
         with job.clock.stage("open scene"):
-            bench = _open(scene, variant, camera, projector, define, outside)
+            bench = bench_of(scene, variant, camera, projector, define, outside)
         result = run_demo(bench, output, request, job)
-    return _finish(as_json, result.payload(), result.lines(), result.warnings)
+    return finish(as_json, result.payload(), result.lines(), result.warnings)
 
 
 @app.command()
@@ -180,13 +151,13 @@ def plan(
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.core.resources import running_seconds
 
-    request = _request(patterns=patterns, accuracy=accuracy, seed=seed, effects=effects)
-    bench = _open(scene, variant, camera, projector, define, outside)
+    request = request_of(patterns=patterns, accuracy=accuracy, seed=seed, effects=effects)
+    bench = bench_of(scene, variant, camera, projector, define, outside)
     starting = running_seconds()
     plan = bench.plan(**request).taking(start=starting)
     if not as_json:
-        _print_plan(plan)
-    return _finish(as_json, plan.payload(), [], plan.warnings)
+        print_plan(plan)
+    return finish(as_json, plan.payload(), [], plan.warnings)
 
 
 @app.command()
@@ -220,11 +191,11 @@ def capture(
     quiet: Quiet = False,
 ) -> int:
     """Render, expose and write one frame for each pattern."""
-    request = _request(
+    request = request_of(
         patterns=patterns,
         accuracy=accuracy,
         seed=seed,
-        exposure=_number("exposure", exposure),
+        exposure=number_of("exposure", exposure),
         exposure_fraction=exposure_fraction,
         effects=effects,
         noise_fraction=noise_fraction,
@@ -232,9 +203,9 @@ def capture(
         ambient_shots=ambient_shots,
     )
     advise(RESUME)
-    with _job(quiet or as_json, max_seconds, max_memory) as job:
+    with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
-            bench = _open(scene, variant, camera, projector, define, outside)
+            bench = bench_of(scene, variant, camera, projector, define, outside)
         shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
     payload = shots.summary()
     seconds = payload["seconds"]
@@ -251,7 +222,7 @@ def capture(
             f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
             f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's"
         )
-    return _finish(as_json, payload, lines, shots.warnings)
+    return finish(as_json, payload, lines, shots.warnings)
 
 
 @app.command()
@@ -277,9 +248,9 @@ def calibrate(
 
     session = load_recipe(recipe)
     advise(RESUME)
-    with _job(quiet or as_json, max_seconds, max_memory) as job:
+    with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
-            bench = _open(scene, variant, camera, projector, define, outside)
+            bench = bench_of(scene, variant, camera, projector, define, outside)
         factors = bench.calibrate(seed, accuracy, session, output, resume, job)
     payload = {**factors.manifest.result, "output": str(output)}
     # JSON has no numbers beyond the finite ones.
@@ -292,7 +263,7 @@ def calibrate(
         f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
         f"{condition:.2e}",
     ]
-    return _finish(as_json, payload, lines, factors.warnings)
+    return finish(as_json, payload, lines, factors.warnings)
 
 
 @app.command()
@@ -313,7 +284,7 @@ def reconstruct(
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
     result = reconstruct_folder(
-        run, calibration, output or run / "reconstruction", _number("lambda", lam), method, overwrite
+        run, calibration, output or run / "reconstruction", number_of("lambda", lam), method, overwrite
     )
     payload = result.summary()
     lines = [payload["status"]]
@@ -333,7 +304,7 @@ def reconstruct(
         budget = sorted(payload["uncertainty_budget"].items(), key=lambda source: -source[1])
         largest = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for name, value in budget[:3])
         lines.append(f"standard uncertainty {uncertainty:.1e} rms; largest: {largest}")
-    return _finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
+    return finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
 
 
 @app.command()
@@ -359,18 +330,18 @@ def render(
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
-    request = _request(accuracy=accuracy, seed=seed, effects=effects)
+    request = request_of(accuracy=accuracy, seed=seed, effects=effects)
     method: Any = estimator
-    with _job(quiet or as_json, max_seconds, max_memory) as job:
+    with job_of(quiet or as_json, max_seconds, max_memory) as job:
         place = prepare_output(output, overwrite=True, kind="file")
-        bench = _open(scene, variant, None, projector, define, outside, for_render=True)
+        bench = bench_of(scene, variant, None, projector, define, outside, for_render=True)
         frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
         payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
         f"{payload['seconds']:.2f} s: {payload['output']}"
     ]
-    return _finish(as_json, payload, lines, frame.warnings)
+    return finish(as_json, payload, lines, frame.warnings)
 
 
 @app.command()
@@ -393,10 +364,10 @@ def study(
 
     run_study = find_study(name)
     request = mitsim.Request.of(patterns=patterns, seed=seed)
-    with _job(quiet or as_json) as job:
-        bench = _open(scene, variant, camera, projector, define, outside)
+    with job_of(quiet or as_json) as job:
+        bench = bench_of(scene, variant, camera, projector, define, outside)
         result = run_study(bench, output, request, job)
-    return _finish(as_json, result.payload(), result.lines(), ())
+    return finish(as_json, result.payload(), result.lines(), ())
 
 
 @app.command()
@@ -415,117 +386,4 @@ def doctor(
         for check in checks
     ]
     bad = tuple(f"{check.name}: {check.detail}" for check in checks if not check.ok)
-    return _finish(as_json, {"checks": [asdict(check) for check in checks], "ok": not bad}, lines, bad)
-
-
-# ---- helpers ---------------------------------------------------------------------------------------------------------
-
-
-def _variant(name: str) -> str:
-    """The name, refused when it is none that light can be traced in; every verb checks it alike."""
-    from mitsim.core.environment import VARIANTS
-
-    # CUDA has the same kinds; whether there is a GPU shows when the variant is loaded.
-    if name.replace("cuda_", "llvm_", 1) not in VARIANTS:
-        raise MitsimError(f"--variant {name!r}: use {', '.join(VARIANTS)}")
-    return name
-
-
-def _request(**values: object) -> dict[str, Any]:
-    """Checked fields of a request: refused before anything is opened."""
-    from mitsim.capture.request import Request
-
-    request = Request.of(**values).model_dump()
-    return {name: request[name] for name in values}
-
-
-def _open(
-    scene: str,
-    variant: str,
-    camera: str | None,
-    projector: str | None,
-    define: Sequence[str] | None,
-    outside: bool,
-    for_render: bool = False,
-) -> Bench:
-    parameters = {}
-    for text in define or ():
-        name, equals, value = text.partition("=")
-        if not (name and equals):
-            raise MitsimError(f"-D {text!r}: give NAME=VALUE")
-        if name in _BENCH_ARGUMENTS:
-            raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
-        parameters[name] = value
-    return mitsim.open_bench(scene, variant, camera, projector, outside, for_render, **parameters)
-
-
-def _number(argument: str, text: str) -> float | Literal["auto"]:
-    """The number in ``text``, or auto."""
-    if text == "auto":
-        return "auto"
-    try:
-        return float(text)
-    except ValueError:
-        raise ArgumentError("lam" if argument == "lambda" else argument, f"{text!r}: give a number or auto") from None
-
-
-@contextmanager
-def _job(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
-    """A job with limits, and a progress bar on stderr while the context lasts."""
-    from mitsim.core.job import Clock, Job
-    from mitsim.core.resources import Limits, running_seconds
-
-    limits = Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
-    with _progress(silent_progress) as progress:
-        yield Job(Clock(running_seconds()), progress, limits)
-
-
-@contextmanager
-def _progress(hidden: bool) -> Iterator[Progress]:
-    """A progress bar on stderr; nothing when asked to be quiet, or when stderr is no terminal."""
-    if hidden or not sys.stderr.isatty():
-        from mitsim.core.arrays import silent
-
-        yield silent
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("starting", total=1.0)
-        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
-
-
-def _print_plan(plan: Plan) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"Effect plan at accuracy {plan.accuracy:g}")
-    for heading in ("effect", "state", "reason", "error if off", "seconds"):
-        table.add_column(heading, justify="right" if heading in ("error if off", "seconds") else "left")
-    for row in plan.effects:
-        error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}"
-        table.add_row(row.name, row.state, row.reason, error, f"{row.seconds:.2f}")
-    console = Console()
-    console.print(table)
-    stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in plan.predicted.items())
-    console.print(f"Predicted time from start to finish: {plan.predicted_seconds:.2f} s ({stages})")
-    if plan.cost:
-        memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
-        console.print(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
-
-
-def _finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
-    """Print the result; exit status 1 when there are warnings."""
-    if as_json:
-        from mitsim.core.jsonfile import plain
-
-        print(json.dumps(plain(payload), allow_nan=False))
-    else:
-        for line in lines:
-            print(line)
-    for warning in warnings:
-        print(f"mitsim: warning: {warning}", file=sys.stderr)
-    return 1 if warnings else 0
+    return finish(as_json, {"checks": [asdict(check) for check in checks], "ok": not bad}, lines, bad)

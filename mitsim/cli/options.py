@@ -1,0 +1,143 @@
+"""Options that several commands share: words of a command line in, a bench, a request or a job out, or a refusal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+import mitsim
+from mitsim.cli.screen import progress_bar
+from mitsim.core.errors import ArgumentError, MitsimError
+
+if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench
+    from mitsim.core.job import Job
+
+_OPTIONS = {"lam": "lambda"}
+"""Options that are not called like the argument."""
+_BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
+
+Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
+Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
+Variant = Annotated[
+    str,
+    typer.Option(
+        help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral", callback=lambda name: variant_of(name)
+    ),
+]
+Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
+Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
+Seed = Annotated[int, typer.Option(help="root of every random stream")]
+Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
+Camera = Annotated[str | None, typer.Option(help="camera electronics: name or TOML file", metavar="NAME|FILE")]
+Projector = Annotated[str | None, typer.Option(help="projector: name or TOML file", metavar="NAME|FILE")]
+Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
+Outside = Annotated[bool, typer.Option("--allow-outside-files", help="let the scene read files outside its own folder")]
+Resume = Annotated[bool, typer.Option("--resume", help="go on where an interrupted one of the same options stopped")]
+MaxSeconds = Annotated[float, typer.Option("--max-seconds", help="refuse work that would take longer")]
+MaxMemory = Annotated[
+    float | None,
+    typer.Option(
+        "--max-memory", help="refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
+    ),
+]
+DAY = 86400.0
+"""Work that would take longer is a mistake, unless it is asked for."""
+
+
+def variant_of(name: str) -> str:
+    """The ``name``, refused when it is none that light can be traced in; every verb checks it alike."""
+    from mitsim.core.environment import VARIANTS
+
+    # CUDA has the same kinds; whether there is a GPU shows when the variant is loaded.
+    if name.replace("cuda_", "llvm_", 1) not in VARIANTS:
+        raise MitsimError(f"--variant {name!r}: use {', '.join(VARIANTS)}")
+    return name
+
+
+def request_of(**values: object) -> dict[str, Any]:
+    """Checked ``values`` of a request's fields: refused before anything is opened."""
+    from mitsim.capture.request import Request
+
+    request = Request.of(**values).model_dump()
+    return {name: request[name] for name in values}
+
+
+def bench_of(
+    scene: str,
+    variant: str,
+    camera: str | None,
+    projector: str | None,
+    define: Sequence[str] | None,
+    outside: bool,
+    for_render: bool = False,
+) -> Bench:
+    """The bench that a command line describes; see :func:`mitsim.open_bench`.
+
+    Parameters
+    ----------
+    scene, variant, camera, projector, outside, for_render
+        as there.
+    define
+        NAME=VALUE of the scene's parameters.
+
+    Raises
+    ------
+    MitsimError
+        as there, and for a parameter that is not written so.
+    """
+    parameters = {}
+    for text in define or ():
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise MitsimError(f"-D {text!r}: give NAME=VALUE")
+        if name in _BENCH_ARGUMENTS:
+            raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
+        parameters[name] = value
+    return mitsim.open_bench(scene, variant, camera, projector, outside, for_render, **parameters)
+
+
+def number_of(argument: str, text: str) -> float | Literal["auto"]:
+    """The number in ``text``, or auto; a refusal names the ``argument``."""
+    if text == "auto":
+        return "auto"
+    try:
+        return float(text)
+    except ValueError:
+        raise ArgumentError("lam" if argument == "lambda" else argument, f"{text!r}: give a number or auto") from None
+
+
+@contextmanager
+def job_of(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
+    """A job with limits, and a progress bar on stderr while the context lasts.
+
+    Parameters
+    ----------
+    silent_progress
+        no bar.
+    seconds, gibibytes
+        longest time [s]; most memory [GiB], nine tenths of what is free if None.
+    """
+    from mitsim.core.job import Clock, Job
+    from mitsim.core.resources import Limits, running_seconds
+
+    limits = Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
+    with progress_bar(silent_progress) as progress:
+        yield Job(Clock(running_seconds()), progress, limits)
+
+
+def spoken(error: MitsimError) -> str:
+    """The message of an ``error`` with its arguments written as options."""
+    text = str(error)
+    if isinstance(error, ArgumentError):
+        option = _OPTIONS.get(error.argument, error.argument).replace("_", "-")
+        text = f"--{option}{text.removeprefix(error.argument)}"
+    text = re.sub(r"^parameter (?=\w+=)", "-D ", text)
+    return re.sub(
+        r"(?<!-)\b(\w+(?==True)|max_seconds|max_memory)(=True)?", lambda m: "--" + m[1].replace("_", "-"), text
+    )

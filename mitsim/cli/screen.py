@@ -1,0 +1,75 @@
+"""What the terminal shows: results, warnings and progress in; text, JSON and an exit status out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mitsim.capture.plan import Plan
+    from mitsim.core.arrays import Progress
+
+
+@contextmanager
+def progress_bar(hidden: bool) -> Iterator[Progress]:
+    """A progress bar on stderr; nothing when ``hidden``, or when stderr is no terminal."""
+    if hidden or not sys.stderr.isatty():
+        from mitsim.core.arrays import silent
+
+        yield silent
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+
+
+def print_plan(plan: Plan) -> None:
+    """Print the ``plan``'s effects, with reasons, and what it takes."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"Effect plan at accuracy {plan.accuracy:g}")
+    for heading in ("effect", "state", "reason", "error if off", "seconds"):
+        table.add_column(heading, justify="right" if heading in ("error if off", "seconds") else "left")
+    for row in plan.effects:
+        error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}"
+        table.add_row(row.name, row.state, row.reason, error, f"{row.seconds:.2f}")
+    console = Console()
+    console.print(table)
+    stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in plan.predicted.items())
+    console.print(f"Predicted time from start to finish: {plan.predicted_seconds:.2f} s ({stages})")
+    if plan.cost:
+        memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
+        console.print(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
+
+
+def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
+    """Print the result; exit status 1 when there are warnings.
+
+    Parameters
+    ----------
+    as_json
+        one JSON object instead of text.
+    payload, lines
+        the result as that object, and as lines of text.
+    warnings
+        on stderr, in either case.
+    """
+    if as_json:
+        from mitsim.core.jsonfile import plain
+
+        print(json.dumps(plain(payload), allow_nan=False))
+    else:
+        for line in lines:
+            print(line)
+    for warning in warnings:
+        print(f"mitsim: warning: {warning}", file=sys.stderr)
+    return 1 if warnings else 0

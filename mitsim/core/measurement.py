@@ -1,0 +1,67 @@
+"""Shots of one pattern in, what was measured under it out; and what is taken off it where lamps burn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Ambient:
+    """What a camera sees with the projector off, as it is taken off every frame of a run.
+
+    Attributes
+    ----------
+    rate
+        (rows, columns) mean over the shots [electrons/s].
+    variance
+        (rows, columns) of that mean [(electrons/s)^2], of what the manifest states of the sensor's noise. It is one
+        draw, the same in all frames.
+    shots
+        that were averaged.
+    """
+
+    rate: FloatArray
+    variance: FloatArray
+    shots: int
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What was measured under one pattern.
+
+    Attributes
+    ----------
+    frame
+        (rows, columns) [electrons/s], of a signed pattern the difference of its halves; of others without ambient
+        light.
+    row, column
+        indices (i, j) of the pattern.
+    light
+        (rows, columns) [electrons/s] sum of its shots as they were read: what their shot noise is of.
+    shots
+        their number.
+    saturated
+        readings of them at the full well or the ADC's end.
+    """
+
+    frame: FloatArray
+    row: int
+    column: int
+    light: FloatArray
+    shots: int
+    saturated: int
+
+    def __add__(self, other: Measurement) -> Measurement:
+        """Both halves of a signed pattern as one measurement."""
+        shots, saturated = self.shots + other.shots, self.saturated + other.saturated
+        return Measurement(self.frame + other.frame, self.row, self.column, self.light + other.light, shots, saturated)
+
+    @property
+    def power(self) -> FloatArray:
+        """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
+        # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
+        return np.square(self.light) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
