@@ -185,6 +185,7 @@ def capture(
             sensor_noise=shooting.sensor_noise,
             heaviest_group=totals.heaviest,
             truth_error=truth.error,
+            light_error=truth.error_of(light.flux_error),
             paths=light.paths,
             lost_light=light.lost,
             seconds=job.clock.seconds(),

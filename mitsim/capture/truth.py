@@ -54,6 +54,11 @@ class Truth:
         """Standard error, root mean square over the image."""
         return float(np.sqrt(np.square(self.standard_error).mean()))
 
+    def error_of(self, flux_error: FloatArray) -> float:
+        """What sampling leaves in any image, rms over it: the standard error ``flux_error`` (n^2,) [W m^-2] of the
+        frames' own light, over the board's."""
+        return _rms(_over(flux_error, self.board_flux))
+
 
 def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
     """Trace until the truth's standard error, rms over the image, is a sixth of the frames', or 1e-4.

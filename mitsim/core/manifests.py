@@ -282,6 +282,10 @@ class RunManifest(RunHead):
     truth_error: float | None = Field(
         default=None, description="standard error of truth.exr, rms over the image; 1 is the board's reflectance"
     )
+    light_error: float | None = Field(
+        default=None,
+        description="standard error of single projector pixels' light in the frames, rms; 1 is the board's",
+    )
     paths: int | None = Field(default=None, description="connections and paths traced")
     lost_light: float | None = Field(
         default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"

@@ -15,6 +15,8 @@ from mitsim.reconstruct.solver import Prepared
 EDGES = 2.9
 """Energy of hard edges at any place within a pixel over that of the ramp that their image shows: the dipole of an edge
 at t is t (1 - t) / 2 with a mean square of 1/120; the slopes that the image shows around it bring 1/346."""
+PRINT = (1 + EDGES) / 2
+"""The same of print that may have hard edges or none: their mean."""
 
 
 class FrameNoise:
@@ -24,14 +26,18 @@ class FrameNoise:
     ----------
     manifest
         of the run.
-    ambient_variance
-        mean noise variance of a pixel of the ambient frame that was taken off every shot [(electrons/s)^2]: one draw,
-        common to all; 0 without one.
+    ambient
+        (m,) and (m',) mean noise variance by sensor row, and by sensor column, of the ambient frame that was taken off
+        every shot [(electrons/s)^2]: one draw, common to all; None without one.
 
     Attributes
     ----------
     variance
         (K, K') mean noise variance of a datum of each pattern by its own shots [(electrons/s)^2].
+    rows, columns
+        (K, K', m) and (K, K', m') the same of each sensor row, and of each sensor column.
+    light_error
+        standard error of single projector pixels' light in simulated frames, 1 is the board's; 0: not stated.
     power
         sum of the squares of all shots [(electrons/s)^2].
     shots, saturated, readings
@@ -39,12 +45,16 @@ class FrameNoise:
 
     """
 
-    def __init__(self, manifest: RunManifest, ambient_variance: float = 0.0) -> None:
+    def __init__(self, manifest: RunManifest, ambient: tuple[FloatArray, FloatArray] | None = None) -> None:
         self._digital = manifest.digital
-        self.ambient_variance = ambient_variance
-        self._rendering = np.hypot(manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error"))
+        self.ambient = ambient
+        self.light_error = manifest.light_error or 0.0
+        self._sampling, self._systematic = manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error")
         counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
         self.variance: FloatArray = np.zeros(counts)
+        self.rows: FloatArray
+        self.columns: FloatArray
+        self.rows, self.columns = (np.zeros((*counts, 0)) for _ in range(2))
         self.power, self.shots, self.saturated, self.readings = 0.0, 1, 0, 0
 
     @property
@@ -55,7 +65,12 @@ class FrameNoise:
     @property
     def rendering(self) -> float:
         """Energy of what simulated frames are off by, as they state it: Monte Carlo error and discretisation."""
-        return float(self._rendering**2 * self.power)
+        return float((self._sampling**2 + self._systematic**2) * self.power)
+
+    @property
+    def discretisation(self) -> float:
+        """The part of :attr:`rendering` that :attr:`light_error` does not tell; all of it where that is not stated."""
+        return float(self._systematic**2 * self.power) if self.light_error else self.rendering
 
     def of(self, light: FloatArray | float, shots: int) -> FloatArray:
         """Noise variance [(electrons/s)^2] of a measurement, with that of the frame that was taken off it.
@@ -65,16 +80,21 @@ class FrameNoise:
         light, shots
             sum of its shots [electrons/s], any shape, and their number.
         """
-        ambient = self.ambient_variance if shots == 1 else 0.0  # the difference of a pair has no ambient frame
+        # The difference of a pair has no ambient frame.
+        ambient = float(self.ambient[0].mean()) if self.ambient and shots == 1 else 0.0
         return self._own(light, shots) + ambient
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
-        self.variance[measurement.row, measurement.column] = self._own(measurement.light.mean(), measurement.shots)
+        pattern, light, shots = (measurement.row, measurement.column), measurement.light, measurement.shots
+        if not self.rows.size:
+            self.rows, self.columns = (np.zeros((*self.variance.shape, size)) for size in light.shape)
+        self.variance[pattern] = self._own(light.mean(), shots)
+        self.rows[pattern], self.columns[pattern] = (self._own(light.mean(axis=axis), shots) for axis in (1, 0))
         self.power += float(measurement.power.sum())
-        self.shots = measurement.shots
+        self.shots = shots
         self.saturated += measurement.saturated
-        self.readings += measurement.shots * measurement.frame.size
+        self.readings += shots * measurement.frame.size
 
     def _own(self, light: FloatArray | float, shots: int) -> FloatArray:
         return np.maximum(self._digital.variance(light, shots), 0.0)

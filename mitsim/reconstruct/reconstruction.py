@@ -98,8 +98,7 @@ class Reconstruction:
 
     @property
     def uncertainty(self) -> FloatArray | None:
-        """(n, n') standard uncertainty of the image, random and systematic parts together; without what lambda takes
-        away, which ``uncertainties.bias`` states."""
+        """(n, n') standard uncertainty of the image, random and systematic parts together."""
         return self.uncertainties.total if self.uncertainties else None
 
     def summary(self) -> dict[str, Any]:
@@ -293,7 +292,7 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     numbers = sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides)
     Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{shots.name}: factorising its patterns", Limits())
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
-    noise = FrameNoise(shots.manifest, _ambient_variance(shots))
+    noise = FrameNoise(shots.manifest, _ambient_noise(shots))
     frames, kept = prepared.accumulator(), list[Measurement]()
     few = left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= _KEPT_NUMBERS
     for measurement in shots.measured((len(factors.left), len(factors.right))):
@@ -304,11 +303,11 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     return Accumulated(prepared, frames, noise, tuple(kept))
 
 
-def _ambient_variance(shots: Capture) -> float:
-    """Mean variance of the frame that is taken off all others; 0 where none is."""
+def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:
+    """Variance, by sensor row and by sensor column, of the frame that is taken off all others; None where none is."""
     if shots.ambient is None or any(shot.sign for shot in shots.manifest.patterns.captures):
-        return 0.0
-    return float(shots.ambient.variance.mean())
+        return None
+    return shots.ambient.variance.mean(axis=1), shots.ambient.variance.mean(axis=0)
 
 
 def inputs(shots: Capture, factors: Factors, lam: float | str, method: str) -> dict[str, str | float]:

@@ -5,9 +5,12 @@ U_Rj. Independent noise of variance v in all data leaves, V o V being the square
 
     var X = (V_L o V_L) (v G o G) (V_R o V_R)^T
 
-Light differs from frame to frame and over the sensor. A coefficient of the blocks (B, B') takes part w_Bi w'_B'j of its
-energy from frame (i, j), w_Bi = ||U_Li,B||^2 / r_B, and from all of the sensor alike, because a mask spreads each pixel
-over it: v becomes sum_ij w_Bi w'_B'j v_ij, with v_ij the mean over the frame.
+Light differs from frame to frame and over the sensor. Taking the variance of frame (i, j) for a product of its means by
+sensor row and by sensor column, v_ij = r_ij c_ij^T / mean, v becomes sum_ij ((U_Li o U_Li)^T r_ij) ((U_Rj o U_Rj)^T
+c_ij)^T / mean, number by number. (For patterns whose blocks share no row, such as ``random``, coefficients are then
+correlated, which is left out.) The noise N of a frame that is taken off all others comes in as (sum_i U_Li)^T N (sum_j
+U_Rj), whose numbers are correlated too; with G = sum_k g_k h_k^T that is exact, sum_k A_k N B_k^T, A_k = V_L diag(g_k)
+(sum_i U_Li)^T.
 
 Factors are off by independent numbers of deviation s_L, one and the same in all frames. To first order the frames are
 then off by d_L (P_ij o X) Phi_R^T, and, with Q = X V_R S_R, the image by V_L [G o (T Q)] V_R^T, where T = sum_i U_Li^T
@@ -20,31 +23,44 @@ blocks share no row, such as ``random``, rho leaves out what is correlated betwe
 
 Print that changes within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its
 light g / 12 pixels off the centre, which moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T, Phi_R' being the slope of
-Phi_R along its columns; what that does to the image stands for print that is finer than the image shows.
+Phi_R along its columns; what that does to the image stands for print that is finer than the image shows, which may have
+hard edges or none.
 
-What lambda takes away, sigma^2 x / (sigma^2 + lambda) instead of x, is no noise: it is estimated from the data and
-stated apart.
+Simulated light is off by its sampling, projector pixel by projector pixel: an error of the image that is kept as the
+image is. What lambda takes away, lambda x / (sigma^2 + lambda) of each coefficient x, is no noise, but as large as the
+scene has energy there, which is told by the data or follows from them (:func:`scene_energy`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.framefile import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.noise import FrameNoise, moved_responses
-from mitsim.reconstruct.regularisation import DiagonalProblem
+from mitsim.reconstruct.noise import PRINT, FrameNoise, moved_responses
+from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
 
 _LOST = 1e-5
 """Part of the energy of G that its few products may leave out: 0.3 % of its norm, less than 1 % of a variance."""
 _FITTED = 4
-"""Octaves of sigma that a power of the scene's energy is fitted to: chosen, of some ten that a camera tells."""
+"""Octaves of sigma that the power of the scene's energy is fitted to: chosen, of some ten that a camera tells."""
+_TOLD = 0.5
+"""Part of an octave's noise that its signal must have, so that an error of that noise does not pass for a scene: the
+calibration's noise, which :mod:`mitsim.reconstruct.halves` tells to a third, strikes some octaves."""
+_SIGNIFICANT = 3.0
+"""Standard deviations of the noise's energy that an octave's signal must have."""
+_NEAR = 2.0
+"""Scene pixels around a place whose detail tells of lost detail there: of 1, 2 and 4 that which covers best."""
+_DIGITS = 9
+"""Digits to which answers of coefficients, at most of order 1, are alike: rounding moves them by 1e-15."""
 NO_UNCERTAINTY = {"uncertainty": None, "uncertainty_budget": None}
 """Entries of result.json where it is not known."""
 
@@ -55,18 +71,9 @@ RANDOM = ("frame_noise", "ambient_frame", "rendering")
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Standard uncertainty of an image, without its ``bias``.
-
-    Attributes
-    ----------
-    sources
-        (n, n') standard uncertainty by source.
-    bias
-        root mean square over the image of what lambda takes away, as the data tell it.
-    """
+    """Standard uncertainty of an image: (n, n') by source, ``regularisation_bias`` among them."""
 
     sources: dict[str, FloatArray]
-    bias: float
 
     @property
     def random(self) -> FloatArray:
@@ -75,7 +82,8 @@ class Uncertainty:
 
     @property
     def systematic(self) -> FloatArray:
-        """(n, n') of what captures with these factors share: noise of the factors, print within a pixel, exposure."""
+        """(n, n') of what captures with these factors share: noise of the factors, print within a pixel, exposure, what
+        lambda takes away."""
         return _together([values for name, values in self.sources.items() if name not in RANDOM])
 
     @property
@@ -85,8 +93,8 @@ class Uncertainty:
 
     @property
     def budget(self) -> dict[str, float]:
-        """Root mean square over the image by source, and of the bias, which is none of them."""
-        return {**{name: _rms(values) for name, values in self.sources.items()}, "regularisation_bias": self.bias}
+        """Root mean square over the image by source."""
+        return {name: _rms(values) for name, values in self.sources.items()}
 
     def channels(self) -> dict[str, Channel]:
         """(n, n') channels of uncertainty.exr."""
@@ -95,10 +103,7 @@ class Uncertainty:
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
-        return {
-            "uncertainty": _rms(self.total),
-            "uncertainty_budget": {**self.budget, "regularisation_bias": self.bias},
-        }
+        return {"uncertainty": _rms(self.total), "uncertainty_budget": self.budget}
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,43 +127,100 @@ class Propagation:
     patterns: tuple[FloatArray, FloatArray]
     lam: float
 
-    @property
+    @cached_property
     def gain(self) -> FloatArray:
         """G (r, r'), 0 where nothing is measured."""
         sigma = np.outer(self.prepared.left.singular, self.prepared.right.singular)
         return np.divide(sigma, np.square(sigma) + self.lam, out=np.zeros_like(sigma), where=sigma > 0)
 
-    def of_frames(self, variance: FloatArray) -> FloatArray:
-        """(n, n') variance of the image, ``variance`` (K, K') being the mean of a datum of each pattern."""
-        left, right = (_column_energies(side) for side in self._sides)
-        return self._spread(left.T @ variance @ right)
+    @cached_property
+    def terms(self) -> tuple[FloatArray, FloatArray]:
+        """g (r, k) and h (r', k) of which G is the sum of products, as few as leave out ``_LOST`` of its energy."""
+        left, values, right = np.linalg.svd(self.gain, full_matrices=False)
+        beyond = 1 - np.cumsum(np.square(values)) / np.square(values).sum()
+        count = int(np.argmax(beyond <= _LOST)) + 1
+        return left[:, :count] * values[:count], right[:count].T
 
-    def of_ambient_frame(self, variance: float) -> FloatArray:
-        """(n, n') variance of the image by one noisy frame, of this mean ``variance``, taken off every measurement."""
-        left, right = (_common_energy(side) for side in self._sides)
-        return self._spread(variance * np.outer(left, right))
+    def of_white(self, variance: float) -> FloatArray:
+        """(n, n') variance of the image by independent noise of this ``variance`` in all data."""
+        return self._spread(np.full(self.gain.shape, variance))
+
+    def of_frames(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """(n, n') variance of the image by noise of the frames.
+
+        Parameters
+        ----------
+        rows, columns
+            (K, K', m) and (K, K', m') mean variance of a datum of each pattern by sensor row, and by sensor column.
+        """
+        left, right = self._sides
+        squares = [np.square(slab.matrix) for slab in right.slabs]
+        means = np.maximum(rows.mean(axis=2), np.finfo(np.float64).tiny)
+        total = np.zeros_like(self.gain)
+        for slab, own_rows, own_columns, mean in zip(left.slabs, rows, columns, means, strict=True):
+            seen = np.zeros((len(own_columns), len(right.singular)))
+            for part, other, square, column in zip(seen, right.slabs, squares, own_columns, strict=True):
+                part[other.columns] = column @ square
+            total[slab.columns] += (own_rows @ np.square(slab.matrix)).T @ (seen / mean[:, None])
+        return self._spread(total)
+
+    def of_ambient_frame(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """(n, n') variance of the image by one noisy frame, taken off every measurement.
+
+        Parameters
+        ----------
+        rows, columns
+            (m,) and (m',) mean variance of its pixels by sensor row, and by sensor column.
+        """
+        products = []
+        for side, own, variance in zip(self._sides, self.terms, (rows, columns), strict=True):
+            common = _common(side) * np.sqrt(variance)[:, None]
+            taken = np.stack([(side.basis * term) @ common.T for term in own.T], axis=1)
+            products.append(taken @ taken.transpose(0, 2, 1))
+        return np.asarray(np.einsum("pkl,qkl->pq", *products, optimize=True) / rows.mean())
+
+    def of_light(self, variance: float) -> FloatArray:
+        """(n, n') variance of the image by an independent error of this ``variance`` in every scene pixel's light."""
+        sigma = np.outer(self.prepared.left.singular, self.prepared.right.singular)
+        return self._spread(variance * np.square(sigma))
+
+    def of_regularisation(self, problem: DiagonalProblem, variance: float) -> FloatArray:
+        """(n, n') mean square of what lambda takes away of the image of a ``problem``, whose data have the stated
+        ``variance``.
+
+        Detail is lost where there is detail: the mean over the image is told by the scene's energy, and its place by
+        what lambda would take away of the image itself.
+        """
+        lost = 1 - problem.kept(self.lam)
+        everywhere = self._seen(np.square(lost) * scene_energy(problem, variance))
+        seen = np.square(self.prepared.image(lost * self.gain * problem.projected))
+        near = gaussian_filter(seen, _NEAR, mode="nearest")
+        return everywhere * near / near.mean() if near.any() else everywhere
 
     def of_factors(self, noise: FactorNoise, image: FloatArray) -> FloatArray:
         """(n, n') variance of an ``image`` by ``noise`` of the factors."""
         left, right = self._sides
-        gain = self.gain
-        rows = _of_factor(left, right, self.patterns[0], gain, image)
-        columns = _of_factor(right, left, self.patterns[1], gain.T, image.T).T
+        rows = _of_factor(left, right, self.patterns[0], self.terms, image)
+        columns = _of_factor(right, left, self.patterns[1], self.terms[::-1], image.T).T
         return np.asarray(noise.left**2 * rows + noise.right**2 * columns)
 
     def of_print(self, image: FloatArray) -> FloatArray:
-        """(n, n') square of what an ``image`` is off by when its print changes evenly within every projector pixel."""
+        """(n, n') mean square of what an ``image`` is off by when its print changes within every projector pixel."""
         left, right = self._sides
         gain = self.gain
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
         moved = [moved_responses(*side) for side in zip(self._sides, self.factors, self.patterns, strict=True)]
         seen = moved[0].T @ rows @ (right.basis * right.singular), (left.basis * left.singular).T @ columns @ moved[1]
-        return sum((np.square(self.prepared.image(gain * each)) for each in seen), np.zeros_like(image))
+        return PRINT * sum((np.square(self.prepared.image(gain * each)) for each in seen), np.zeros_like(image))
 
     def _spread(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
+        return self._seen(np.square(self.gain) * variances)
+
+    def _seen(self, variances: FloatArray) -> FloatArray:
+        """(n, n') variance of the image, that of each of its coefficients being ``variances`` (r, r')."""
         left, right = (np.square(side.basis) for side in self._sides)
-        return np.asarray(left @ (np.square(self.gain) * variances) @ right.T)
+        return np.asarray(left @ variances @ right.T)
 
     @property
     def _sides(self) -> tuple[Side, Side]:
@@ -190,88 +252,75 @@ def uncertainty(
     problem
         its data in the diagonal basis.
     """
-    zero = np.zeros_like(image)
-    rendering = np.full(noise.variance.shape, noise.rendering / problem.data_count)
+    zero, data = np.zeros_like(image), problem.data_count
     variances = {
-        "frame_noise": propagation.of_frames(noise.variance),
-        "ambient_frame": propagation.of_ambient_frame(noise.ambient_variance) if noise.ambient_variance else zero,
-        "rendering": propagation.of_frames(rendering) if noise.rendering else zero,
+        "frame_noise": propagation.of_frames(noise.rows, noise.columns),
+        "ambient_frame": propagation.of_ambient_frame(*noise.ambient) if noise.ambient else zero,
+        "rendering": propagation.of_white(noise.discretisation / data) + propagation.of_light(noise.light_error**2),
         "calibration_noise": propagation.of_factors(factors, image) if factors else zero,
         "print_detail": propagation.of_print(image),
         "exposure": np.square(exposure * image),
+        "regularisation_bias": propagation.of_regularisation(problem, float(noise.variance.mean())),
     }
-    return Uncertainty(
-        sources={name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in variances.items()},
-        bias=regularisation_bias(problem, propagation.lam, float(noise.variance.mean())),
-    )
+    return Uncertainty({name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in variances.items()})
 
 
-def regularisation_bias(problem: DiagonalProblem, lam: float, variance: float) -> float:
-    """Root mean square over the image of what lambda takes away.
+def scene_energy(problem: DiagonalProblem, variance: float) -> FloatArray:
+    """(r, r') mean square that is expected of each coefficient of the scene, in the diagonal basis of a ``problem``,
+    whose noise has the stated ``variance`` where no more data than unknowns tell it.
 
-    Parameters
-    ----------
-    problem
-        in its diagonal basis.
-    lam
-        lambda.
-    variance
-        of a datum.
-
-    Notes
-    -----
-    Coefficient x loses (1 - k) x. Over an octave of sigma the scene's energy, the mean of x^2, is told by sum(W^2 -
-    variance) / sum(sigma^2) while there is more signal than noise in it. Beyond, it goes on by the power of sigma that
-    the last octaves show, or as it is: scenes have less of what a camera sees badly, which is fine detail.
+    Over an octave of sigma it is sum(W^2 - noise) / sum(sigma^2) while that tells a signal. Beyond, the scene's energy
+    falls on with the number of coefficients that a camera sees better: that number is the square of the detail's
+    fineness, and scenes have spectra that fall with a power of it. sigma itself falls ever faster with fineness, and so
+    is no guide. Where fewer octaves are told it goes on as it is.
     """
     measured = problem.sigma > 0
     sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
+    told_by_data = problem.data_count > np.count_nonzero(measured)
+    noise = np.broadcast_to(coefficient_noise(problem) if told_by_data else variance, problem.sigma.shape)[measured]
     octave = np.log2(sigma.max() / sigma).astype(np.intp)
-    count = np.maximum(np.bincount(octave), 1)
-    signal = np.bincount(octave, data) / count - variance
+    sizes = np.bincount(octave)
+    count = np.maximum(sizes, 1)
+    signal, level = (np.bincount(octave, values) / count for values in (data - noise, noise))
+    chance = np.sqrt(2 * np.bincount(octave, np.square(noise))) / count
+    told = (signal > _SIGNIFICANT * chance) & (signal > _TOLD * level)
+    end = int(np.argmin(np.append(told | (sizes == 0), False)))  # beyond the first that is not told, chance may tell
+    energies = np.zeros_like(problem.sigma)
+    known = np.flatnonzero(told[:end])
+    if not known.size:
+        return energies
     square = np.bincount(octave, np.square(sigma)) / count
-    told = np.flatnonzero(signal > variance)
-    if not told.size:
-        return 0.0
-    energy = np.where(signal > variance, signal, 0.0) / np.where(square > 0, square, 1.0)
-    last, fitted = told[-1], told[-_FITTED:]
-    power = np.polyfit(np.log(square[fitted]), np.log(energy[fitted]), 1)[0] if fitted.size == _FITTED else 0.0
-    beyond = np.power(square[octave] / square[last], max(float(power), 0.0)) * energy[last]
-    expected = np.where(octave > last, beyond, energy[octave])
-    lost = np.square(1 - problem.kept(lam)[measured])
-    return float(np.sqrt(np.sum(lost * expected) / problem.sigma.size))
-
-
-def _column_energies(side: Side) -> FloatArray:
-    """(K, r) part of each column of U that lies in the rows of each pattern; parts of a column add up to 1."""
-    energies = np.zeros((side.pattern_count, len(side.singular)))
-    for energy, slab in zip(energies, side.slabs, strict=True):
-        energy[slab.columns] = np.square(slab.matrix).sum(axis=0)
+    energy = np.where(told, signal, 0.0) / np.where(square > 0, square, 1.0)
+    middle, last, fitted = np.cumsum(sizes) - sizes / 2, known[-1], known[-_FITTED:]
+    power = np.polyfit(np.log(middle[fitted]), np.log(energy[fitted]), 1)[0] if fitted.size == _FITTED else 0.0
+    beyond = energy[last] * np.power(middle[octave] / middle[last], min(float(power), 0.0))
+    energies[measured] = np.where(octave > last, beyond, energy[octave])
     return energies
 
 
-def _common_energy(side: Side) -> FloatArray:
-    """(r,) squared norm of the sum of all slabs: how much of one frame, added to all, each coefficient takes."""
+def _common(side: Side) -> FloatArray:
+    """(m, r) sum of all slabs: how each coefficient takes what is common to all frames."""
     total = np.zeros((side.sensor_size, len(side.singular)))
     for slab in side.slabs:
         total[:, slab.columns] += slab.matrix
-    return np.asarray(np.square(total).sum(axis=0))
+    return total
 
 
-def _of_factor(own: Side, other: Side, patterns: FloatArray, gain: FloatArray, image: FloatArray) -> FloatArray:
+def _of_factor(
+    own: Side, other: Side, patterns: FloatArray, terms: tuple[FloatArray, FloatArray], image: FloatArray
+) -> FloatArray:
     """(n, n') variance of an ``image`` by independent numbers of variance 1 in the factor of its ``own`` side."""
     seen = image @ (other.basis * other.singular)
-    responses = _responses(own, patterns)
-    left, values, right = np.linalg.svd(gain, full_matrices=False)
-    beyond = 1 - np.cumsum(np.square(values)) / np.square(values).sum()
-    count = int(np.argmax(beyond <= _LOST)) + 1
-    rows, columns = left[:, :count] * values[:count], right[:count]
-    parts = [(seen * column) @ other.basis.T for column in columns]
+    # Coefficients of one block answer alike: each kind of answer is summed once.
+    responses, kind = np.unique(np.round(_responses(own, patterns), _DIGITS), axis=0, return_inverse=True)
+    rows, columns = terms
+    parts = [(seen * column) @ other.basis.T for column in columns.T]
     spread = np.zeros((len(own.singular), len(other.basis)))
-    for k in range(count):
+    for k, part in enumerate(parts):
         for other_k in range(k + 1):
             twice = 1.0 if k == other_k else 2.0
-            spread += twice * (rows[:, k] * rows[:, other_k])[:, None] * (responses @ (parts[k] * parts[other_k]))
+            both = (responses @ (part * parts[other_k]))[kind]
+            spread += twice * (rows[:, k] * rows[:, other_k])[:, None] * both
     return np.asarray(np.square(own.basis) @ np.maximum(spread, 0.0))
 
 

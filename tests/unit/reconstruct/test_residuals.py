@@ -76,8 +76,10 @@ def test_noise_of_a_measurement_is_its_shots_and_that_of_the_ambient_frame_where
         exposure_s=0.1, gain_dn_per_e=0.5, black_level_dn=8.0, read_noise_e=3.0, dark_current_e_per_s=20.0
     )
     patterns = Patterns.of(parse_patterns("uniform", 2), ["frame"])
-    manifest = SimpleNamespace(digital=digital, patterns=patterns, mc_error=3e-3, plan={"systematic_error": 4e-3})
-    noise = FrameNoise(manifest, ambient_variance=50.0)  # type: ignore[arg-type]
+    manifest = SimpleNamespace(
+        digital=digital, patterns=patterns, mc_error=3e-3, light_error=None, plan={"systematic_error": 4e-3}
+    )
+    noise = FrameNoise(manifest, ambient=(np.full(4, 50.0), np.full(5, 50.0)))  # type: ignore[arg-type]
     light = np.array([100.0, 4000.0])
     np.testing.assert_allclose(noise.of(light, 1), digital.variance(light, 1) + 50)
     np.testing.assert_allclose(noise.of(light, 2), digital.variance(light, 2))
@@ -101,7 +103,9 @@ def test_an_ambient_frame_s_noise_goes_into_an_oblong_image_from_both_its_sides(
         sums = prepared.accumulator()
         sums.add(unit.reshape(5, 6), 0, 0)
         images.append(prepared.solve(sums, lam).image)
-    found = Propagation(prepared, (sides[0], sides[1]), patterns, lam).of_ambient_frame(3.0)
+    found = Propagation(prepared, (sides[0], sides[1]), patterns, lam).of_ambient_frame(
+        np.full(5, 3.0), np.full(6, 3.0)
+    )
     np.testing.assert_allclose(found, 3.0 * np.square(images).sum(axis=0), rtol=1e-9)
 
 
