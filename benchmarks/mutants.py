@@ -48,7 +48,10 @@ WHOLE = ("sensor", "optics", "reconstruct")
 MEMORY = 8 * 2**30
 """Address space of a mutant [bytes]: a wrong size must not take the machine's memory."""
 SLOWER, LATER_S = 4, 30
-"""A mutant may take this many times as long as the tests without one, and so much longer [s]: an endless loop ends."""
+"""A mutant may take this many times the processor time of the tests without one, and so much more [s]: an endless loop
+ends, and a busy machine makes no verdict."""
+WAITING = 20
+"""Seconds on the clock for a second of that limit, after which a mutant waits for something that never comes."""
 
 _NO_SHRINKING = (hypothesis.Phase.explicit, hypothesis.Phase.generate)
 """The smallest example of a failure takes minutes, and nobody reads it here."""
@@ -147,7 +150,7 @@ def file_of(test: str) -> str:
 
 
 def judged(mutant: Mutant | None, tests: Tests, limit_s: float) -> tuple[str, float]:
-    """Verdict on a ``mutant`` (None: the code as it is, by one file) by ``tests``, and the seconds that they took."""
+    """Verdict on a ``mutant`` (None: the code as it is, by one file) by ``tests``, and their processor time [s]."""
     notes = [_copy.parent / f"{test.replace('/', '-')}.json" for test in tests]
     if mutant is None:
         return _verdict(tests, limit_s, Notes(notes[0]))
@@ -161,27 +164,29 @@ def judged(mutant: Mutant | None, tests: Tests, limit_s: float) -> tuple[str, fl
 
 
 def _verdict(tests: Tests, limit_s: float, plugin: Notes | Order) -> tuple[str, float]:
-    begin = time.monotonic()
-    child = os.fork() or _test(tests, plugin)
-    status: int | None = None
-    while status is None and time.monotonic() < begin + limit_s:
-        ended, status_then = os.waitpid(child, os.WNOHANG)
-        status = status_then if ended else time.sleep(0.02)
-    seconds = round(time.monotonic() - begin, 1)
-    if status is None:
+    end = time.monotonic() + WAITING * limit_s
+    child = os.fork() or _test(tests, limit_s, plugin)
+    ended, status, usage = os.wait4(child, os.WNOHANG)
+    while not ended and time.monotonic() < end:
+        time.sleep(0.02)
+        ended, status, usage = os.wait4(child, os.WNOHANG)
+    if not ended:
         os.killpg(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        _, status, usage = os.wait4(child, 0)
+    code, seconds = os.waitstatus_to_exitcode(status), round(usage.ru_utime + usage.ru_stime, 1)
+    if not ended or code == -signal.SIGXCPU:
         return "timeout", seconds
-    return "killed" if os.waitstatus_to_exitcode(status) else "survived", seconds
+    return "killed" if code else "survived", seconds
 
 
-def _test(tests: Tests, plugin: Notes | Order) -> int:
+def _test(tests: Tests, limit_s: float, plugin: Notes | Order) -> int:
     """Run the tests in this process and end it."""
     code = 3
     try:
         os.setsid()
         os.chdir(_copy)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, int(limit_s) + 60))
         sys.dont_write_bytecode = isinstance(plugin, Order)
         sys.path[:0], os.environ["PYTHONPATH"] = [str(_copy)], str(_copy)
         hypothesis.settings.register_profile("mutants", derandomize=True, phases=_NO_SHRINKING, database=None)

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from mitsim.core.manifests import Digital
+from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit
 from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
-from mitsim.reconstruct.status import Verdict
+from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.status import Status, Verdict
 from tests.ideal_sessions import PIXELS, Bench, N, bench, picture, shadow
 
 DATA = PIXELS**2
@@ -143,6 +145,38 @@ def test_no_more_data_than_unknowns_tell_no_misfit() -> None:
     square = Bench(shadow(n=PIXELS), shadow(n=PIXELS))
     image = reconstruct(square.run("uniform", picture(n=PIXELS), 0), square.calibrated(0), 1.0)
     assert image.misfit is None and image.summary()["misfit"] is None
+
+
+def test_misfit_has_no_unit() -> None:
+    """The same digital numbers as electrons of 10^12 seconds: light, noise and image shrink together."""
+    shots, factors = bench().run("dots:3", picture(), 0), bench().calibrated(0)
+    digital = shots.manifest.digital
+    longer = digital.model_copy(
+        update={
+            "exposure_s": digital.exposure_s * 1e12,
+            "dark_current_e_per_s": digital.dark_current_e_per_s / 1e12,
+        }
+    )
+    other = Capture(shots.manifest.model_copy(update={"digital": longer}), memory=shots._memory)
+    found, expected = misfit(reconstruct(other, factors)), misfit(reconstruct(shots, factors))
+    for name in ("chi_square", "unexplained", "worst_tile"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6)
+
+
+def test_lambda_is_told_whether_the_frames_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they do not, or where the calibration says that no factors do, lambda is chosen once more, knowing that.
+
+    In small sessions the frames show it themselves and both choices agree, so what is said is looked at."""
+    said, solve = [], Prepared.solve
+    monkeypatch.setattr(
+        Prepared, "solve", lambda *given, **named: said.append(named.get("explained", True)) or solve(*given, **named)
+    )
+    factors = bench().calibrated(0)
+    odd = replace(factors, status=Status(Verdict.NOT_SEPARABLE, "Not separable"))
+    for shift, known, expected in ((0.0, factors, [True]), (SHIFT, factors, [True, False]), (0.0, odd, [True, False])):
+        said.clear()
+        reconstruct(bench(shift).run("dots:3", picture(), 0), known)
+        assert said == expected
 
 
 def test_variance_of_digital_numbers() -> None:

@@ -11,6 +11,7 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.regularisation import (
     RISK_POWER,
     DiagonalProblem,
+    _least,
     automatic_lambda,
     coefficient_noise,
     is_misfit,
@@ -199,3 +200,11 @@ def test_total_variation_without_weight_is_least_squares():
             solve_tv(prepared, sums, weight)
     with pytest.raises(MitsimError, match="iterations"):
         solve_tv(prepared, sums, 1.0, iterations=0)
+
+
+def test_the_least_score_is_found_down_to_none_at_all() -> None:
+    """A parabola over lambda in steps of the search: its minimum inside, at the least step, and at no lambda at all."""
+    exponents, scale = np.arange(-4, 1.01, 0.25), 3.0
+    for least in (0.3, 3.0 * 1e-4):
+        assert _least(lambda lam, least=least: (lam - least) ** 2, scale, exponents) == pytest.approx(least, rel=0.02)
+    assert _least(lambda lam: lam**2, scale, exponents) == 0.0
