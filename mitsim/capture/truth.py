@@ -17,7 +17,7 @@ from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.rig.recipe import load_recipe
-from mitsim.transport.direct import FluxTracer
+from mitsim.transport.flux import FluxTracer
 from mitsim.transport.histogram import DIRECT
 
 _PART = 1 / 6
@@ -66,7 +66,7 @@ class Truth:
 
 
 def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
-    """Trace until the truth's standard error, rms over the image, is an eighth of the frames', or 1e-4.
+    """Trace until the truth's standard error, rms over the image, is a sixth of the frames', or 1e-4.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class _Flux:
 
     def __init__(self, bench: Bench, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
         physics, loaded, pixels = Physics.simulated(bench, effects), bench.loaded, bench.n**2
-        self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry)
+        self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry, loaded.glossy)
         self._seeds = [integer(seed, "truth", name, group) for group in range(GROUPS)]
         self._sums, self._samples = np.zeros((GROUPS, pixels)), np.zeros(pixels)
         self._shape, self.rays = (bench.n, bench.n), 0
