@@ -17,6 +17,7 @@ from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.evidence import GROUPS, Estimate, Settings
 from mitsim.capture.exposer import Exposer, NoiseTarget, in_chunks
 from mitsim.capture.light import Light, Sampling, make_plan, trace_light
+from mitsim.capture.losses import known_losses
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Request
 from mitsim.core.arrays import FloatArray
@@ -396,6 +397,7 @@ def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
 
 def _warnings(light: Light, totals: _Totals, shooting: _Shooting, request: Request) -> Iterator[str]:
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
+    yield from known_losses(light.simulation.bench.loaded, request.effects)
     if not light.reached:
         yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
     elif total.bound > accuracy and not light.plan.warnings and request.noise_fraction is None:
