@@ -87,7 +87,7 @@ CARD = """<shape type="rectangle"><transform name="to_world"><scale value="90"/>
 
 @pytest.mark.parametrize("before", [CARD, PANE.format(z=200, bsdf="dielectric"), PANE.format(z=200, bsdf="null")])
 def test_causes_are_looked_for_behind_what_lets_light_pass(small_scene: Write, before: str) -> None:
-    """(Seen failing: the pane was blamed, for its back or for hiding what is lit.)"""
+    """(Seen failing: the material of what stands before was blamed.)"""
     words = sentence(small_scene(extra=before), FLIP)
     assert "turns its back to the projector" in words
     assert "reflects nothing" in sentence(small_scene("good", extra=before))

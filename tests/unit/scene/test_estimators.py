@@ -103,7 +103,7 @@ def test_light_that_mirrors_bring_is_told_as_lost(small_scene: Write) -> None:
 
 
 def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
-    """It is no pane and casts no glint there (seen failing: it was opaque to connections, without a word)."""
+    """It is no pane and casts no glint there, and an instance does not show its materials."""
     group = '<shape type="shapegroup" id="group">{}</shape>'
     placed = (
         '<shape type="instance"><ref id="group"/><transform name="to_world"><translate z="20"/></transform></shape>'
