@@ -15,6 +15,7 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.losses import known_losses
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
@@ -197,12 +198,13 @@ def render(
     started = time.perf_counter()
     if estimator == "reference":
         mean, error = reference(bench.loaded, spp, seed, job)
+        warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
     else:
         uniform = Lighting.uniform(bench.n)
         plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
-        warnings = light.warnings
+        warnings = (*light.warnings, *known_losses(bench.loaded, effects or {}))
         frame = next(iter(light.frames(uniform, seed)))
         mean = frame.irradiance[..., None]
         error = np.full_like(mean, math.sqrt(frame.variance))

@@ -107,6 +107,13 @@ class Request(BaseModel):
             )
         return fraction
 
+    @field_validator("ambient_frame", mode="before")
+    @classmethod
+    def _a_choice(cls, choice: object) -> object:
+        if choice not in ("auto", "yes", "no"):
+            raise ArgumentError("ambient_frame", f"{choice!r}: use auto, yes or no")
+        return choice
+
     @field_validator("ambient_shots")
     @classmethod
     def _a_number_of_shots(cls, shots: int | None) -> int | None:

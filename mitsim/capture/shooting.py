@@ -101,6 +101,11 @@ class Shooting:
         return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
 
     @property
+    def dilution(self) -> float:
+        """Norm of the frames' light over that of the projector's: by so much lamps dilute an error relative to all."""
+        return math.sqrt(self._energy / self._signal) if self._signal else 1.0
+
+    @property
     def ambient_part(self) -> float:
         """Ambient light in all light of the frames."""
         return float(self.always.sum()) * len(self.family.shots) / self._light if self._light else 0.0

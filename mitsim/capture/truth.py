@@ -18,7 +18,7 @@ from mitsim.capture.prices import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.rig.recipe import load_recipe
-from mitsim.transport.direct import FluxTracer
+from mitsim.transport.flux import FluxTracer
 from mitsim.transport.histogram import DIRECT
 
 _FINEST = 1e-4
@@ -91,7 +91,7 @@ class _Flux:
 
     def __init__(self, bench: Bench, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
         physics, loaded, pixels = Physics.simulated(bench, effects), bench.loaded, bench.n**2
-        self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry)
+        self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry, loaded.glossy)
         self._seeds = [integer(seed, "truth", name, group) for group in range(GROUPS)]
         self._sums, self._samples = np.zeros((GROUPS, pixels)), np.zeros(pixels)
         self._shape, self.rays = (bench.n, bench.n), 0

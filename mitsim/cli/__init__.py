@@ -220,7 +220,8 @@ def capture(
         ambient = payload["ambient_frame"]
         lines.append(
             f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
-            f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's"
+            f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
+            f"total error up to {payload['total_error_of_projector']:.1e} of it"
         )
     return finish(as_json, payload, lines, shots.warnings)
 

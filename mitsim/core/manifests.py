@@ -270,6 +270,9 @@ class RunManifest(RunHead):
         description="relative error of the expected frames, all in all: the plan's systematic error and that",
     )
     total_error_bound: float | None = Field(default=None, description="what it is below, at 95 %")
+    total_error_of_projector: float | None = Field(
+        default=None, description="that bound relative to the projector's light alone: more, where lamps are on"
+    )
     mc_to_sensor_noise: float | None = Field(
         default=None, description="largest ratio of that to a frame's sensor noise"
     )

@@ -185,6 +185,7 @@ class Capture:
             "mc_error",
             "total_error",
             "total_error_bound",
+            "total_error_of_projector",
             "mc_to_sensor_noise",
             "sensor_noise",
             "heaviest_group",

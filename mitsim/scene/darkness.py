@@ -1,6 +1,7 @@
 """Why a scene is dark: a loaded scene in, the sentence out that says what keeps the projector's light from the camera.
 
-A few hundred rays go from the projector through its window, and from what they meet to the sensor's centre.
+A few hundred rays go from the projector through its window, and from what they meet to the sensor's centre; holes,
+filters and glass let them pass.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ _FAR = 3.0
 """Beyond so many times the aligned plane's distance, a scene is called too far: the window is three times as wide."""
 _SMALL = 1e-2
 """Part of the aligned plane's distance below which a whole scene is taken for one in metres; theirs is 1e-3."""
+_MOST_PASSED = 16
+"""Surfaces that a ray passes: eight panes of two faces."""
 
 
 def why_dark(loaded: LoadedScene) -> str:
@@ -40,9 +43,11 @@ def why_dark(loaded: LoadedScene) -> str:
     if not _any((projector_to_world.inverse() @ plane).z > 0):
         return "the projector looks away from the scene, whose aligned plane lies behind it; turn the projector"
     towards = plane - start
-    si = loaded.scene.ray_intersect(mi.Ray3f(start, dr.normalize(towards)))
+    si = _opaque(loaded.scene, mi.Ray3f(start, dr.normalize(towards)), None)
     met = np.array(si.is_valid()).ravel()
     if not met.any():
+        if _any(loaded.scene.ray_test(mi.Ray3f(start, dr.normalize(towards)))):
+            return "all that the projector's rays meet lets light pass; put something opaque behind it"
         return _missed(loaded, to_world)
     back = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
     centre = to_world @ mi.Point3f(0)
@@ -63,9 +68,22 @@ def why_dark(loaded: LoadedScene) -> str:
             f"what is lit lies outside the field stop: {np.degrees(np.arctan(slope.min())):.3g} degrees off the axis "
             f"or more, and the stop (fov) lets {geometry.fov / 2:g} degrees pass; turn the camera or widen fov"
         )
-    if not _any(facing & ~loaded.scene.ray_test(si.spawn_ray_to(centre))):
+    if not _any(facing & ~_opaque(loaded.scene, si.spawn_ray_to(centre), centre).is_valid()):
         return "something hides from the camera what is lit; move it out of the way"
     return "what is lit lies edge-on, is hidden or reflects nothing; turn it, move it or check its material"
+
+
+def _opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.SurfaceInteraction3f:
+    """What rays meet that lets no light pass, before their ``target`` if there is one; panes are taken for thin."""
+    si = scene.ray_intersect(ray)
+    for _ in range(_MOST_PASSED):
+        clear = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+        passing = si.is_valid() & (clear | (dr.max(si.bsdf().eval_null_transmission(si)) > 0))
+        if not _any(passing):
+            break
+        onward = si.spawn_ray(ray.d) if target is None else si.spawn_ray_to(target)
+        si = dr.select(passing, scene.ray_intersect(onward, passing), si)
+    return si
 
 
 def _missed(loaded: LoadedScene, to_world: mi.Transform4f) -> str:

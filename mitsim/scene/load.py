@@ -96,15 +96,20 @@ def load_scene(
         except MitsimError:
             if needs_projector:
                 raise
-    facts = *_polished(scene), checked.unfit
+    facts = *_polished(scene, checked.unfit), checked.unfit
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
     return LoadedScene(path, checked.files, scene, cameras[0], projectors[0], grid, lamps, *facts)
 
 
-def _polished(scene: mi.Scene) -> tuple[bool, bool]:
-    """Whether a surface of the scene is a mirror or bends light, and whether one has a glossy component."""
+def _polished(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
+    """Whether a surface of the scene is a mirror or bends light, and whether one has a glossy component.
+
+    An instance hides its materials: what is glossy there is looked for by rays, so it may be.
+    """
     flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
     mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
-    return any(own & mirror for own in flags), any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)
+    mirrors = any(own & mirror for own in flags) or unfit.instances is not None
+    hidden = any(shape.class_name() == "Instance" for shape in scene.shapes())
+    return mirrors, hidden or any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)

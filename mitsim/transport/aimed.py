@@ -2,9 +2,10 @@
 
 Connected to an anchor u of the sensor, light over a lobe of roughness alpha comes from a patch of some alpha r about
 the point that mirrors the projector into u; even rays of a projector pixel seldom meet it. Where in the pixel it lies
-is told by a few rays that are sent on along their lobes' axes: they arrive at about u0 + J (x - 1/2), x the place in
-the pixel, so x is drawn from a Cauchy density about 1/2 + J^-1 (u - u0), as wide as the lobe. Any such density
-leaves the estimate unbiased; a part of the rays stays even, so that what the axes do not tell of is found as well.
+is told by a few rays that are sent on along their lobes' axes, past holes and through panes: they arrive at about
+u0 + J (x - 1/2), x the place in the pixel, so x is drawn from a Cauchy density about 1/2 + J^-1 (u - u0), as wide as
+the lobe. Any such density leaves the estimate unbiased; a part of the rays stays even, so that what the axes do not
+tell of is found as well.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.coordinates import rows_columns
 from mitsim.transport.direct import DirectTracer
+from mitsim.transport.landing import landing
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import sampled_wavelengths
 from mitsim.transport.sampling import stratified, streams
@@ -53,6 +55,16 @@ class _Aims:
     slope: FloatArray
     scale: FloatArray
     known: npt.NDArray[np.bool_]
+
+
+@dataclass
+class _Axis:
+    """Where rays along a lobe's axis meet the sensor's plane (x, y) and the lobe's radius there [mm], if known."""
+
+    x: mi.Float
+    y: mi.Float
+    width: mi.Float
+    known: mi.Bool
 
 
 class AimedTracer(DirectTracer):
@@ -167,19 +179,34 @@ class AimedTracer(DirectTracer):
         shared, rng = streams(_SEED, pixel, sample)
         jitter = stratified(sample, shared)
         wavelengths, _ = sampled_wavelengths(self.receiver.camera, rng)
-        si = self.scene.ray_intersect(self.rays.sample(pixel, jitter, rng, wavelengths))
-        # The middle of the random numbers is the middle of a lobe, or near it.
-        turn, _ = si.bsdf().sample(
-            mi.BSDFContext(mi.TransportMode.Importance), si, rng.next_float32(), mi.Point2f(0.5), si.is_valid()
-        )
-        inverse = self.receiver.camera.world_transform().inverse()
-        start, onward = inverse @ si.p, inverse @ si.to_world(turn.wo)
-        reach = -start.z / onward.z
-        valid = si.is_valid() & (onward.z < 0) & (reach > 0) & (turn.pdf > dr.opaque(mi.Float, _SHARP))
-        valid &= ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        row, column = rows_columns(start.x + onward.x * reach, start.y + onward.y * reach)
-        # 1 / sqrt(pi q), q the density on the sensor.
-        width = dr.sqrt(dr.square(reach) / (dr.pi * turn.pdf * dr.abs(onward.z)))
+        ray = self.rays.sample(pixel, jitter, rng, wavelengths)
+        none = _Axis(mi.Float(0), mi.Float(0), mi.Float(1), mi.Bool(False))
+        axis, _ = self.receiver.passage.along(ray, mi.Spectrum(1), (none, rng), self._axis)
+        row, column = rows_columns(axis.x, axis.y)
+        width, valid = axis.width, axis.known
         dr.eval(jitter, row, column, width, valid)
         stacked = [np.stack([np.array(a), np.array(b)], axis=1) for a, b in ((jitter.y, jitter.x), (row, column))]
         return stacked[0], stacked[1], np.array(width, dtype=np.float64), np.array(valid, dtype=np.float64)
+
+    def _axis(
+        self,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        light: mi.Spectrum,
+        active: mi.Bool,
+        state: tuple[_Axis, mi.PCG32],
+    ) -> tuple[_Axis, mi.PCG32]:
+        """The axis of the first surface that turns a ray sharply."""
+        del light
+        axis, rng = state
+        si.wi = si.to_local(-direction)
+        # The middle of the random numbers is the middle of a lobe, or near it.
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        turn, _ = si.bsdf().sample(context, si, rng.next_float32(), mi.Point2f(0.5), active)
+        active = active & (turn.pdf > dr.opaque(mi.Float, _SHARP)) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+        place = landing(self.receiver, si, si.to_world(turn.wo), active & ~axis.known)
+        # 1 / sqrt(pi q), q the density on the sensor.
+        width = place.length * dr.rsqrt(dr.pi * turn.pdf * place.cosine)
+        found = _Axis(place.x, place.y, width, place.arrives)
+        chosen = (dr.select(place.arrives, getattr(found, name), getattr(axis, name)) for name in vars(axis))
+        return _Axis(*chosen), rng

@@ -7,8 +7,6 @@ so does the ray: of the points that it meets one is handed out, drawn in proport
 
 from __future__ import annotations
 
-from copy import copy
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -20,8 +18,8 @@ from mitsim.transport.coordinates import x_y
 from mitsim.transport.histogram import DIRECT, Deposits, Sightings
 from mitsim.transport.paths import Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.receiver import Receiver, sampled_wavelengths
-from mitsim.transport.sampling import panchromatic, shuffled, stratified, streams
+from mitsim.transport.receiver import Receiver, Reception, sampled_wavelengths
+from mitsim.transport.sampling import panchromatic, stratified, streams
 
 IntArray = npt.NDArray[np.int64]
 
@@ -76,13 +74,45 @@ class DirectTracer(Tracer):
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         sensor = self._random_point(sample, shared, rng) if self.spread else self._anchor(row, column)
         flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
-        if self.receiver.passage.open:
-            seen = self._passing(ray, sensor, flux, pixel, rng)
-        else:
-            si = self.scene.ray_intersect(ray)
-            reception = self.receiver.receive(si, -ray.d, sensor, si.is_valid())
-            seen = reception.sightings(panchromatic(reception.irradiance * flux), pixel)
+
+        def seen_at(
+            si: mi.SurfaceInteraction3f,
+            direction: mi.Vector3f,
+            light: mi.Spectrum,
+            active: mi.Bool,
+            state: tuple[Sightings, mi.PCG32],
+        ) -> tuple[Sightings, mi.PCG32]:
+            seen, rng = state
+            reception, value = self._received(si, direction, light, sensor, active, rng)
+            return seen.joined_by(reception.sightings(value, pixel), rng), rng
+
+        seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(), rng), seen_at)
         return [Deposits.fetched(seen, DIRECT, (row, column))]
+
+    def _received(
+        self,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        light: mi.Spectrum,
+        sensor: mi.Point3f,
+        active: mi.Bool,
+        rng: mi.PCG32,
+    ) -> tuple[Reception, mi.Float]:
+        """What ``light`` that comes to surfaces in a ``direction`` brings to ``sensor`` points."""
+        del rng
+        return self._connected(si, direction, light, sensor, active)
+
+    def _connected(
+        self,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        light: mi.Spectrum,
+        sensor: mi.Point3f,
+        active: mi.Bool,
+    ) -> tuple[Reception, mi.Float]:
+        """The same by one connection."""
+        reception = self.receiver.receive(si, -direction, sensor, active)
+        return reception, panchromatic(reception.irradiance * light)
 
     def _pair(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """A lane's place in the list of pixels, its anchor, and its weight."""
@@ -97,29 +127,6 @@ class DirectTracer(Tracer):
         del number, row, column
         return jitter, mi.Float(1)
 
-    def _passing(
-        self, ray: mi.Ray3f, sensor: mi.Point3f, flux: mi.Spectrum, pixel: mi.UInt32, rng: mi.PCG32
-    ) -> Sightings:
-        """Light of rays that go on through what lets them pass."""
-        passage = self.receiver.passage
-
-        def further(
-            active: mi.Bool, ray: mi.Ray3f, flux: mi.Spectrum, seen: Sightings, rng: mi.PCG32
-        ) -> tuple[object, ...]:
-            si = self.scene.ray_intersect(ray, active)
-            active &= si.is_valid()
-            passed = passage.through(si, ray.d, active)
-            onward = passage.onward(si, passed.direction)
-            reception = self.receiver.receive(si, -ray.d, sensor, active)
-            light = panchromatic(reception.irradiance * flux)
-            seen = seen.joined_by(reception.sightings(light, pixel), rng)
-            flux = flux * passed.part
-            return active & (dr.max(flux) > 0), onward, flux, seen, rng
-
-        state = mi.Bool(True), ray, flux, Sightings.none(), rng
-        seen: Sightings = dr.while_loop(state, lambda active, *_: active, further)[3]
-        return seen
-
     def _anchor(self, row: mi.UInt32, column: mi.UInt32) -> mi.Point3f:
         """Anchors, in the camera's frame."""
         positions = mi.Float(self.positions.astype(np.float32))
@@ -133,33 +140,3 @@ class DirectTracer(Tracer):
         """Points of the unit square on the sensor, in the camera's frame."""
         side = 2 * dr.opaque(mi.Float, self.receiver.geometry.half_width)
         return mi.Point3f((point.x - 0.5) * side, (point.y - 0.5) * side, 0)
-
-
-class FluxTracer(DirectTracer):
-    """Direct light at the sensor as a whole: its points are stratified together with those of the projector's pixels.
-
-    Frames keep the plain random points that they are bit-equal with.
-    """
-
-    def __init__(
-        self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry
-    ) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        scene, camera, projector
-            as loaded.
-        geometry
-            stands in for the camera's own.
-        """
-        super().__init__(scene, camera, projector, 1, geometry, spread=True)
-
-    def at(self, pixels: IntArray) -> FluxTracer:
-        """The same for the projector pixels ``pixels`` (m,) alone."""
-        part = copy(self)
-        part._pixels = pixels
-        return part
-
-    def _random_point(self, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32) -> mi.Point3f:
-        return self._on_sensor(stratified(shuffled(sample, shared), shared))

@@ -209,10 +209,18 @@ class _Walk(Walk):
         """The same for another light of the scene."""
         point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         ds, light = emitter.sample_direction(si, point, self.active)
-        active = self.active & (ds.pdf > 0)
-        seen, passed = self.passage.between(si, ds.p, active)
+        active, direction = self.active & (ds.pdf > 0), ds.d
+        if self.passage.panes and mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+            # No path runs into such a lamp behind glass, but there is one way to it.
+            way = refracted_way(self.passage, si, ds.p, active)
+            apparent = mi.SurfaceInteraction3f(si)
+            apparent.p = way.apparent
+            ds, light = emitter.sample_direction(apparent, point, active & way.open)
+            seen, passed, direction = way.open, way.part / dr.square(way.eta), way.direction
+        else:
+            seen, passed = self.passage.between(si, ds.p, active)
         active &= seen
-        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
         # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
         share = dr.select(ds.delta, 1, self._share(ds.pdf, pdf)) if self.paths.interreflection else 1
         self._keep_seen("ambient", active, self._radiance(value * light * passed) * share, self._lamps())

@@ -20,6 +20,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import check_finite
+from mitsim.transport.landing import landing
 from mitsim.transport.paths import launches
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, sampled_wavelengths
@@ -87,12 +88,12 @@ def sharp_light(
     squares, widths, weights = 0.0, [], []
     by_pixel, moments = np.zeros(lanes), np.zeros(lanes)
     for sample, pixel in launches(lanes, 0, samples):
-        mean, connected, density = lobes.meet(seed, sample, pixel)
+        mean, product, density = lobes.meet(seed, sample, pixel)
         check_finite(mean)
-        check_finite(connected)
+        check_finite(product)
         number = np.array(pixel)
         by_pixel += np.bincount(number, mean, minlength=lanes) / samples
-        moments += np.bincount(number, mean * connected, minlength=lanes) / samples
+        moments += np.bincount(number, product, minlength=lanes) / samples
         squares += float(np.square(mean).sum())
         widths.append(1 / np.sqrt(np.pi * density[mean > 0]))
         weights.append(mean[mean > 0])
@@ -110,41 +111,66 @@ def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
     return float(values[order][np.searchsorted(sums, part * sums[-1])]) if values.size else math.inf
 
 
+@dataclass
+class _Met:
+    """Of points met on the sensor: estimates x of the mean irradiance, x I, and density q of one, drawn by x."""
+
+    mean: mi.Float
+    moment: mi.Float
+    density: mi.Float
+
+    def joined_by(self, more: _Met, rng: mi.PCG32) -> _Met:
+        """These and ``more``; in x I, points that are met over one surface are no points of another."""
+        mean = self.mean + more.mean
+        new = rng.next_float32() * mean < more.mean
+        return _Met(mean, self.moment + more.moment, dr.select(new, more.density, self.density))
+
+
 class _Lobes:
-    """Rays of the projector that a sharp lobe of the first surface sends to the sensor."""
+    """Rays of the projector that sharp lobes of the surfaces that they light send to the sensor."""
 
     def __init__(
         self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry
     ) -> None:
-        self.scene, self.camera, self.geometry = scene, camera, geometry
+        self.camera, self.geometry = camera, geometry
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
 
     def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Estimates x of the mean irradiance, light I of a connection to the point met, density q there; (lanes,)."""
+        """Estimates x of the mean irradiance, x I, and density q of one of the points met; (lanes,)."""
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         wavelengths, spectral = sampled_wavelengths(self.camera, rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
-        si = self.scene.ray_intersect(ray)
-        toward = -ray.d
-        si.wi = si.to_local(toward)
+        flux = self.rays.flux(pixel, wavelengths) * spectral
+        none = _Met(mi.Float(0), mi.Float(0), mi.Float(1))
+        met, _ = self.receiver.passage.along(ray, flux, (none, rng), self._at)
+        dr.eval(met)
+        mean, moment, density = (np.array(values, dtype=np.float64) for values in vars(met).values())
+        return mean, moment, density
+
+    def _at(
+        self,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        light: mi.Spectrum,
+        active: mi.Bool,
+        state: tuple[_Met, mi.PCG32],
+    ) -> tuple[_Met, mi.PCG32]:
+        """What a turn that is sampled at the surface meets."""
+        met, rng = state
+        si.wi = si.to_local(-direction)
         context = mi.BSDFContext(mi.TransportMode.Importance)
         number, point = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        turn, _ = si.bsdf().sample(context, si, number, point, si.is_valid())
-        density = si.bsdf().pdf(context, si, turn.wo, si.is_valid())
-        active = si.is_valid() & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        inverse = self.camera.world_transform().inverse()
-        start, onward = inverse @ si.p, inverse @ si.to_world(turn.wo)
-        reach = -start.z / onward.z
-        local = start + onward * reach
+        turn, _ = si.bsdf().sample(context, si, number, point, active)
+        density = si.bsdf().pdf(context, si, turn.wo, active)
+        active = active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+        place = landing(self.receiver, si, si.to_world(turn.wo), active)
         half = dr.opaque(mi.Float, self.geometry.half_width)
-        active &= (onward.z < 0) & (reach > 0) & (dr.abs(local.x) <= half) & (dr.abs(local.y) <= half)
-        reception = self.receiver.receive(si, toward, mi.Point3f(local.x, local.y, 0), active)
-        light = panchromatic(reception.irradiance * self.rays.flux(pixel, wavelengths) * spectral)
-        active &= (reception.pdf > dr.opaque(mi.Float, _SHARP)) & (density > 0)
-        per_area = density * -onward.z / dr.square(reach)
-        mean = dr.select(active, light / (4 * dr.square(half) * per_area), 0)
-        light = dr.select(active, light, 0)
-        dr.eval(mean, light, per_area)
-        fetched = (np.array(values, dtype=np.float64) for values in (mean, light, per_area))
-        return next(fetched), next(fetched), next(fetched)
+        active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
+        sensor = mi.Point3f(place.x, place.y, 0)
+        reception = self.receiver.receive(si, -direction, sensor, active)
+        active &= reception.pdf > dr.opaque(mi.Float, _SHARP)
+        per_area = density * reception.solid_angle(sensor)
+        connected = dr.select(active, panchromatic(reception.irradiance * light), 0)
+        mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
+        return met.joined_by(_Met(mean, mean * connected, per_area), rng), rng

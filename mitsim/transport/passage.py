@@ -9,7 +9,9 @@ before it. Scenes without such surfaces keep a plain test of visibility.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +22,7 @@ _OFFSET = 9e-5
 """How far a ray starts beyond a surface that it has passed, for each mm of its coordinates: Mitsuba's ray epsilon."""
 _GRAZING = 0.02
 """Least cosine that this distance is divided by, so that a grazing ray does not skip centimetres."""
+State = TypeVar("State", bound=tuple[object, ...])
 
 
 @dataclass
@@ -71,13 +74,50 @@ class Passage:
             active &= met.is_valid()
             part = dr.select(active, part * self.straight(met, active), part)
             active &= dr.max(part) > 0
-            ray.o = dr.select(active, met.spawn_ray_to(target).o, ray.o)
-            ray.d = dr.select(active, target - ray.o, ray.d)
+            onward = met.spawn_ray_to(target)
+            for name in ("o", "d", "maxt"):
+                setattr(ray, name, dr.select(active, getattr(onward, name), getattr(ray, name)))
             return active, ray, part
 
         state = mi.Bool(active), ray, mi.Spectrum(1)
         _, _, part = dr.while_loop(state, lambda active, *_: active, further, labels=("active", "ray", "part"))
         return dr.max(part) > 0, part
+
+    def along(
+        self,
+        ray: mi.Ray3f,
+        light: mi.Spectrum,
+        state: State,
+        visit: Callable[[mi.SurfaceInteraction3f, mi.Vector3f, mi.Spectrum, mi.Bool, State], State],
+    ) -> State:
+        """What is made of all surfaces that rays meet one behind another, as far as these let light pass.
+
+        Parameters
+        ----------
+        ray, light
+            what comes to the first surface.
+        state
+            before that.
+        visit
+            of points of surfaces, the direction and the light that come to them, and the lanes that count, makes
+            another state of one.
+        """
+        if not self.open:
+            si = self.scene.ray_intersect(ray)
+            return visit(si, ray.d, light, si.is_valid(), state)
+
+        def further(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
+            si = self.scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            # Before the visit, which may turn the surface to where it is seen from.
+            passed = self.through(si, ray.d, active)
+            onward = self.onward(si, passed.direction)
+            state = visit(si, ray.d, light, active, state)  # type: ignore[arg-type]
+            light = light * passed.part
+            return active & (dr.max(light) > 0), onward, light, *state
+
+        begun = mi.Bool(True), ray, light, *state
+        return dr.while_loop(begun, lambda active, *_: active, further)[3:]  # type: ignore[no-any-return]
 
     @staticmethod
     def straight(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:

@@ -90,7 +90,7 @@ class Reception:
     """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
 
     ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.histogram.Deposits`; ``pdf`` is that of
-    sampling the turn at P from the sensor's side.
+    sampling the turn at P from the sensor's side, ``direction`` the unit one in which the light leaves P.
     """
 
     irradiance: mi.Spectrum
@@ -98,6 +98,14 @@ class Reception:
     column: mi.Float
     inverse_depth: mi.Float
     pdf: mi.Float
+    direction: mi.Vector3f
+
+    def solid_angle(self, local: mi.Point3f) -> mi.Float:
+        """Solid angle at P for each area of the sensor at ``local`` [sr/mm^2]: cos^3 / z^2 of the apparent point."""
+        row, column = rows_columns(local.x, local.y)
+        inverse = self.inverse_depth
+        squared = 1 + dr.square(self.row - row * inverse) + dr.square(self.column - column * inverse)
+        return dr.square(inverse) / (squared * dr.sqrt(squared))
 
     def sightings(self, value: mi.Float, pixel: mi.UInt32) -> Sightings:
         """Light ``value`` [W m^-2] of projector pixels ``pixel``, seen from here."""
@@ -164,7 +172,7 @@ class Receiver:
         inverse_depth = dr.rcp(point.z)
         irradiance = dr.select(active, mi.unpolarized_spectrum(reflected) * passed * geometric, 0)
         row, column = rows_columns(point.x, point.y)
-        return Reception(irradiance, row * inverse_depth, column * inverse_depth, inverse_depth, pdf)
+        return Reception(irradiance, row * inverse_depth, column * inverse_depth, inverse_depth, pdf, direction)
 
 
 def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:

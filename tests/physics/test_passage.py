@@ -116,6 +116,13 @@ def test_a_card_of_opacity_0_is_no_card(scene: Callable[..., Bench]) -> None:
     assert direct_light(behind, 1) == pytest.approx(direct_light(alone, 1), rel=1e-6)
 
 
+def test_what_stands_behind_the_sensor_hides_nothing(scene: Callable[..., Bench]) -> None:
+    """A wall of the room behind camera and projector (seen failing: what lay beyond the sensor hid all light)."""
+    room = plate(-300, MATT, 1000)
+    alone, behind = scene(room), scene(room + plate(350, card(0)))
+    assert direct_light(behind, 1) == pytest.approx(direct_light(alone, 1), rel=1e-6)
+
+
 @pytest.mark.parametrize("opacity", [0.25, 1.0])
 def test_a_black_card_dims_the_wall_by_its_opacity_squared(scene: Callable[..., Bench], opacity: float) -> None:
     """It stands in the whole way to the wall, and in the whole way back."""

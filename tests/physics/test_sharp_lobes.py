@@ -14,7 +14,7 @@ import pytest
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.light import Light, Sampling, make_plan, trace_light
 from mitsim.rig.patterns import Lighting
-from tests.hard.test_hard_transport import GLINT, PLACE, SCALE, glossy, lobe
+from tests.hard.test_hard_transport import GLINT, PLACE, SCALE, gauss, glossy, lobe
 
 N, PIXELS, SIGMAS = 32, 64, 5.0
 ALONE = {"interreflection": False, "diffraction": False}
@@ -124,6 +124,98 @@ def test_a_ball(traced: Callable[..., Light], alpha: float, accuracy: float) -> 
     assert light.plan.settings.sharp is not None and len(light.plan.settings.sharp.pixels) < 20
     error = float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
     assert error < SIGMAS * predicted(light) < 0.1
+
+
+# ---- what stands before a sharp lobe
+
+THICK, INDEX = 6.0, 1.5
+
+
+def card(opacity: str) -> str:
+    """A black card of 160 mm, which both ways cross."""
+    place = '<scale x="80" y="80"/><rotate y="1" angle="180"/><translate x="30" z="250"/>'
+    black = '<bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
+    bsdf = f'<bsdf type="mask">{opacity}{black}</bsdf>'
+    return f'<shape type="rectangle"><transform name="to_world">{place}</transform>{bsdf}</shape>'
+
+
+@pytest.mark.slow
+def test_a_sharp_lobe_behind_a_half_open_card(traced: Callable[..., Light]) -> None:
+    """The lobe's own light, a quarter of it (seen failing: where the first surface alone was looked at, 1e-4 of it)."""
+    plate = glossy(1e-3, sheet=False)
+    plate["extra"] += card('<float name="opacity" value="0.5"/>')
+    light = traced(1e-2, **plate)
+    index, place = points(light.bench, 6)
+    expected = 0.25 * np.array([[lobe(1e-3, row, column) for column in place] for row in place])
+    error = float(np.linalg.norm(frame(light)[np.ix_(index, index)] - expected) / np.linalg.norm(expected))
+    assert light.reached and not light.warnings and light.plan.settings.sharp is not None
+    assert error < SIGMAS * predicted(light) < 0.15
+
+
+def behind_panes(alpha: float, row: float, column: float) -> float:
+    """As :func:`lobe`, an upright pane in each way: a ray that is r away on the far side left at the slope that
+    (z - t) tan a + t tan b = r, sin a = n sin b.
+
+    Irradiance is pi scale dp dq / dA on the plate and d omega / dA on the sensor, both by dr / da; each face of glass
+    lets 1 - (R_s + R_p) / 2 through.
+    """
+    z, source = 395.0, np.array([PLACE, 0.0])
+    axes = []
+    for centre, low, high in ((PLACE, 0.0, 60.0), (0.0, -30.0, 30.0)):
+        shift = -column if centre else -row
+        middle = (shift + centre) / 2
+        s, ds = gauss(*(float(np.arcsinh((limit - middle) / z / alpha)) for limit in (low, high)), 200)
+        axes.append((middle + z * alpha * np.sinh(s), z * alpha * np.cosh(s) * ds))
+    (x, dx), (y, dy) = axes
+    point = np.stack(np.broadcast_arrays(x[:, None], y[None, :]), axis=-1)
+    into, dp, passed_in = _through_pane(point - source, z)
+    out, do, passed_out = _through_pane(point - np.array([-column, -row]), z)
+    normal = np.array([0, 0, 1.0])
+    h = (into + out) / np.linalg.norm(into + out, axis=-1)[..., None]
+    cos_i, cos_o, cos_h = (vector @ normal for vector in (into, out, h))
+    tan2 = lambda cosine: 1 / cosine**2 - 1  # noqa: E731
+    d = 1 / (np.pi * alpha**2 * cos_h**4 * (1 + tan2(cos_h) / alpha**2) ** 2)
+    g = [2 / (1 + np.sqrt(1 + alpha**2 * tan2(cosine))) for cosine in (cos_i, cos_o)]
+    f = d * g[0] * g[1] / (4 * cos_i * cos_o)
+    solid = do * cos_o**3  # d omega = cos^3 dp dq
+    return float(np.pi * SCALE * dx @ (f * cos_o * dp * solid * passed_in * passed_out) @ dy)
+
+
+def _through_pane(offset: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions back from the plate, tan-angles' area for each area of the plate, and transmittance."""
+    r = np.linalg.norm(offset, axis=-1)
+    slope = r / z
+    for _ in range(40):
+        sine = slope / np.sqrt(1 + slope**2) / INDEX
+        slope = (r - THICK * sine / np.sqrt(1 - sine**2)) / (z - THICK)
+    cosine = 1 / np.sqrt(1 + slope**2)
+    inside = np.sqrt(1 - sine**2)
+    grows = (z - THICK) + THICK * cosine**3 / (INDEX * inside**3)  # dr / d tan a
+    s, p = (cosine - INDEX * inside) / (cosine + INDEX * inside), (INDEX * cosine - inside) / (INDEX * cosine + inside)
+    direction = -offset * (slope / r * cosine)[..., None]
+    return np.concatenate([direction, cosine[..., None]], axis=-1), slope / r / grows, (1 - (s**2 + p**2) / 2) ** 2
+
+
+def pane(x: float) -> str:
+    """In one of the two ways, and beside the place that mirrors the projector into the sensor."""
+    place = f'<scale x="20" y="60" z="{THICK / 2}"/><translate x="{x}" z="100"/>'
+    glass = f'<bsdf type="dielectric"><float name="int_ior" value="{INDEX}"/><float name="ext_ior" value="1"/></bsdf>'
+    return f'<shape type="cube"><transform name="to_world">{place}</transform>{glass}</shape>'
+
+
+@pytest.mark.slow
+def test_a_sharp_lobe_behind_panes(traced: Callable[..., Light], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One pane in each way; without reflections inside of the glass, which are told as left out (some 1e-3)."""
+    monkeypatch.setitem(ALONE, "mirrors", False)
+    plate = glossy(1e-3, sheet=False)
+    plate["extra"] += pane(52) + pane(7.6)
+    light = traced(1e-2, **plate)
+    index, place = points(light.bench, 6)
+    expected = np.array([[behind_panes(1e-3, row, column) for column in place] for row in place])
+    assert expected.mean() == pytest.approx(0.96**4 * GLINT * (790 / 786) ** 2, rel=5e-3)
+    error = float(np.linalg.norm(frame(light)[np.ix_(index, index)] - expected) / np.linalg.norm(expected))
+    assert light.reached and light.plan.settings.sharp is not None
+    assert error < SIGMAS * predicted(light) < 0.15
 
 
 def test_matt_scenes_pay_nothing(small_scene: Callable[..., Path], variant: str) -> None:

@@ -1,4 +1,4 @@
-"""What an estimator cannot render: the tree of a checked scene in; the refusal of each estimator out, if there is one.
+"""What an estimator cannot render: the tree of a checked scene in; its refusal out, or what is known to be lost.
 
 The factored estimator knows surfaces alone. The reference is the scene's own integrator, and of Mitsuba's only those
 for volumes see a light through what lets it straight on: the others take a hole that is cut out for opaque whenever
@@ -21,15 +21,32 @@ if TYPE_CHECKING:
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""
+_MIRRORS = ("conductor", "dielectric", "plastic", "pplastic", "thindielectric")
+"""Materials that reflect or bend light into single directions."""
+_SMALL_LAMPS = ("directional", "point", "spot")
+"""Lamps that no path runs into."""
 _VOLUMETRIC = ("volpath", "volpathmis")
 
 
 @dataclass(frozen=True)
 class Unfit:
-    """Why an estimator must not be given a scene; None where it may."""
+    """Why an estimator must not be given a scene, and which light it loses of one that it may be given; None: none.
+
+    Attributes
+    ----------
+    factored, reference
+        the refusal of each estimator.
+    caustics
+        what the reference loses: light that mirrors or glass bring to surfaces from what no path runs into.
+    lamps, instances
+        what the factored estimator loses: the same of lamps, and light over mirrors or glass inside of instances.
+    """
 
     factored: MitsimError | None = None
     reference: MitsimError | None = None
+    caustics: str | None = None
+    lamps: str | None = None
+    instances: str | None = None
 
     @classmethod
     def of(cls, outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
@@ -45,7 +62,41 @@ class Unfit:
                 "the integrator volpath"
             )
             factored = outline.tag(node).refusal(name, "a medium", rule)
-        return cls(factored, _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)))
+        return cls(
+            factored,
+            _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)),
+            _caustics(outline, tree, ("projector", *_SMALL_LAMPS), "the reference"),
+            _caustics(outline, tree, _SMALL_LAMPS, "the factored estimator"),
+            _in_instances(outline, tree),
+        )
+
+
+def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estimator: str) -> str | None:
+    """What an ``estimator`` loses where one of the ``lights`` shines on a mirror."""
+    mirror = next(tree.to(_MIRRORS), None)
+    light = next((node for node in tree.nodes if node.props.plugin_name() in lights), None)
+    if mirror is None or light is None:
+        return None
+    place, what = outline.tag(mirror[0]), tree.plugin(*mirror)
+    rule = (
+        f"{estimator} finds no light of it that {place.path.name}:{place.line} ({what}) brings to other surfaces, so "
+        "that is missing; use a light that has a surface (area; mitsim_projector for the reference)"
+    )
+    return str(outline.tag(light).refusal("light", repr(str(light.props.plugin_name())), rule))
+
+
+def _in_instances(outline: Outline, tree: _References) -> str | None:
+    for node in tree.nodes:
+        if node.props.plugin_name() != "shapegroup":
+            continue
+        mirror = next(tree.below(node, _MIRRORS), None)
+        if mirror is not None:
+            rule = (
+                "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the "
+                "projector is missing; place the shape itself"
+            )
+            return str(outline.tag(mirror).refusal("bsdf", repr(str(mirror.props.plugin_name())), rule))
+    return None
 
 
 def _lost_by_integrator(
@@ -74,6 +125,15 @@ class _References:
             for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
                 if self.plugin(node, name) in plugins:
                     yield node, name
+
+    def below(self, node: mi.parser.SceneNode, plugins: Sequence[str]) -> Iterator[mi.parser.SceneNode]:
+        """Nodes of one of the ``plugins`` that a ``node`` refers to, itself or by others."""
+        for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
+            if node.props.type(name) == mi.Properties.Type.ResolvedReference:
+                other = self.nodes[node.props[name].index()]
+                if other.props.plugin_name() in plugins:
+                    yield other
+                yield from self.below(other, plugins)
 
     def plugin(self, node: mi.parser.SceneNode, name: str) -> str:
         """What the property refers to; nothing unless it is an object."""

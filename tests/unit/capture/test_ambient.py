@@ -85,6 +85,21 @@ def test_the_folder_carries_it(captured: Capture) -> None:
     assert json.loads((folder / "manifest.json").read_text())["ambient_frame"]["shots"] == 16
 
 
+def test_the_error_is_stated_relative_to_the_projectors_light(
+    captured: Capture, light: Light, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the norms of the frames with and without ambient light; flagged where lamps dilute it too far."""
+    off = read_frame(captured.folder / "ambient.exr")[0]["electrons"].astype(float)
+    electrons = captured.electrons.astype(float)
+    diluted = np.linalg.norm(electrons) / np.linalg.norm(electrons - off)
+    manifest = captured.manifest
+    assert diluted > 1.1
+    assert manifest.total_error_of_projector == pytest.approx(manifest.total_error_bound * diluted, rel=1e-4)
+    monkeypatch.setattr("mitsim.capture.run._DILUTED", 1e-6)
+    (warning,) = light.expose("dots:2").warnings
+    assert "relative to the projector's light alone the error is up to" in warning
+
+
 def test_it_holds_the_lamps_light_alone(captured: Capture, light: Light) -> None:
     """The expected frame is that of a scene whose projector gives nothing, contrast ratio 100 or not."""
     expected = light.frames(parse_patterns("dots:4", N).lighting, 2)

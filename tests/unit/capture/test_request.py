@@ -44,6 +44,7 @@ def test_a_request_is_a_value() -> None:
         *(("exposure_fraction", value, "to 1") for value in (0.0, -0.5, 1.01, math.nan)),
         *(("effects", value, "diffraction") for value in ("fog", "+fog", "diffraction", {"fog": True})),
         ("effects", "+ambient,-ambient", "keep one"),
+        *(("ambient_frame", value, "use auto, yes or no") for value in ("maybe", "", True)),
     ],
 )
 def test_values_out_of_range_name_the_argument(argument: str, value: Any, allowed: str) -> None:

@@ -77,3 +77,26 @@ def test_a_projector_that_looks_away(small_scene: Write) -> None:
 def test_a_good_scene_is_not_blamed_for_its_place(small_scene: Write) -> None:
     """What is left is its material."""
     assert "reflects nothing" in sentence(small_scene())
+
+
+PANE = """<shape type="cube"><transform name="to_world"><scale x="90" y="90" z="3"/><translate z="{z}"/></transform>
+    <bsdf type="{bsdf}"/></shape>"""
+CARD = """<shape type="rectangle"><transform name="to_world"><scale value="90"/><translate z="200"/></transform>
+    <bsdf type="mask"><float name="opacity" value="0"/><bsdf type="diffuse"/></bsdf></shape>"""
+
+
+@pytest.mark.parametrize("before", [CARD, PANE.format(z=200, bsdf="dielectric"), PANE.format(z=200, bsdf="null")])
+def test_causes_are_looked_for_behind_what_lets_light_pass(small_scene: Write, before: str) -> None:
+    """(Seen failing: the material of what stands before was blamed.)"""
+    words = sentence(small_scene(extra=before), FLIP)
+    assert "turns its back to the projector" in words
+    assert "reflects nothing" in sentence(small_scene("good", extra=before))
+    wall = (
+        '<shape type="rectangle"><transform name="to_world"><scale value="25"/><translate z="100"/></transform></shape>'
+    )
+    assert "hides from the camera" in sentence(small_scene("wall", extra=before + wall))
+
+
+def test_a_scene_of_glass_alone(small_scene: Write) -> None:
+    path = small_scene(extra=PANE.format(z=200, bsdf="null"), sheet_z=-400)
+    assert "lets light pass" in sentence(path)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from mitsim.capture.bench import open_bench
+from mitsim.capture.losses import known_losses
 from mitsim.core.errors import MitsimError
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -77,3 +78,40 @@ def test_other_scenes_go_their_way(small_scene: Write) -> None:
     unused = '<bsdf type="mask" id="unused"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf>'
     bench = open_bench(small_scene(extra=glass + unused))
     assert bench.loaded.unfit.factored is None and bench.loaded.unfit.reference is None
+
+
+BALL = """<shape type="sphere"><float name="radius" value="5"/><point name="center" x="0" y="0" z="300"/>
+    <bsdf type="{}"/></shape>"""
+BULB = '<emitter type="point"><point name="position" x="0" y="200" z="0"/></emitter>'
+
+
+def test_light_that_mirrors_bring_is_told_as_lost(small_scene: Write) -> None:
+    """The reference loses the pinhole's, the factored estimator that of small lamps; with file and line, exit 1."""
+    path = small_scene(extra=BALL.format("dielectric"))
+    unfit = open_bench(path).loaded.unfit
+    lines = path.read_text().splitlines()
+    line = next(number for number, text in enumerate(lines, 1) if "sphere" in text)
+    said = open_bench(path).render("reference", spp=4).warnings
+    assert unfit.caustics is not None and said == (unfit.caustics,) and unfit.lamps is None
+    assert f"small.xml:{line} (dielectric)" in said[0] and "'projector'" in said[0] and f"{path}:" in said[0]
+    lit = small_scene("lit", extra=BALL.format("conductor") + BULB)
+    lamps = open_bench(lit).loaded.unfit.lamps
+    assert lamps is not None and "'point'" in lamps and "(conductor)" in lamps
+    plain = open_bench(small_scene("plain", extra=BALL.format("diffuse") + BULB))
+    assert plain.loaded.unfit.caustics is None and plain.loaded.unfit.lamps is None
+    assert not plain.render("reference", spp=4).warnings
+
+
+def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
+    """It is no pane and casts no glint there, and an instance does not show its materials."""
+    group = '<shape type="shapegroup" id="group">{}</shape>'
+    placed = (
+        '<shape type="instance"><ref id="group"/><transform name="to_world"><translate z="20"/></transform></shape>'
+    )
+    path = small_scene(extra=group.format(BALL.format("dielectric")) + placed)
+    loaded = open_bench(path).loaded
+    assert loaded.mirrors and loaded.unfit.instances is not None and "'dielectric'" in loaded.unfit.instances
+    said = list(known_losses(loaded, {}))
+    assert said == [loaded.unfit.instances] and not list(known_losses(loaded, {"mirrors": False}))
+    matt = open_bench(small_scene("matt", extra=group.format(BALL.format("diffuse")) + placed)).loaded
+    assert matt.unfit.instances is None and not matt.mirrors and matt.glossy

@@ -1,0 +1,87 @@
+"""Flux on the sensor as a whole over lobes of any roughness, against quadrature and against plain connections.
+
+Gates on means of eight seeds are seven standard errors (t distribution of 7 degrees of freedom: 2e-4), plus what is
+stated; each test says how narrow they are.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import Settings
+from mitsim.capture.truth import trace_truth
+from mitsim.transport.flux import FluxTracer
+from tests.hard.test_hard_transport import gauss, glossy, lobe
+
+N, SEEDS, SEVEN, HALF_SENSOR = 16, 8, 7.0, 3.2
+HOLE = """<shape type="rectangle"><transform name="to_world"><scale x="80" y="80"/><rotate y="1" angle="180"/>
+    <translate x="30" z="250"/></transform><bsdf type="mask"><float name="opacity" value="{}"/>
+    <bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf></bsdf></shape>"""
+
+
+@pytest.fixture
+def bench(small_scene: Callable[..., Path], variant: str) -> Callable[..., Bench]:
+    """A plate of some roughness alone before a sensor of 6.4 mm, behind a black card of some opacity."""
+
+    def load(alpha: float, opacity: float | None = None) -> Bench:
+        parts = glossy(alpha, sheet=False)
+        extra = parts.pop("extra") + ("" if opacity is None else HOLE.format(opacity))
+        return open_bench(
+            small_scene("flux", n=N, mask="open", pitch=0.1, extra=extra, **parts), variant, for_render=True
+        )
+
+    return load
+
+
+LIT = (N * np.arange(6, 10)[:, None] + np.array([2, 3, 4, 5, 10, 11, 12, 13])).ravel()
+"""Pixels about those that the plate mirrors into the sensor; beyond them lies 1e-3 of a GGX lobe of 1e-3."""
+
+
+def flux(bench: Bench, glossy: bool, samples: int, pixels: np.ndarray | None = None) -> tuple[float, float]:
+    loaded = bench.loaded
+    tracer = FluxTracer(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, glossy)
+    tracer = tracer if pixels is None else tracer.at(pixels)
+    sums = [float(tracer.trace(seed, 0, samples).value.sum()) / samples for seed in range(SEEDS)]
+    return float(np.mean(sums)), float(np.std(sums, ddof=1) / np.sqrt(SEEDS))
+
+
+def over_the_sensor(alpha: float) -> float:
+    """Mean irradiance over the sensor, by quadrature."""
+    node, weight = gauss(-HALF_SENSOR, HALF_SENSOR, 6)
+    weight = weight / weight.sum()
+    return float(weight @ np.array([[lobe(alpha, row, column) for column in node] for row in node]) @ weight)
+
+
+@pytest.mark.parametrize("alpha", [3e-2, 1e-3, 1e-4])
+def test_flux_over_lobes_is_that_of_quadrature(bench: Callable[..., Bench], alpha: float) -> None:
+    """Connections alone are off by more than the gate, or noisier (seen failing without sampled turns)."""
+    found, error = flux(bench(alpha), True, 512) if alpha > 1e-3 else flux(bench(alpha), True, 2**14, LIT)
+    gate, expected = SEVEN * error + 1e-3 * found, over_the_sensor(alpha)
+    assert gate < 0.04 * expected
+    assert abs(found - expected) < gate, f"{found / expected - 1:+.2%}, gate {gate / expected:.2%}"
+
+
+def test_flux_behind_a_hole_is_dimmed_once_each_way(bench: Callable[..., Bench]) -> None:
+    found, error = flux(bench(1e-3, 0.5), True, 2**14, LIT)
+    gate, expected = SEVEN * error + 1e-3 * found, 0.25 * over_the_sensor(1e-3)
+    assert gate < 0.04 * expected and abs(found - expected) < gate
+
+
+def test_broad_lobes_have_the_flux_of_connections(bench: Callable[..., Bench]) -> None:
+    one, other = (flux(bench(0.2), glossy, 256) for glossy in (True, False))
+    gate = SEVEN * np.hypot(one[1], other[1])
+    assert gate < 0.01 * other[0] and abs(one[0] - other[0]) < gate
+
+
+def test_truth_over_a_sharp_lobe_is_exact_to_its_standard_error(bench: Callable[..., Bench]) -> None:
+    """All pixels together; their errors are independent."""
+    plate = bench(1e-3)
+    first = trace_truth(plate, Settings(400.0), 9, np.full(N * N, np.inf))
+    truth = trace_truth(plate, Settings(400.0), 0, 0.05 * first.board_flux)
+    found = float((truth.reflectance.ravel() * truth.board_flux).sum())
+    error = float(np.linalg.norm(truth.standard_error.ravel() * truth.board_flux))
+    assert 0 < SEVEN * error < 0.05 * found
+    assert abs(found - over_the_sensor(1e-3)) < SEVEN * error + 1e-3 * found
