@@ -49,8 +49,8 @@ class Choice:
         effects, numbers, and samples.
     systematic
         error that all that is left out or made coarse adds up to.
-    unsigned
-        by what leaves it, the part of that whose sign nobody knows, and which is added as it is.
+    lacking
+        light that is known to be missing, by where it is; it is added as it is.
     target, noise
         Monte Carlo error at which sampling may stop, and which the samples are predicted to leave.
     fits
@@ -61,7 +61,7 @@ class Choice:
 
     settings: Settings
     systematic: Estimate
-    unsigned: Mapping[str, float]
+    lacking: Mapping[str, float]
     target: float
     noise: float
     fits: bool
@@ -218,17 +218,14 @@ class _Table:
             "light over sharp lobes": self.evidence.unresolved,
             "light over mirrors or curved glass both ways (left out)": self.evidence.left_out,
         }
-        missing, centre = min(sum(lacking.values()), 1.0), np.add(*self._from_one_point(SURE))
+        missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.
         rest = (float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE))
         value, bound = (missing + (1 - missing) * error for error in rest)
         return Choice(
             settings=settings,
             systematic=Estimate(value, bound),
-            unsigned={
-                **lacking,
-                "one anchor for ambient light": float(centre[index]),
-            },
+            lacking=lacking,
             target=float(self.target[index]),
             noise=float(self.noise[index]),
             fits=bool(self.fits[index]),
@@ -248,8 +245,7 @@ class _Table:
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
         squared, spread = changes.squared(chosen)
-        beside, along = self._from_one_point(sure)
-        return np.asarray(np.sqrt(np.maximum(squared, 0) + sure * spread + sum(drawn) + beside**2) + along)
+        return np.asarray(np.sqrt(np.maximum(squared, 0) + sure * spread + sum(drawn)))
 
     def _weight(self, part: Part) -> FloatArray:
         """(m,) how much of a part's change each row leaves."""
@@ -271,23 +267,6 @@ class _Table:
         for count, error in ladder.items():
             parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
         return np.where(self._all_layers > 0, parts[self.layers.astype(int)], 1.0)
-
-    def _from_one_point(self, sure: float) -> tuple[FloatArray, FloatArray]:
-        """(m,) errors of ambient light, seen from one point of the sensor: as one anchor leaves of direct light.
-
-        The first where direct light has several anchors: it varies over the sensor, unlike what cells and layers leave,
-        and is independent of that. The second where it has one, whose error has the same shape and adds up.
-        """
-        evidence = self.evidence
-
-        def size(error: Estimate) -> float:
-            return error.bound if sure else error.value
-
-        seen = self.effects & names(lambda effect: effect.from_one_point)
-        share = sum(size(error) for name, error in evidence.effects.items() if name in seen)
-        error = min(share, 1.0) * size(evidence.ladders["anchors"][1]) / (evidence.direct_part or 1.0)
-        several = self.anchors > 1
-        return error * several, error * ~several
 
     # ---- samples and work
 

@@ -108,8 +108,6 @@ class Effect:
         whether it shapes direct light so much that the pilot has it on while it looks for anchors, layers and cells.
     followed
         whether its light is followed over several surfaces or from the camera, which takes time.
-    from_one_point
-        whether one point of the sensor sees its light for all.
     in_shadow
         whether it costs time in the mask's shadow.
     in_frames
@@ -128,7 +126,6 @@ class Effect:
     kind: Literal["indirect", "ambient"] | None = None
     first_look: bool = False
     followed: bool = False
-    from_one_point: bool = False
     in_shadow: bool = False
     in_frames: bool = True
     in_reference: bool = False
@@ -214,7 +211,6 @@ EFFECTS: Mapping[str, Effect] = _registry(
         note=lambda bench: f"{len(bench.loaded.lamps)} emitter(s) beside the projector",
         kind="ambient",
         followed=True,
-        from_one_point=True,
         in_reference=True,
     ),
     Effect("diffraction", {"spectrum": None}, note=_diffraction, first_look=True, in_shadow=True),

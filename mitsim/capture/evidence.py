@@ -254,8 +254,6 @@ class Evidence:
     changes
         of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
         cells that was tried, and by one coarse cell a pixel, or one layer, for light of each of ``COARSE``.
-    direct_part
-        direct light in all light.
     direct, anchored, indirect, from_camera
         what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
         and what is followed from the camera.
@@ -278,7 +276,6 @@ class Evidence:
     depth: float
     layers: Mapping[int, tuple[float, ...]]
     changes: Changes
-    direct_part: float
     direct: Effort
     anchored: Effort
     indirect: Effort

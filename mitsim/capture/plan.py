@@ -299,7 +299,7 @@ class _Words:
             f"layers ({layers})": self._number("layers", layers).bound,
             f"cells ({cells}x{cells})": self._number("cells", cells).bound,
             f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
-            **self.chosen.unsigned,
+            **self.chosen.lacking,
             **{f"{name} (off)": e.bound for name, e in evidence.effects.items() if name not in settings.effects},
         }
 
@@ -351,12 +351,14 @@ class _Words:
             self._number("followed_anchors", 1),
         )
         if not any(effect.followed and effect.name in self.chosen.settings.effects for effect in EFFECTS.values()):
-            return PlanRow(name, "off", "no light over several surfaces or in mirrors is followed", 0.0, 0.0)
+            return PlanRow(name, "off", "no light over several surfaces, in mirrors or of lamps is followed", 0.0, 0.0)
         if anchors == 1:
-            reason = f"light over several surfaces and in mirrors is seen from the centre, which leaves {_said(one)}"
+            reason = f"light over several surfaces, in mirrors and of lamps: one point leaves {_said(one)}"
             return PlanRow(name, "off", reason, one.value, 0.0)
         left = _said(self._number("followed_anchors", anchors))
-        reason = f"light over several surfaces and in mirrors: {anchors}x{anchors} leave {left}, one {_said(one)}"
+        reason = (
+            f"light over several surfaces, in mirrors and of lamps: {anchors}x{anchors} leave {left}, one {_said(one)}"
+        )
         return PlanRow(name, "approximate", reason, one.value, self._seconds(followed_anchors=1))
 
     def _effect(self, effect: Effect) -> PlanRow:

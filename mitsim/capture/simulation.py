@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
-import mitsuba as mi
 import numpy as np
 from scipy import sparse
 
@@ -144,7 +143,8 @@ class Simulation:
     physics
         what is simulated of the bench.
     fine, coarse, smooth, followed, sharp
-        trays for the parts of an :class:`FiledLight`; ``ambient`` for lamps' light in the cells of ``fine``.
+        trays for the parts of an :class:`FiledLight`; ``ambient`` and ``followed_ambient`` for lamps' light in the
+        cells of ``fine`` and of ``followed``.
     """
 
     def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None) -> None:
@@ -159,9 +159,11 @@ class Simulation:
         self.fine = self._tray(fine)
         self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
         self.smooth = self._tray(Bundle(coarse, 1, depths))
-        self.followed = self._tray(Bundle(coarse, settings.followed_anchors, depths))
+        several = Bundle(coarse, settings.followed_anchors, depths)
+        self.followed = self._tray(several)
         self.sharp = self._tray(self._apart(pixels))
-        self.ambient = self._tray(fine, _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
+        lamps = _bands(*_AMBIENT_NM, _AMBIENT_BANDS)
+        self.ambient, self.followed_ambient = self._tray(fine, lamps), self._tray(several, lamps)
 
     def _tray(self, bundle: Bundle, light: Spectrum | None = None) -> Tray:
         """``light`` None: the projector's. All light diffracts or none."""
@@ -233,13 +235,13 @@ class Simulation:
     @cached_property
     def from_camera(self) -> FromCameraTracer | None:
         """Follows all other light, from the same points; none where there is none."""
-        return self._from_camera(self._mean_points, self.physics.lamps)
+        return self._from_camera(self._mean_points)
 
     @property
     def at_anchors(self) -> tuple[IndirectTracer | None, FromCameraTracer | None]:
-        """Both, to every anchor of followed light, but for ambient light."""
+        """Both, to every anchor of followed light."""
         points = self._points(self.settings.followed_anchors)
-        return self._indirect(points), self._from_camera(points, ())
+        return self._indirect(points), self._from_camera(points)
 
     @property
     def _mean_points(self) -> SensorPoints:
@@ -255,12 +257,13 @@ class Simulation:
             return None
         return IndirectTracer(loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points)
 
-    def _from_camera(self, points: SensorPoints, lamps: tuple[mi.Emitter, ...]) -> FromCameraTracer | None:
+    def _from_camera(self, points: SensorPoints) -> FromCameraTracer | None:
         loaded, physics = self.bench.loaded, self.physics
-        if not (lamps or physics.mirrors or (physics.interreflection and loaded.glossy)):
+        if not (physics.lamps or physics.mirrors or (physics.interreflection and loaded.glossy)):
             return None
-        paths, parts = Paths(physics.mirrors, physics.interreflection, lamps), (loaded.scene, loaded.camera)
-        return FromCameraTracer(*parts, physics.projector, self.aim, paths, physics.geometry, points)
+        paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
+        parts = loaded.scene, loaded.camera, physics.projector
+        return FromCameraTracer(*parts, self.aim, paths, physics.geometry, points)
 
     def follow(self, seed: int, samples: int) -> Deposits:
         """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``, to be filed."""
@@ -421,6 +424,9 @@ class Simulation:
             lights.append(Filed(self.smooth.optics, tuple(_rows(group.smooth, 0, first) for group in groups)))
         if self.physics.lamps:
             ambient.append(Filed(self.ambient.optics, tuple(_rows(group.fine, first, first + 1) for group in groups)))
+            if self.settings.followed_anchors > 1:
+                beyond = tuple(_rows(group.followed, first, first + 1) for group in groups)
+                ambient.append(Filed(self.followed_ambient.optics, beyond))
         glint = self.glint_frames(lighting.labels)
         return ExpectedFrames(lights, Lighting(rows, emitted), seed, ambient, glint)
 

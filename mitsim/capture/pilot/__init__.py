@@ -154,7 +154,6 @@ class Look:
             depth=self._base.depth,
             layers=fine.layers,
             changes=Changes.between(seen, light**2),
-            direct_part=anchored.light / light if light else 0.0,
             direct=fine.effort(light),
             anchored=anchored.effort(light),
             indirect=switched.effort("indirect"),

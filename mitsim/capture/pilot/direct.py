@@ -13,7 +13,7 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Effort, Forming, Noise, Part, Settings
-from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, coarsened, ladder, noise, norm
+from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, coarsened, ladder, noise
 from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
@@ -187,8 +187,6 @@ class AnchoredLight:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self.layers = layers
         self._seeds = [integer(seed, "pilot", "anchors", look) for look in range(LOOKS)]
-        self.light = norm(self._frames(1))
-        """Norm of frames of direct light."""
 
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:

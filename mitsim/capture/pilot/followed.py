@@ -1,4 +1,4 @@
-"""Light over several surfaces and in mirrors, seen from one point of the sensor or several: what one changes."""
+"""Light over several surfaces, in mirrors and of lamps, from one point of the sensor or several: what one changes."""
 
 from __future__ import annotations
 
@@ -76,13 +76,15 @@ class FollowedLight:
         return Simulation(self.bench, replace(self.everything, followed_anchors=anchors))
 
     def _traced(self, simulation: Simulation) -> list[Deposits]:
-        """Light of the projector to every anchor, look by look."""
+        """Light to every anchor, look by look."""
         tracers = [tracer for tracer in simulation.at_anchors if tracer is not None]
         samples = self.sample.followed
         return [Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers]) for seed in self._seeds]
 
     def _formed(self, simulation: Simulation, lights: list[sparse.csr_array]) -> FloatArray:
         """(looks, shots, pixels, columns) frames of light to every anchor."""
-        rows = self.sample.rows
+        rows, lighting = self.sample.rows, Lighting(self.sample.rows, self.sample.lighting.weights)
         filed = Filed(simulation.followed.optics, tuple(light[: len(rows)] for light in lights))
-        return ExpectedFrames([filed], Lighting(rows, self.sample.lighting.weights), 0).by_group(self.sample.columns)
+        lamps = Filed(simulation.followed_ambient.optics, tuple(light[len(rows) :] for light in lights))
+        ambient = [lamps] if simulation.physics.lamps else []
+        return ExpectedFrames([filed], lighting, 0, ambient).by_group(self.sample.columns)

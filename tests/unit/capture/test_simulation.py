@@ -168,7 +168,7 @@ def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> No
     stages = made.tracers()
     assert set(stages) == {"direct", "indirect", "from_camera", *AT_ANCHORS}
     labels = np.zeros(N * N, dtype=np.int64)
-    assert not any((stages[name].tracer.trace(1, 0, 16).kind == AMBIENT).any() for name in AT_ANCHORS)
+    assert (stages[AT_ANCHORS[1]].tracer.trace(1, 0, 16).kind == AMBIENT).any()
     rng = np.random.default_rng(1)
     number, place = rng.integers(0, 2, (3, 200)), rng.uniform(-0.14, 0.14, (2, 200))
     found = Deposits(0 * number[0], *number[:2], *place, np.full(200, 1 / Z), rng.random(200), 1 + number[2])
