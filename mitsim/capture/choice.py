@@ -25,9 +25,6 @@ from mitsim.core.arrays import FloatArray
 _MARGIN = 0.92
 """Part of the accuracy that is planned for: sampling knows its own error to a few percent, and the frames that the
 pilot looks at differ from the family's by as much."""
-_LEAST_SAMPLING = 0.7
-"""Part of the accuracy that sampling aims for where nothing fits; or half of what is left out or coarse, if that is
-more: it then adds an eighth to the total."""
 _AS_GOOD = 1.1
 """Where nothing fits, settings whose error is larger than the least by this count as good as it."""
 _COARSE_CELLS = (1, 2, 4, 8)
@@ -279,8 +276,7 @@ class _Table:
     def target(self) -> FloatArray:
         """(m,) Monte Carlo error at which sampling may stop."""
         left = np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
-        otherwise = np.maximum(_LEAST_SAMPLING * self.accuracy, self._avoidable / 2)
-        return np.where(self.fits, np.sqrt(np.maximum(left, 0)), otherwise)
+        return np.where(self.fits, np.sqrt(np.maximum(left, 0)), _MARGIN * self.accuracy)
 
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:
