@@ -295,16 +295,7 @@ def reconstruct(
         f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
         f"residual {payload['residual']:.1e}: {payload['output']}"
     )
-    misfit, uncertainty = payload["misfit"], payload["uncertainty"]
-    if misfit:
-        noise = "" if misfit["noise_stated"] else " of shot noise alone, as no other was stated"
-        lines.append(
-            f"misfit: chi-square {misfit['chi_square']:.3g} a datum{noise}, {misfit['unexplained']:.1e} unexplained"
-        )
-    if uncertainty is not None:
-        budget = sorted(payload["uncertainty_budget"].items(), key=lambda source: -source[1])
-        largest = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for name, value in budget[:3])
-        lines.append(f"standard uncertainty {uncertainty:.1e} rms; largest: {largest}")
+    lines += result.reconstruction.trust
     return finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
 
 

@@ -75,6 +75,11 @@ class Misfit:
     cause: Cause | None
     signatures: Signatures | None
 
+    def __str__(self) -> str:
+        noise = "" if self.stated else " of shot noise alone, as no other was stated"
+        cause = f"; likely cause: {self.cause.value[0]}" if self.cause else ""
+        return f"misfit: chi-square {self.chi_square:.3g} a datum{noise}, {self.unexplained:.1e} unexplained{cause}"
+
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
         return {

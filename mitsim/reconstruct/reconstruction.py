@@ -18,7 +18,7 @@ from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.measurement import Measurement
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.pictures import card, png
+from mitsim.core.pictures import card, png, scaled, span
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
@@ -101,6 +101,11 @@ class Reconstruction:
         """(n, n') standard uncertainty of the image, random and systematic parts together."""
         return self.uncertainties.total if self.uncertainties else None
 
+    @property
+    def trust(self) -> tuple[str, ...]:
+        """A line on the misfit, and one on the uncertainty by source, where these are known."""
+        return tuple(str(known) for known in (self.misfit, self.uncertainties) if known)
+
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
         return {
@@ -158,7 +163,10 @@ class Reconstruction:
     def _repr_html_(self) -> str:
         facts = f"lambda {self.lam:.3g}, residual {self.residual:.1e} of the frames"
         pictures = {"reflectance 0 to 1": self.image}
-        return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), facts))
+        if self.uncertainty is not None:
+            caption = f"standard uncertainty of each pixel\n{span(self.uncertainty, 'of reflectance')}"
+            pictures[caption] = scaled(self.uncertainty)
+        return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), *self.trust, facts))
 
 
 @single_threaded_blas()

@@ -96,6 +96,11 @@ class Uncertainty:
         """Root mean square over the image by source."""
         return {name: _rms(values) for name, values in self.sources.items()}
 
+    def __str__(self) -> str:
+        parts = sorted(((value, name) for name, value in self.budget.items() if value), reverse=True)
+        by_source = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for value, name in parts)
+        return f"standard uncertainty {_rms(self.total):.1e} rms: {by_source or 'no noise is stated'}"
+
     def channels(self) -> dict[str, Channel]:
         """(n, n') channels of uncertainty.exr."""
         parts = {"uncertainty": self.total, "random": self.random, "systematic": self.systematic}
