@@ -19,12 +19,24 @@ import numpy.typing as npt
 
 from mitsim.capture.effects import EFFECTS, names
 from mitsim.capture.evidence import COUNTED, EVEN, GROUPS, SURE, Estimate, Evidence, Part, Settings, even
-from mitsim.capture.prices import FIXED, MIXING, Numbers, checking_seconds, connections, efforts, optics_seconds, priced
+from mitsim.capture.prices import (
+    FIXED,
+    MIXING,
+    Numbers,
+    checking_seconds,
+    connections,
+    efforts,
+    entries,
+    optics_seconds,
+    priced,
+)
 from mitsim.core.arrays import FloatArray
 
 _MARGIN = 0.92
 """Part of the accuracy that is planned for: sampling knows its own error to a few percent, and the frames that the
 pilot looks at differ from the family's by as much."""
+_MOST_ENTRIES = 2.0**25
+"""Entries of one group's filed light beyond which settings are not chosen: 12 GB in all (`mitsim.capture.cost`)."""
 _AS_GOOD = 1.1
 """Where nothing fits, settings whose error is larger than the least by this count as good as it."""
 _COARSE_CELLS = (1, 2, 4, 8)
@@ -191,7 +203,11 @@ class _Table:
     @cached_property
     def best(self) -> int:
         """The best row."""
-        chosen = self.fits if self.fits.any() else self._avoidable <= _AS_GOOD * self._avoidable.min()
+        if self.fits.any():
+            chosen = self.fits
+        else:
+            error = np.where(self._entries <= max(_MOST_ENTRIES, self._entries.min()), self._avoidable, math.inf)
+            chosen = error <= _AS_GOOD * error.min()
         return int(np.lexsort((self._avoidable, self.work, ~chosen))[0])
 
     def choice(self, index: int) -> Choice:
@@ -269,14 +285,14 @@ class _Table:
 
     @cached_property
     def fits(self) -> npt.NDArray[np.bool_]:
-        """(m,) whether anything is left for sampling."""
-        return self._avoidable < _MARGIN * self.accuracy
+        """(m,) whether anything is left for sampling, and the light can be held."""
+        return (self._avoidable < _MARGIN * self.accuracy) & (self._entries <= _MOST_ENTRIES)
 
     @cached_property
     def target(self) -> FloatArray:
         """(m,) Monte Carlo error at which sampling may stop."""
         left = np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
-        return np.where(self.fits, np.sqrt(np.maximum(left, 0)), _MARGIN * self.accuracy)
+        return np.where(left > 0, np.sqrt(np.maximum(left, 0)), _MARGIN * self.accuracy)
 
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:
@@ -313,12 +329,22 @@ class _Table:
         return np.sqrt(total)
 
     @cached_property
+    def _entries(self) -> FloatArray:
+        """(m,) of one group's filed light."""
+        evidence, samples = self.evidence, {**self.samples}
+        for name in ("indirect", "followed"):
+            samples.setdefault(name, np.ones(len(self.rows)))
+        found = entries(evidence.direct.paths, evidence.forming.classes, self.numbers, samples)
+        return np.asarray(found) + np.zeros(len(self.rows))
+
+    @cached_property
     def work(self) -> FloatArray:
         """(m,) seconds at fixed paces."""
         tracing = sum(self.samples[name] * price for name, price in self._prices.items())
         forming = self.evidence.forming
+        filing = FIXED.filed * GROUPS * self._entries
         shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
-        return np.asarray(tracing + shown)
+        return np.asarray(tracing + filing + shown)
 
 
 def counted(settings: Settings) -> tuple[int, int, int, int]:

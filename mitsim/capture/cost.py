@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE
+from mitsim.capture.prices import Numbers, entries
 from mitsim.core.resources import Cost
 from mitsim.optics.frames import frames_in_memory
 from mitsim.rig.patterns import Lighting
@@ -17,9 +17,6 @@ _ENTRY_BYTES = 45.0
 45 where matrices are large."""
 _DEPOSIT_BYTES = 500.0
 """A path's light while it is filed; measured."""
-_SPLIT, _EDGES = 2, 2
-"""Layers, at most, that share the light of one depth; and how many times the cells of a pixel its light lies in, at
-most, where it lies across an edge or at another depth than the cells are aligned at (measured: 1.6)."""
 _EXPOSING_S, _WRITING_S = 4e-8, 2e-8
 """A pixel; measured on two cores."""
 _BYTES_PER_PIXEL = 8
@@ -57,11 +54,14 @@ def frames_cost(
     pixels = rows**2
     files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
     truth = float(_BYTES_PER_PIXEL * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES)
-    entries, paths = _entries(bench.n**2, classes, settings), min(LANES_AT_ONCE, _paths(bench.n**2, settings))
+    filed, paths = (
+        float(entries(bench.n**2, classes, Numbers.of(settings), settings)),
+        min(LANES_AT_ONCE, _paths(bench.n**2, settings)),
+    )
     held = frames_in_memory(classes, shots) + 4 * FRAMES_AT_ONCE
     return Cost(
         seconds=seconds,
-        memory_bytes=_LANES_BYTES + 8.0 * held * pixels + GROUPS * entries * _ENTRY_BYTES + paths * _DEPOSIT_BYTES,
+        memory_bytes=_LANES_BYTES + 8.0 * held * pixels + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES,
         disk_bytes=max(files + truth - on_disk, 0.0),
     )
 
@@ -71,21 +71,3 @@ def _paths(pixels: int, settings: Settings) -> float:
     anchored = settings.anchors**2 * settings.anchored_samples * (settings.anchors > 1)
     followed = settings.followed_anchors**2 * settings.followed_samples * (settings.followed_anchors > 1)
     return pixels * max(settings.direct_samples, anchored, followed, settings.indirect_samples)
-
-
-def _entries(pixels: int, classes: int, settings: Settings) -> float:
-    """Entries of one group's light, at most: a pixel's direct light lies in its own cells, followed light in all."""
-    layers = len(settings.depths)
-    coarse, coarse_layers = settings.coarse_cells**2, layers if settings.coarse_layers else 1
-    fine = min(settings.direct_samples, _EDGES * settings.subdivision**2) * min(layers, _SPLIT)
-    if settings.anchors > 1:
-        seen = min(_EDGES * settings.anchored_samples, _EDGES * coarse) * min(coarse_layers, _SPLIT)
-        fine += _EDGES * settings.anchors**2 * seen
-    if not settings.effects & names(lambda effect: effect.followed):
-        return pixels * fine
-    # Pixels of the projector, not of all cells: light from beyond its window is a small part.
-    places = classes * coarse * coarse_layers
-    followed = min(_SPLIT * settings.indirect_samples, places)
-    if settings.followed_anchors > 1:
-        followed += _EDGES * settings.followed_anchors**2 * min(_SPLIT * settings.followed_samples, places)
-    return pixels * (fine + followed)

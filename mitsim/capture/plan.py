@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.capture.choice import Choice, cheapest, predicted
 from mitsim.capture.effects import EFFECTS, Effect
-from mitsim.capture.evidence import Estimate, Evidence, Settings
+from mitsim.capture.evidence import GROUPS, Estimate, Evidence, Settings
 from mitsim.capture.prices import (
     Numbers,
     Paces,
     checking_seconds,
+    entries,
     optics_seconds,
     paces_of,
     priced,
@@ -247,8 +248,11 @@ def _stages(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, f
     """Seconds of transport, truth and optics."""
     forming, numbers = evidence.forming, Numbers.of(settings)
     tracing = tracing_seconds(evidence, settings, paces)
+    filed = GROUPS * entries(evidence.direct.paths, forming.classes, numbers, settings)
     return {
-        "transport": sum(tracing.values()) + float(checking_seconds(forming, numbers, paces)),
+        "transport": sum(tracing.values())
+        + paces.filed * float(filed)
+        + float(checking_seconds(forming, numbers, paces)),
         "truth": truth_seconds(evidence, settings, paces),
         "optics": float(optics_seconds(forming, numbers, paces)),
     }

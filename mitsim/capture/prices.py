@@ -7,6 +7,7 @@ the same settings. What the pilot measured only scales the prediction that peopl
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import cast
 
@@ -20,6 +21,9 @@ ROUNDS, CHECKED_SHOTS = 1.5, 8
 """Rounds that sampling takes, most often one or two, and shots that are formed in each to see the error."""
 MIXING = "black-level"
 """Effect that lights every pixel in every shot, so that shots are no longer single classes."""
+_SPLIT, _EDGES = 2.0, 2.0
+"""Layers, at most, that share the light of one depth; and how many times the cells of a pixel its light lies in, at
+most, where it lies across an edge or at another depth than the cells are aligned at (measured: 1.6)."""
 _GEOMETRIC_ENTRIES = 0.03
 """An entry of a geometric shadow over one of a wave-optical one: a sum over features against samples of a field."""
 
@@ -37,7 +41,7 @@ two cores. The standard error tells how good it is then."""
 @dataclass(frozen=True)
 class Paces:
     """Seconds of a path or connection of each kind, of a frame and of a multiplication in forming it, of an entry of a
-    wave-optical shadow, and of a ray of the truth."""
+    wave-optical shadow and of one of filed light, and of a ray of the truth."""
 
     direct: float
     anchored: float
@@ -48,6 +52,7 @@ class Paces:
     frame: float
     product: float
     entry: float
+    filed: float
     ray: float
 
 
@@ -61,6 +66,7 @@ FIXED = Paces(
     frame=2e-3,
     product=6e-11,
     entry=1e-7,
+    filed=3e-8,
     ray=1e-7,
 )
 """Chosen near what was measured of the photograph and the cookie bag on two cores; only their ratios decide."""
@@ -117,6 +123,7 @@ def paces_of(evidence: Evidence) -> Paces:
         frame=float(slower * FIXED.frame),
         product=float(slower * FIXED.product),
         entry=float(slower * FIXED.entry),
+        filed=float(slower * FIXED.filed),
         ray=evidence.direct.seconds * FIXED.ray / FIXED.direct or FIXED.ray,
     )
 
@@ -265,6 +272,36 @@ def predicted_rays(pixels: int, samples: float, rate: float) -> float:
     first = GROUPS * pixels * (TRUTH_SAMPLES + BOARD_SAMPLES)
     wanted = GROUPS * pixels * samples * float(TRUTH_PART ** (-1 / rate))
     return min(first + wanted, max(MOST_RAYS, MOST_SAMPLES * pixels))
+
+
+def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Mapping[str, Number]) -> Number:
+    """Entries of one group's filed light, at most: a pixel's direct light lies in its own cells, indirect light in all.
+
+    Parameters
+    ----------
+    pixels, classes
+        of the projector, and of the family.
+    numbers, samples
+        of the settings; samples by kind of light, or as settings have them.
+    """
+
+    def of(name: str) -> Number:
+        return cast(Number, getattr(samples, f"{name}_samples") if isinstance(samples, Settings) else samples[name])
+
+    coarse, layers = np.square(numbers.coarse_cells), np.minimum(numbers.coarse_layers, _SPLIT)
+    several, followed = (np.asarray(count) > 1 for count in (numbers.anchors, numbers.followed_anchors))
+    found = np.minimum(of("direct"), _EDGES * np.square(numbers.cells)) * np.minimum(numbers.layers, _SPLIT)
+    if np.any(several):
+        seen = _EDGES * np.minimum(of("anchored"), coarse) * layers
+        found = found + several * _EDGES * np.square(numbers.anchors) * seen
+    # Pixels of the projector, not of all cells: light from beyond its window is a small part.
+    places = classes * coarse * numbers.coarse_layers
+    if np.any(numbers.indirect):
+        found = found + numbers.indirect * np.minimum(_SPLIT * of("indirect"), places)
+    if np.any(followed):
+        seen = np.minimum(_SPLIT * of("followed"), places)
+        found = found + followed * _EDGES * np.square(numbers.followed_anchors) * seen
+    return cast(Number, pixels * found)
 
 
 def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float:

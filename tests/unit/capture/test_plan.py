@@ -11,7 +11,7 @@ from mitsim.capture.choice import cheapest, doubt, parts_of, predicted
 from mitsim.capture.effects import EFFECTS, SWITCHES, parse_switches
 from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Estimate, Evidence, Forming, Noise, Part, even
 from mitsim.capture.plan import Plan, PlanRow, SceneFacts, check_accuracy, decide
-from mitsim.capture.prices import FIXED
+from mitsim.capture.prices import FIXED, Numbers, entries
 from mitsim.core.errors import MitsimError
 
 FACTS = SceneFacts(notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
@@ -52,6 +52,8 @@ EVIDENCE = Evidence(
     forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49, seconds=2e-3),
     apart=APART,
 )
+ONE_CLASS = replace(EVIDENCE, forming=replace(EVIDENCE.forming, shots=1, classes=1))
+"""The same under one pattern, whose light takes no memory."""
 PRICED = {"interreflection", "ambient", "diffraction", "black-level"}
 ACCURACIES = [0.1, 1e-2, 3e-3, 1e-3, 3e-4]
 
@@ -311,8 +313,8 @@ def test_what_does_not_fit_is_flagged_with_the_largest_part() -> None:
     (warning,) = found.warnings
     assert "largest: diffraction (off), 3.0e-01" in warning
     assert found.systematic_error == pytest.approx(0.3, rel=0.01) and "0.001" in warning
-    (warning,) = plan(1e-6).warnings
-    assert "largest: layers (4), 5.0e-05" in warning
+    (warning,) = plan(1e-6, ONE_CLASS).warnings
+    assert "largest: followed anchors (2x2), 9.0e-05" in warning, "more cannot be held"
 
 
 def test_what_nothing_can_make_up_for_does_not_make_the_rest_finer() -> None:
@@ -323,8 +325,17 @@ def test_what_nothing_can_make_up_for_does_not_make_the_rest_finer() -> None:
 
 
 def test_the_best_there_is_when_nothing_fits() -> None:
-    found = plan(1e-6)
+    found = plan(1e-6, ONE_CLASS)
     assert found.warnings and found.settings.subdivision == 8 and len(found.settings.depths) == 4
+
+
+@pytest.mark.parametrize("accuracy", [1e-3, 1e-4, 1e-6])
+def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
+    """Of 49 classes indirect light lies in all cells of each: 2^25 entries a group are 12 GB. (Planted: no limit.)"""
+    settings, pixels = cheapest(accuracy, EVIDENCE, {}).settings, EVIDENCE.direct.paths
+    assert entries(pixels, 49, Numbers.of(settings), settings) <= 2**25
+    finest = replace(settings, followed_anchors=3, coarse_cells=8, indirect_samples=1e5, followed_samples=1e5)
+    assert entries(pixels, 49, Numbers.of(finest), finest) > 2**28
 
 
 def test_warnings_of_the_devices_come_first() -> None:
