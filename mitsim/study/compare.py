@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,15 +14,18 @@ from mitsim.capture.exposer import Exposer, peak_irradiance
 from mitsim.capture.light import Light
 from mitsim.capture.request import Exposure
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.runs import Capture
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.rig.patterns import PatternFamily
 from mitsim.sensor.chain import Digital
 from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import Quality
 from mitsim.study.report import FamilyResult, Recovery
+from mitsim.study.trust import Trust
 
 CONVENTIONS = ("equal peak", "equal frame", "equal total")
 _SECOND_SHOWN = 0.4
@@ -44,27 +47,39 @@ class Comparison:
     light: Light
     factors: Factors
 
-    def family(self, name: str) -> FamilyResult:
-        """Both reconstructions of the family ``name`` at equal peak, and the PSNR [dB] of the rendered one under each
-        exposure convention. MitsimError when it does not fit the projector."""
+    def family(self, name: str, shots: Capture | None = None) -> FamilyResult:
+        """Both reconstructions of the family ``name`` at equal peak, the rendered one with how far to trust it, and its
+        PSNR [dB] under each exposure convention.
+
+        Parameters
+        ----------
+        name
+            of the family; MitsimError when it does not fit the projector.
+        shots
+            of it at equal peak, where they were taken already.
+        """
         bench, seed = self.light.bench, self.light.seed
         family = bench.family(name, seed)
         expected = self._merged.frames(family.lighting, seed)
         factors, sides = self.factors, (family.left, family.right)
         model = prepare(factors.left, factors.right, *sides, centre=factors.manifest.centre)
-        shots = family.shots
         times = dict(
-            zip(CONVENTIONS, (peak_time(bench, expected), self._uniform_s, self._uniform_s / len(shots)), strict=True)
+            zip(
+                CONVENTIONS,
+                (peak_time(bench, expected), self._uniform_s, self._uniform_s / len(family.shots)),
+                strict=True,
+            )
         )
-        rendered = {
-            time: self._recovery(self._exposer(time), family, expected, model) for time in dict.fromkeys(times.values())
-        }
+        rendered = {times[CONVENTIONS[0]]: self._trusted(shots or self.light.expose(name))}
+        for time in times.values():
+            if time not in rendered:
+                rendered[time] = self._recovery(self._exposer(time), family, expected, model)
         singular = np.sort(model.left.singular**2)[::-1]
-        examples = shots[0], shots[int(len(shots) * _SECOND_SHOWN)]
+        examples = family.shots[0], family.shots[int(len(family.shots) * _SECOND_SHOWN)]
         return FamilyResult(
             name=name,
             label=label(name),
-            shots=len(shots),
+            shots=len(family.shots),
             patterns=tuple(family.light(shot) for shot in dict.fromkeys(examples)),
             singular_values=singular / singular[0],
             idealised=self._idealised(family),
@@ -104,6 +119,14 @@ class Comparison:
         exposer = Exposer(camera.bench.rig, peak_time(camera.bench, expected), self.light.seed + 1)
         model = prepare(*camera.calibrated(flux), family.left, family.right, centre=camera.centre)
         return self._recovery(exposer, family, expected, model)
+
+    def _trusted(self, shots: Capture) -> Recovery:
+        """As a user's own frames are reconstructed."""
+        image = reconstruct(shots, self.factors)
+        quality = Quality.of(image.image, self.light.truth, self.light.apparent.error)
+        # What the capture and the calibration are flagged for is in the report's notes, once for all families.
+        status = replace(image.status, flags=())
+        return Recovery(image.image, quality, image.lam, str(status), Trust.of(image, self.light.truth))
 
     def _recovery(self, exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, model: Prepared) -> Recovery:
         (sums,) = accumulate(exposer, family, expected, [model])

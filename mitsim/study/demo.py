@@ -42,8 +42,8 @@ _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)--
 @dataclass(frozen=True)
 class DemoResult:
     """What `mitsim demo` reports: PSNR [dB] by family, rendered and idealised, at equal peak, and by exposure
-    convention; what the main family gains over uniform light, as a number and in words; the truth's standard error; and
-    where the page is."""
+    convention; what the main family gains over uniform light, as a number and in words; the truth's standard error; how
+    far to trust each family's image; and where the page is."""
 
     psnr: dict[str, float]
     psnr_ideal: dict[str, float]
@@ -52,6 +52,7 @@ class DemoResult:
     verdict: str
     mc_error: float
     truth_error: float
+    trust: dict[str, dict[str, Any]]
     seconds: dict[str, float]
     report: str
     warnings: tuple[str, ...]
@@ -121,7 +122,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
     comparison, families = Comparison(light, factors), {}
     with job.clock.stage("compare families"):
         for index, name in enumerate(names):
-            families[name] = comparison.family(name)
+            families[name] = comparison.family(name, shots if name == request.patterns else None)
             job.progress(label(name), (index + 1) / len(names))
     with job.clock.stage("views"):
         view = pinhole_view(bench, load_recipe().board_reflectance, request.seed)
@@ -139,6 +140,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
         verdict=page.verdict,
         mc_error=shots.manifest.mc_error or 0.0,
         truth_error=light.apparent.error,
+        trust={name: f.rendered.trust.summary() for name, f in families.items() if f.rendered and f.rendered.trust},
         seconds=job.clock.seconds(),
         report=str(report),
         warnings=evidence.warnings,
@@ -174,6 +176,7 @@ def _page(evidence: _Evidence) -> ReportData:
         truth=light.truth,
         scene=scene_line(bench.loaded.path),
         families=tuple(evidence.families.values()),
+        main=evidence.main,
         exposure=f"equal peak: each family's brightest pixel fills {100 * Exposure().fraction:.0f} % of the full well",
         calibration={**session, "status": f"{factors.status}{beyond}"},
         budget=(

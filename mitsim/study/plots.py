@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from mitsim.core.arrays import FloatArray
+
 if TYPE_CHECKING:
     from mitsim.study.solver_cost import SolverRow
 
@@ -34,6 +36,8 @@ _WIDTH, _FRAME_WIDTH = 8.6, 3.6
 """Inches: a page of text, and three frames side by side with room for their labels."""
 _SHORT_AXIS = 30.0
 """Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
+_SHOWN_PERCENT = 99.0
+"""Of the errors, those that the scale holds: a normal error's are then within 2.6 deviations."""
 _BEST = "best for its time"
 Point = tuple[float, float]
 """Wall seconds, relative error."""
@@ -50,6 +54,25 @@ def frame(values: npt.ArrayLike) -> Figure:
     axes.set_xlabel("sensor column [pixel]", fontsize=_FONT - 1)
     axes.set_ylabel("sensor row [pixel]", fontsize=_FONT - 1)
     axes.tick_params(labelsize=_FONT - 2)
+    return figure
+
+
+def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
+    """An image's standard ``uncertainty`` beside its actual ``error``, both (n, n') [reflectance], on one scale."""
+    figure, _ = _figure(0.46 * _WIDTH, layout="compressed")
+    figure.clear()
+    panels: Any = figure.subplots(1, 2, sharex=True, sharey=True)
+    largest = max(float(uncertainty.max()), float(np.percentile(error, _SHOWN_PERCENT)))
+    titled = {"stated: standard uncertainty": uncertainty, "actual: |image - truth|": error}
+    for axes, (title, values) in zip(panels, titled.items(), strict=True):
+        drawn = axes.imshow(values, vmin=0, vmax=largest, cmap="viridis", interpolation="none")
+        axes.set_title(f"{title}\nrms {np.sqrt(np.mean(np.square(values))):.1e}", fontsize=_FONT)
+        axes.set_xlabel("column [projector pixel]", fontsize=_FONT - 1)
+        axes.tick_params(labelsize=_FONT - 2)
+    panels[0].set_ylabel("row [projector pixel]", fontsize=_FONT - 1)
+    bar = figure.colorbar(drawn, ax=panels, extend="max")
+    bar.set_label("reflectance, 1 = board", fontsize=_FONT - 1)
+    bar.ax.tick_params(labelsize=_FONT - 2)
     return figure
 
 

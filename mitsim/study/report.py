@@ -24,6 +24,7 @@ from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri, grey_png, lightness
 from mitsim.study import plots
 from mitsim.study.metrics import Quality
+from mitsim.study.trust import Trust
 
 _DASH = "\N{EN DASH}"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -39,13 +40,14 @@ _WORTH_TELLING = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """One reconstruction: (n, n) reflectance, its quality, the lambda it took, and the solver's sentence (shown if it
-    says more than "Solved: ...")."""
+    """One reconstruction: (n, n) reflectance, its quality, the lambda it took, the solver's sentence (shown if it says
+    more than "Solved: ..."), and how far to trust it, where that is known."""
 
     image: FloatArray
     quality: Quality
     lam: float | None = None
     status: str = ""
+    trust: Trust | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +82,9 @@ class ReportData:
     """All that one report shows.
 
     ``truth`` (n, n) and ``render`` (any size) are reflectances, 1 = calibration board, as seen along +z, row 0 at the
-    top. The first of the ``families`` is the one that the tiles compare the best with. ``frames`` are (m, m) [DN] by
-    caption, ``exposure`` says which convention the reconstructions used, ``calibration`` is what `calibrate --json`
+    top. The first of the ``families`` is the one that the tiles compare the best with; of the one named ``main`` the
+    errors are shown as a picture. ``frames`` are (m, m) [DN] by caption, ``exposure`` says which convention the
+    reconstructions used, ``calibration`` is what `calibrate --json`
     says of the session, and its ``status``. ``accuracy`` and ``effects`` are the plan's.
     """
 
@@ -92,6 +95,7 @@ class ReportData:
     verdict_detail: str = ""
     render: FloatArray | None = None
     families: tuple[FamilyResult, ...] = ()
+    main: str = ""
     frames: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     exposure: str = ""
     calibration: Mapping[str, Any] | None = None
@@ -202,6 +206,9 @@ def _figures(report: ReportData) -> dict[str, Any]:
     }
     if both:
         figures["quality"] = _picture(plots.quality_bars(both))
+    trusted = next((f.rendered.trust for f in report.families if f.rendered and f.name == report.main), None)
+    if trusted:
+        figures["trust"] = _picture(plots.stated_and_actual(trusted.uncertainty, trusted.error))
     positive = {row.name: row.value for row in report.budget if row.value}
     if positive:
         figures["budget"] = _picture(plots.error_bars(positive, report.accuracy))

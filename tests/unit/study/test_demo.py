@@ -80,6 +80,14 @@ def test_the_scene_is_traced_once_and_a_speckled_projector_shows_in_every_family
     image = reconstruct(shots, load_calibration(tmp_path / "demo" / "calibration"))
     assert shots.truth is not None
     assert psnr(image.image, shots.truth) == pytest.approx(result.psnr["dots:2"], abs=1e-3)
+    assert result.trust.keys() == result.psnr.keys()
+    trust, error = result.trust["dots:2"], image.image - shots.truth
+    assert image.uncertainty is not None and image.misfit is not None
+    assert trust["rms_error"] == pytest.approx(10 ** (-result.psnr["dots:2"] / 20))
+    assert trust["uncertainty"] == pytest.approx(np.sqrt(np.mean(image.uncertainty**2)))
+    assert trust["within_95"] == np.mean(np.abs(error) <= 1.96 * image.uncertainty)
+    assert trust["chi_square"] == pytest.approx(image.misfit.chi_square)
+    assert bool(trust["cause"]) == image.misfit.flagged
     assert {"plan", "transport", "calibration sensor", "compare families", "report"} <= job.clock.seconds().keys()
     assert any("4 dots" in line for line in result.lines()) and result.report in result.lines()[-1]
 

@@ -46,6 +46,17 @@ def test_frame_shows_row_zero_at_the_top_with_its_own_range() -> None:
     assert figure.axes[1].get_ylabel() == "signal [DN]"
 
 
+def test_stated_and_actual_errors_share_one_scale() -> None:
+    """(Planted: each panel with a range of its own.)"""
+    error = np.linspace(0.0, 0.01, 10_000).reshape(100, 100)
+    figure = plots.stated_and_actual(np.full((100, 100), 0.004), error)
+    stated, actual, bar = figure.axes
+    assert stated.images[0].get_clim() == actual.images[0].get_clim() == (0.0, np.percentile(error, 99))
+    assert np.array_equal(np.asarray(actual.images[0].get_array()), error)
+    assert "stated" in stated.get_title() and "4.0e-03" in stated.get_title() and "5.8e-03" in actual.get_title()
+    assert bar.get_ylabel() == "reflectance, 1 = board"
+
+
 def test_singular_values_are_sorted_and_relative_to_the_largest() -> None:
     line = plots.singular_values({"a": [1.0, 4.0, 2.0, 0.0]}).axes[0].lines[0]
     assert np.array_equal(np.asarray(line.get_ydata()), [1.0, 0.5, 0.25, 0.0])

@@ -16,6 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.study import report as R
 from mitsim.study.demo import _no_image
 from mitsim.study.metrics import Quality
+from mitsim.study.trust import Trust
 
 N = 32
 
@@ -28,7 +29,9 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
 
     def recovery(decibel: float) -> R.Recovery:
         image = truth + 10 ** (-decibel / 20) * rng.standard_normal((n, n))
-        return R.Recovery(image, Quality(decibel, 0.98 - 0.6 * 10 ** (-decibel / 20)), 3e-6)
+        error = 10 ** (-decibel / 20)
+        trust = Trust(np.full((n, n), error), np.abs(image - truth), 1.02, "depth" if decibel < 20 else "")
+        return R.Recovery(image, Quality(decibel, 0.98 - 0.6 * error), 3e-6, trust=trust)
 
     def dots(k: int) -> np.ndarray:
         row = np.arange(n) % k == 0
@@ -72,6 +75,7 @@ def example(n: int = N, frame_size: int = 48) -> R.ReportData:
         scene="A printed photograph, 400 mm from the camera; a projector beside it lights 120 x 120 mm.",
         render=np.kron(truth, np.ones((2, 2))),
         families=families,
+        main="dots:7",
         frames=frames,
         exposure="equal peak, 80 % of full well",
         calibration={
@@ -158,8 +162,8 @@ def test_every_number_that_was_given_is_shown(page: str) -> None:
 
 
 def test_each_image_stands_in_its_place(page: str) -> None:
-    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 4 plots.
-    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 4
+    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 5 plots.
+    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 5
     assert page.count('class="picture result best"') == 2
 
 
@@ -172,6 +176,30 @@ def test_best_of_each_exposure_convention_and_a_dash_where_there_is_none(page: s
     table = page.split("<h2>Exposure decides who wins</h2>")[1].split("</table>")[0]
     best = re.findall(r'class="n best">(.*?)<', table)
     assert best == ["31.8 dB", "24.0 dB", "23.0 dB"] and table.count("\N{EN DASH}") == 1
+
+
+def test_trust_is_a_row_a_family_and_one_picture_of_the_main_one(page: str) -> None:
+    """1024 draws of normal noise of the stated deviation: 95 % of them inside to 0.7 %, one deviation, and 3 of these.
+
+    (Planted: the error held against one uncertainty instead of 1.96.)
+    """
+    section = page.split("<h2>How far to trust the images</h2>")[1].split("<h2>")[0]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row, flags=re.S) for row in section.split("<tr>")[2:]]
+    assert [row[0] for row in rows] == ["Uniform", "16 dots", "25 dots", "49 dots", "64 Hadamard"]
+    for row, decibel in zip(rows, (18.7, 27.9, 29.6, 31.8, 30.9), strict=True):
+        stated = 10 ** (-decibel / 20)
+        assert row[1] == f"{decibel} dB" and row[2] == f"{stated:.3g}" and row[5] == "1.02"
+        assert float(row[3]) == pytest.approx(stated, rel=0.1)
+        assert float(row[4].removesuffix(" %")) == pytest.approx(95, abs=2.1)
+    assert [re.sub(r"<.*?>", "", row[6]) for row in rows] == ["depth", "fits", "fits", "fits", "fits"]
+    assert section.count("<img ") == 1 and 'alt="Stated uncertainty and actual error, 49 dots"' in section
+
+
+def test_an_image_without_its_uncertainty_has_no_row() -> None:
+    family = example().families[3]
+    assert family.rendered is not None
+    unknown = replace(family, rendered=replace(family.rendered, trust=None))
+    assert "How far to trust" not in R.render_html(replace(example(), families=(unknown,)))
 
 
 def test_an_image_too_small_for_ssim_is_shown_without(page: str) -> None:
