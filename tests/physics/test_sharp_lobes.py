@@ -53,7 +53,7 @@ def points(bench: Bench, step: int) -> tuple[np.ndarray, np.ndarray]:
     [
         pytest.param(3e-2, 5e-3, marks=pytest.mark.slow),
         pytest.param(1e-2, 5e-3, marks=pytest.mark.slow),
-        (3e-3, 1e-2),
+        pytest.param(3e-3, 1e-2, marks=pytest.mark.slow),
         (1e-3, 1e-2),
         pytest.param(3e-4, 1e-2, marks=pytest.mark.slow),
         pytest.param(1e-4, 2e-2, marks=pytest.mark.slow),
