@@ -118,7 +118,7 @@ class AimedTracer(DirectTracer):
     def _place(
         self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
     ) -> tuple[mi.Point2f, mi.Float]:
-        aims, positions = self._aims, mi.Float(self.positions.astype(np.float32))
+        aims, positions = self._aims, mi.Float(self.points.positions.astype(np.float32))
         at = [dr.gather(mi.Float, positions, index) for index in (row, column)]
         aimed = (self._of(aims.known, number) > 0) & (jitter.x >= _EVEN)
         even = dr.select(self._of(aims.known, number) > 0, mi.Float(_EVEN), 1)
@@ -164,7 +164,7 @@ class AimedTracer(DirectTracer):
     def _is_near(self) -> npt.NDArray[np.bool_]:
         """(anchors^2, pixels): whether an anchor lies within a few lobes of the pixel's light, as far as known."""
         aims = self._aims
-        row, column = np.meshgrid(self.positions, self.positions, indexing="ij")
+        row, column = np.meshgrid(self.points.positions, self.points.positions, indexing="ij")
         at = np.stack([row.ravel(), column.ravel()], axis=1)
         place = aims.centre + np.einsum("mij,aj->ami", aims.slope, at)
         beyond = np.abs(place - np.clip(place, 0, 1)) / aims.scale

@@ -12,13 +12,11 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.optics.anchors import anchor_positions
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.coordinates import x_y
 from mitsim.transport.histogram import DIRECT, Deposits, Sightings
 from mitsim.transport.paths import Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.receiver import Receiver, Reception, sampled_wavelengths
+from mitsim.transport.receiver import Receiver, Reception, SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 
 IntArray = npt.NDArray[np.int64]
@@ -53,26 +51,26 @@ class DirectTracer(Tracer):
             (m,) of the projector that are traced; None: all.
         """
         self._pixels = np.arange(projector.n**2) if pixels is None else pixels
-        self.scene, self.projector, self.anchors, self.spread = scene, projector, anchors, spread
+        self.scene, self.projector = scene, projector
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
-        self.positions = anchor_positions(anchors, self.receiver.geometry.half_width)
+        self.points = SensorPoints(self.receiver.geometry.half_width, anchors, spread)
 
     @property
     def lanes(self) -> int:
         """Connections of one sample: one per projector pixel and anchor."""
-        return len(self._pixels) * self.anchors**2
+        return len(self._pixels) * self.points.count
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         number, anchor, share = self._pair(seed, sample, lane)
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
-        anchors = dr.opaque(mi.UInt32, self.anchors)
+        anchors = dr.opaque(mi.UInt32, self.points.anchors)
         row, column = anchor // anchors, anchor % anchors
         # Streams belong to pixels: every anchor is connected to the same points.
         shared, rng = streams(seed, pixel, sample)
         jitter, weight = self._place(number, row, column, stratified(sample, shared))
         wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
-        sensor = self._random_point(sample, shared, rng) if self.spread else self._anchor(row, column)
+        sensor = self._sensor(row, column, sample, shared, rng)
         flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
 
         def seen_at(
@@ -127,16 +125,9 @@ class DirectTracer(Tracer):
         del number, row, column
         return jitter, mi.Float(1)
 
-    def _anchor(self, row: mi.UInt32, column: mi.UInt32) -> mi.Point3f:
-        """Anchors, in the camera's frame."""
-        positions = mi.Float(self.positions.astype(np.float32))
-        return mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
-
-    def _random_point(self, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32) -> mi.Point3f:
-        """Random points of the sensor, in the camera's frame; ``shared`` belongs to all samples of a stream."""
-        return self._on_sensor(mi.Point2f(rng.next_float32(), rng.next_float32()))
-
-    def _on_sensor(self, point: mi.Point2f) -> mi.Point3f:
-        """Points of the unit square on the sensor, in the camera's frame."""
-        side = 2 * dr.opaque(mi.Float, self.receiver.geometry.half_width)
-        return mi.Point3f((point.x - 0.5) * side, (point.y - 0.5) * side, 0)
+    def _sensor(
+        self, row: mi.UInt32, column: mi.UInt32, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32
+    ) -> mi.Point3f:
+        """Points of the sensor, in the camera's frame; ``shared`` belongs to all samples of a stream."""
+        del sample, shared
+        return self.points.at(row, column, rng)

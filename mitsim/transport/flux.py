@@ -58,8 +58,11 @@ class FluxTracer(DirectTracer):
         part._pixels = pixels
         return part
 
-    def _random_point(self, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32) -> mi.Point3f:
-        return self._on_sensor(stratified(shuffled(sample, shared), shared))
+    def _sensor(
+        self, row: mi.UInt32, column: mi.UInt32, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32
+    ) -> mi.Point3f:
+        del row, column, rng
+        return self.points.inside(stratified(shuffled(sample, shared), shared))
 
     def _received(
         self,

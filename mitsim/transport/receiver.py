@@ -77,12 +77,16 @@ class SensorPoints:
             draws the random points.
         """
         if self.spread:
-            side = 2 * dr.opaque(mi.Float, self.half_width)
-            return mi.Point3f((rng.next_float32() - 0.5) * side, (rng.next_float32() - 0.5) * side, 0)
+            return self.inside(mi.Point2f(rng.next_float32(), rng.next_float32()))
         if self.anchors == 1:
             return mi.Point3f(0)
         positions = mi.Float(self.positions.astype(np.float32))
         return mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
+
+    def inside(self, point: mi.Point2f) -> mi.Point3f:
+        """Each ``point`` of the unit square on the sensor, in the camera's frame."""
+        side = 2 * dr.opaque(mi.Float, self.half_width)
+        return mi.Point3f((point.x - 0.5) * side, (point.y - 0.5) * side, 0)
 
 
 @dataclass

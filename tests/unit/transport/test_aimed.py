@@ -75,7 +75,7 @@ def lit(small_scene: Callable[..., Path], variant: str) -> Callable[[str], tuple
 
 def totals(tracer: DirectTracer, samples: int) -> np.ndarray:
     """(seeds, anchors, anchors) irradiance."""
-    sums = np.zeros((SEEDS, tracer.anchors, tracer.anchors))
+    sums = np.zeros((SEEDS, tracer.points.anchors, tracer.points.anchors))
     for seed in range(SEEDS):
         found = tracer.trace(seed, 0, samples)
         np.add.at(sums[seed], (found.anchor_row, found.anchor_column), found.value / samples)
