@@ -4,10 +4,12 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from mitsim.capture import light as module
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import GROUPS
@@ -128,3 +130,24 @@ def test_sampling_is_checked_without_what_black_pixels_leak(bench: Bench, plan: 
     sharp = replace(light, simulation=Simulation(bench, plan.settings))
     assert np.array_equal(ours, stacked(sharp.frames(family, 3)))
     assert stacked(light.frames(family, 3)).sum() > 1.05 * ours.sum()
+
+
+def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
+    """One group of eight has a path of 100 standard deviations in shot 5; shots 0, 7, 14 are checked. (Planted: 1, 1.)
+
+    The other shots have a variance of about 1, so that of all is 1 + 100^2 (1/8 - 1/64) / 16, and one group has it all.
+    """
+    rng, lighting = np.random.default_rng(1), Lighting(np.arange(16), np.eye(16))
+    totals = rng.normal(size=(8, 17))
+    heavy = totals.copy()
+    heavy[3, 5] += 100
+
+    def ratios(groups: np.ndarray, shots: list[int]) -> tuple[float, float]:
+        light = SimpleNamespace(labels=lighting.labels, groups=[SimpleNamespace(totals=group) for group in groups])
+        return module._unchecked(light, lighting, lighting.shots(np.array(shots)))
+
+    assert ratios(totals, [0, 7, 14]) == (1.0, 1.0)
+    error, bound = ratios(heavy, [0, 7, 14])
+    assert error == pytest.approx(np.sqrt((1 + 100**2 * (1 / 8 - 1 / 64) / 16) / module._BY_CHANCE), rel=0.3)
+    assert bound > 1.2 * error, "one group alone makes it, so it could be larger by chance"
+    assert max(ratios(heavy, [0, 5, 14])) == 1.0, "what is checked is in the error already"
