@@ -12,13 +12,14 @@ import pytest
 from mitsim.capture import light as module
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.effects import EFFECTS
-from mitsim.capture.evidence import GROUPS
+from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.light import Sampling, make_plan, trace_light
 from mitsim.capture.plan import Plan, SceneFacts
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.rig.patterns import Lighting, parse_patterns
+from tests.unit.capture.test_plan import EVIDENCE
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
@@ -151,3 +152,12 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
     assert error == pytest.approx(np.sqrt((1 + 100**2 * (1 / 8 - 1 / 64) / 16) / module._BY_CHANCE), rel=0.3)
     assert bound > 1.2 * error, "one group alone makes it, so it could be larger by chance"
     assert max(ratios(heavy, [0, 5, 14])) == 1.0, "what is checked is in the error already"
+
+
+def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench) -> None:
+    """Direct light and its anchors; other kinds keep what they had. (Planted: seconds of a sample, not of a path.)"""
+    simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
+    timed = module._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
+    for name in ("direct", "anchored"):
+        assert 0 < getattr(timed, name).seconds < 1e-4, "a path takes microseconds at most, a sample of them far more"
+    assert timed.indirect == EVIDENCE.indirect and timed.followed == EVIDENCE.followed
