@@ -99,7 +99,7 @@ def test_full_size_masks_from_2_mm_to_20_um(measured: Recorder, distance: float)
         measured(error / solution.rounding, at_most=1, what="of the stated bound")
         assert f"rounding below {solution.rounding:.0e}." in str(solution.status)
         if relative:
-            assert solution.ok and solution.rounding < 10 * EPS / np.sqrt(relative)
+            assert solution.ok and solution.rounding < 56 * EPS / np.sqrt(relative)
         elif prepared.rank < prepared.unknowns:
             assert not solution.ok and str(solution.status).startswith("Rank deficient")
         else:
@@ -139,7 +139,8 @@ def test_binned_sensors(measured: Recorder, pixels: int, k: int) -> None:
     error = np.linalg.norm(solution.image - visible) / np.linalg.norm(image)
     measured(error, at_most=min(solution.rounding, 1e-4))
     short = pixels * k < 128
-    assert solution.ok != short and str(solution.status).startswith("Under-determined") == short
+    assert solution.ok == (not short and solution.rounding <= ROUNDING_LIMIT)
+    assert str(solution.status).startswith("Under-determined") == short
     assert prepared.rank == min(pixels * k, 128) ** 2
     if not short:
         assert np.linalg.norm(visible - image) < 1e-4 * np.linalg.norm(image)
@@ -209,9 +210,9 @@ def test_rounding_is_bounded_or_flagged(measured: Recorder, exponent: int) -> No
     sums = summed(prepared, frames_of(left, right, one, one, image))
     solution = prepared.solve(sums, 0.0)
     assert prepared.rank == 64 and np.isfinite(solution.image).all()
-    assert solution.rounding == pytest.approx(10 * EPS * 100.0**exponent, rel=2e-2)
+    assert solution.rounding == pytest.approx(110 * EPS * 100.0**exponent, rel=2e-2)
     measured(np.linalg.norm(solution.image - image) / np.linalg.norm(image), at_most=solution.rounding)
-    assert solution.ok == (exponent <= 6)
+    assert solution.ok == (exponent <= 5)
     if not solution.ok:
         advised = float(re.search(r"lambda above (\S+),", str(solution.status))[1])
         again = prepared.solve(sums, 1.05 * advised)
@@ -219,7 +220,7 @@ def test_rounding_is_bounded_or_flagged(measured: Recorder, exponent: int) -> No
 
 
 def test_gram_is_flagged_where_the_default_is_not() -> None:
-    """lambda_rel 1e-15: eps / lambda_rel leaves the Gram matrix no two digits; the default has nine."""
+    """lambda_rel 1e-15: eps / lambda_rel leaves the Gram matrix no two digits; the default has six."""
     factor, one, image = spread(1e5), np.ones((8, 1)), np.random.default_rng(0).random((8, 8))
     found = {}
     for method in ("svd", "gram"):
@@ -227,8 +228,8 @@ def test_gram_is_flagged_where_the_default_is_not() -> None:
         sums = summed(prepared, frames_of(factor, factor, one, one, image))
         found[method] = prepared.solve(sums, 1e-15)
         check_ending(str(found[method].status), prepared)
-    assert found["svd"].ok and found["svd"].rounding < 1e-7
-    assert not found["gram"].ok and "raise lambda above 2.2e-13" in str(found["gram"].status)
+    assert found["svd"].ok and found["svd"].rounding < 1e-6
+    assert not found["gram"].ok and "raise lambda above 2.4e-12" in str(found["gram"].status)
     assert np.linalg.norm(found["gram"].image - found["svd"].image) < found["gram"].rounding * np.linalg.norm(image)
 
 

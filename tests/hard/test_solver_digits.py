@@ -143,7 +143,7 @@ def test_gram_matrices_lose_twice_as_many_digits(measured: Recorder) -> None:
 def test_the_default_stays_below_the_gate(measured: Recorder, data) -> None:
     """Any spectrum, size, kind of pattern, lambda_rel from 1e-2 to 1e-16, units from 1e-12 to 1e12.
 
-    The solver's own bound must hold as well, and is never looser than half the gate, or 10 eps.
+    The solver's own bound must hold as well, and is never looser than 55 eps / sqrt(lambda_rel), or 110 eps.
     """
     n, n2 = data.draw(st.integers(2, 6)), data.draw(st.integers(2, 6))
     power = data.draw(st.floats(0, 9))
@@ -167,8 +167,32 @@ def test_the_default_stays_below_the_gate(measured: Recorder, data) -> None:
     solution = solved(left, right, P_L, P_R, frames, relative)
     error = Exact(left, right, P_L, P_R, frames).error(solution)
     measured(error / gate(relative), at_most=1, what="of the gate")
-    assert error < solution.rounding <= max(gate(relative) / 2, 10 * EPS) * (1 + 1e-9)
+    assert error < solution.rounding <= max(5.5 * gate(relative), 110 * EPS) * (1 + 1e-9)
     assert solution.ok and np.isfinite(solution.image).all()
+
+
+@pytest.mark.parametrize("low", [1.0, 1e-2, 1e-4])
+def test_close_singular_values_keep_to_the_stated_rounding(measured: Recorder, low: float) -> None:
+    """LAPACK ends the SVD of singular values at 1 and ``low``, equal to 1e-12 .. 1e-16, 49 eps from the matrix.
+
+    40 models of 2 to 7 pixels a side under uniform light, each at three lambdas. (Seen failing: ten units of eps.)
+    """
+    worst = 0.0
+    for seed in range(40):
+        rng = np.random.default_rng([int(-np.log10(low)), seed])
+        sizes = rng.integers(2, 8, 2)
+        spectra = [
+            np.where(rng.random(size) < 0.5, 1, low) * (1 + 10 ** -rng.uniform(12, 16) * rng.normal(size=size))
+            for size in sizes
+        ]
+        left, right = (with_spectrum(spectrum, len(spectrum) + 3, seed + 50 * i) for i, spectrum in enumerate(spectra))
+        P_L, P_R = (np.ones((size, 1)) for size in sizes)
+        frames = frames_of(left, right, P_L, P_R, rng.random(sizes))
+        exact = Exact(left, right, P_L, P_R, frames)
+        for relative in (1e-2, 1e-5, 1e-8):
+            solution = solved(left, right, P_L, P_R, frames, relative)
+            worst = max(worst, exact.error(solution) / solution.rounding)
+    measured(worst, at_most=1, what="of the stated rounding")
 
 
 def test_noise_is_magnified_more_than_rounding(measured: Recorder) -> None:
