@@ -18,6 +18,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.choice import cheapest, doubt
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Evidence, Settings, even
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
+from mitsim.capture.prices import CHECKED_SHOTS
 from mitsim.capture.simulation import AT_ANCHORS, FiledLight, Simulation
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 
 Target = Callable[[ExpectedFrames], float]
 """The relative Monte Carlo error to stop at, from the frames seen so far."""
-_CHECKED_SHOTS = 8
-"""Shots that are formed to see the error: their errors differ by a few percent, and each costs its forming."""
 _MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _LARGEST_GROWTH = 8.0
@@ -292,7 +291,7 @@ def trace_light(
     simulation = Simulation(bench, plan.settings)
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
     shots = len(lighting.weights)
-    checked = lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, _CHECKED_SHOTS)).astype(int)))
+    checked = lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, CHECKED_SHOTS)).astype(int)))
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, labels, stream) for stream in streams]
     rounds = 1.0

@@ -18,7 +18,8 @@ from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, S
 from mitsim.optics.frames import PROBES, formed_frames
 
 ROUNDS, CHECKED_SHOTS = 1.5, 8
-"""Rounds that sampling takes, most often one or two, and shots that are formed in each to see the error."""
+"""Rounds that sampling takes, most often one or two, and shots that are formed in each to see the error: shots' errors
+differ by a few percent, and each costs its forming."""
 MIXING = "black-level"
 """Effect that lights every pixel in every shot, so that shots are no longer single classes."""
 _SPLIT, _EDGES = 2.0, 2.0

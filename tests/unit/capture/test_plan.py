@@ -9,9 +9,30 @@ import pytest
 
 from mitsim.capture.choice import cheapest, doubt, parts_of, predicted
 from mitsim.capture.effects import EFFECTS, SWITCHES, parse_switches
-from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Estimate, Evidence, Forming, Noise, Part, even
+from mitsim.capture.evidence import (
+    GROUPS,
+    LOOKS,
+    Changes,
+    Effort,
+    Estimate,
+    Evidence,
+    Forming,
+    Noise,
+    Part,
+    Settings,
+    even,
+)
 from mitsim.capture.plan import Plan, PlanRow, SceneFacts, check_accuracy, decide
-from mitsim.capture.prices import FIXED, Numbers, entries
+from mitsim.capture.prices import (
+    FIXED,
+    Numbers,
+    Paces,
+    checking_seconds,
+    entries,
+    optics_seconds,
+    tracing_seconds,
+    truth_seconds,
+)
 from mitsim.core.errors import MitsimError
 
 FACTS = SceneFacts(notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
@@ -64,6 +85,18 @@ def plan(accuracy: float = 1e-3, evidence: Evidence = EVIDENCE, effects: str = "
 
 def rows(found: Plan) -> dict[str, PlanRow]:
     return {effect.name: effect for effect in found.effects}
+
+
+def stages(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, float]:
+    """Seconds of each stage: paths, filing of what they bring, looks at the error; rays of the truth; frames."""
+    forming, numbers = evidence.forming, Numbers.of(settings)
+    filing = paces.filed * GROUPS * entries(evidence.direct.paths, forming.classes, numbers, settings)
+    looking = checking_seconds(forming, numbers, paces)
+    return {
+        "transport": sum(tracing_seconds(evidence, settings, paces).values()) + filing + looking,
+        "truth": truth_seconds(evidence, settings, paces),
+        "optics": optics_seconds(forming, numbers, paces),
+    }
 
 
 def random_evidence(seed: int) -> Evidence:
@@ -184,6 +217,22 @@ def test_opposite_errors_are_left_together() -> None:
         evidence = replace(EVIDENCE, changes=Changes.between(vectors, 1.0), apart={})
         bare = replace(cheapest(1e-3, evidence, {}).settings, effects=frozenset({"blur"}), subdivision=1)
         assert predicted(1e-3, evidence, bare, {}).fits == fits
+
+
+@pytest.mark.parametrize("accuracy", ACCURACIES)
+def test_work_is_transport_and_optics_at_fixed_paces(accuracy: float) -> None:
+    """Truth is the same for all choices, and none of it."""
+    chosen = cheapest(accuracy, EVIDENCE, {})
+    expected = stages(EVIDENCE, chosen.settings, FIXED)
+    assert chosen.work == pytest.approx(expected["transport"] + expected["optics"])
+
+
+def test_light_that_is_missing_leaves_less_for_other_errors_to_be_part_of() -> None:
+    """A fifth of the light, and a tenth, come over what no tracer finds: errors are those of the rest."""
+    settings = cheapest(1e-2, EVIDENCE, {}).settings
+    lacking = replace(EVIDENCE, unresolved=0.2, left_out=0.1)
+    before, after = (predicted(1e-2, evidence, settings, {}).systematic for evidence in (EVIDENCE, lacking))
+    assert before.value > 1e-3 and after == pytest.approx([0.3 + 0.7 * error for error in before])
 
 
 def test_what_takes_no_time_is_always_on() -> None:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import Part
+from mitsim.capture.evidence import Evidence, Part, Settings
 from mitsim.capture.plan import SceneFacts
-from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows
+from mitsim.capture.prices import paces_of
+from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows, stages
 
 
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
@@ -69,3 +70,33 @@ def test_where_nothing_fits_sampling_still_aims_below_the_accuracy() -> None:
     found = plan(1e-2, replace(EVIDENCE, changes=changes(coarse)))
     assert found.warnings and found.systematic_bound > 1e-2
     assert 0.5e-2 < found.sampling_target < 1e-2
+
+
+FOLLOWS = replace(EVIDENCE, changes=changes(SIZES | {Part("ambient"): 5e-2}))
+"""Light of lamps that no budget can do without, seen from two points a side of the sensor."""
+
+
+def seconds(settings: Settings, evidence: Evidence = FOLLOWS) -> float:
+    return sum(stages(evidence, settings, paces_of(evidence)).values())
+
+
+def test_seconds_are_those_of_every_stage_once() -> None:
+    found = plan(evidence=FOLLOWS)
+    expected = stages(FOLLOWS, found.settings, paces_of(FOLLOWS))
+    assert found.predicted == pytest.approx(expected) and min(expected.values()) > 0
+    assert found.predicted_seconds == pytest.approx(seconds(found.settings))
+
+
+def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
+    """Seconds with and without, samples as they are; the error of one anchor, layer and point, not of two."""
+    found = plan(evidence=FOLLOWS)
+    settings, told = found.settings, rows(found)
+    assert settings.anchors > 1 and settings.layers and settings.followed_anchors == 2
+    for name, less in (
+        ("anchors", replace(settings, anchors=1)),
+        ("layers", replace(settings, layers=())),
+        ("followed-anchors", replace(settings, followed_anchors=1)),
+        ("diffraction", replace(settings, effects=settings.effects - {"diffraction"})),
+    ):
+        assert told[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and told[name].seconds > 0, name
+    assert told["followed-anchors"].error_if_off == pytest.approx(SIZES[Part("followed_anchors", 1)])

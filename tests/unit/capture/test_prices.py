@@ -4,8 +4,17 @@ from dataclasses import fields, replace
 
 import pytest
 
-from mitsim.capture.evidence import GROUPS, Forming
-from mitsim.capture.prices import FIXED, Numbers, Paces, forming_seconds, optics_seconds, paces_of, tracing_seconds
+from mitsim.capture.evidence import GROUPS, Forming, Settings
+from mitsim.capture.prices import (
+    FIXED,
+    Numbers,
+    Paces,
+    entries,
+    forming_seconds,
+    optics_seconds,
+    paces_of,
+    tracing_seconds,
+)
 from mitsim.optics.frames import PROBES
 from tests.unit.capture.test_plan import EVIDENCE, plan
 
@@ -28,6 +37,8 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
         EVIDENCE, direct=replace(EVIDENCE.direct, seconds=0.0), forming=replace(EVIDENCE.forming, seconds=0.0)
     )
     assert paces_of(none).direct == FIXED.direct and paces_of(none).product == FIXED.product
+    slower = {name: getattr(paces_of(measured), name) / getattr(FIXED, name) for name in ("frame", "entry", "filed")}
+    assert slower == pytest.approx(dict.fromkeys(slower, paces_of(measured).product / FIXED.product))
     other = replace(EVIDENCE, direct=replace(EVIDENCE.direct, seconds=5e-6))
     assert paces_of(other).direct == 5e-6
 
@@ -81,3 +92,20 @@ def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_
     several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), paces) for count in (3, 1))
     assert several["direct"] == one["direct"] == GROUPS * 3 * paths
     assert several["anchored"] == 9 * GROUPS * 4 * EVIDENCE.anchored.paths and one["anchored"] == 0
+
+
+def test_light_lies_in_the_cells_that_its_samples_reach() -> None:
+    """100 pixels, 7 classes. Direct light: a pixel's own cells and as many beyond its edge, in two layers at most; what
+    several anchors see, and twice of it: of each and their mean; followed light: all cells of each class."""
+    settings = Settings(
+        depth=400.0, direct_samples=3.0, anchored_samples=50.0, indirect_samples=1e3, followed_samples=20.0
+    )
+    for numbers, found in (
+        (ONE, 2),
+        (replace(ONE, cells=2.0), 3),
+        (replace(ONE, cells=2.0, layers=4.0), 2 * 3),
+        (replace(ONE, anchors=2.0, coarse_cells=2.0), 2 + 2 * 2**2 * 2 * 4),
+        (replace(ONE, indirect=1.0, coarse_cells=2.0), 2 + 7 * 2**2),
+        (replace(ONE, followed_anchors=2.0, coarse_cells=4.0), 2 + 2 * 2**2 * 2 * 20),
+    ):
+        assert entries(100, 7, numbers, settings) == 100 * found, numbers
