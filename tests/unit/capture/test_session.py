@@ -180,7 +180,17 @@ class Killed(BaseException):
 
 @pytest.fixture
 def geometric_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.capture.session.make_plan", geometric_plan)
+    """Sessions of geometric shadows whose plan is made once for each scene, accuracy and seed: plans take most of their
+    time, and that the same seed makes the same plan is held by test_pilot.py."""
+    plans: dict[tuple[object, ...], Plan] = {}
+
+    def planned(board: Bench, lighting: Lighting, *request: object) -> Plan:
+        key = board.loaded.path, *request
+        if key not in plans:
+            plans[key] = geometric_plan(board, lighting, *request)
+        return plans[key]
+
+    monkeypatch.setattr("mitsim.capture.session.make_plan", planned)
 
 
 @pytest.fixture
@@ -261,12 +271,12 @@ def test_damaged_and_foreign_parts_are_computed_again(
 ) -> None:
     """Cut, emptied, flipped at the start, in the middle and at the end, or of a session with another seed."""
     bench = open_bench(shared_scene("damaged16", n=16))
+    save = Checkpoint.save
     for name, seed in (("ours", 3), ("theirs", 4)):
         kill_after(7)
         with pytest.raises(Killed):
             calibrate(bench, recipe=recipe("pair"), seed=seed, output=tmp_path / name)
-    monkeypatch.undo()
-    monkeypatch.setattr("mitsim.capture.session.make_plan", geometric_plan)
+    monkeypatch.setattr(Checkpoint, "save", save)
     whole = calibrate(bench, recipe=recipe("pair"), seed=3)
 
     def flipped(spot: float) -> Callable[[bytes], bytes]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,6 +103,21 @@ def test_the_memory_that_is_asked_for_holds_the_factorised_model(
     sides = prepared.left, prepared.right
     held = sum(side.basis.nbytes + sum(slab.matrix.nbytes for slab in side.slabs) for side in sides)
     assert len(asked) == 1 and held <= asked[0] <= 30 * held
+
+
+def test_the_noise_of_the_ambient_frame_is_that_of_rows_and_of_columns(
+    shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Means of its variance; of pairs, whose ambient light takes itself off, there is none."""
+    variance = np.random.default_rng(0).random((PIXELS, PIXELS))
+    ambient = SimpleNamespace(variance=variance, rate=np.zeros((PIXELS, PIXELS)))
+    monkeypatch.setattr(Capture, "ambient", ambient)
+    assert accumulated(shots, factors).noise.ambient is None
+    patterns = shots.manifest.patterns
+    halves = tuple(shot.model_copy(update={"sign": 0}) for shot in patterns.captures if shot.sign >= 0)
+    manifest = shots.manifest.model_copy(update={"patterns": patterns.model_copy(update={"captures": halves})})
+    by_row, by_column = accumulated(Capture(manifest, memory=shots._memory), factors).noise.ambient
+    assert by_row == pytest.approx(variance.mean(axis=1)) and by_column == pytest.approx(variance.mean(axis=0))
 
 
 def test_the_truth_is_not_looked_at(shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch) -> None:
