@@ -51,10 +51,12 @@ def cut_short(how: signal.Signals, least: int | str, *arguments: object) -> subp
 
 
 def assert_equal_runs(run: Path, whole: Path) -> None:
-    """The same frames with the same pixels, and manifests that agree on all but time."""
+    """The same frames, whose pixels are compared where their bytes differ, and manifests that agree on all but time."""
     names = sorted(path.name for path in whole.glob("*.exr"))
     assert sorted(path.name for path in run.glob("*.exr")) == names
     for name in names:
+        if (run / name).read_bytes() == (whole / name).read_bytes():
+            continue
         ours, theirs = read_frame(run / name)[0], read_frame(whole / name)[0]
         assert ours.keys() == theirs.keys()
         assert all(np.array_equal(ours[channel], theirs[channel]) for channel in theirs), name

@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.study import accuracy
+from mitsim.study.solver_cost import make_problem, time_solver
+
 VERBS = ("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "doctor")
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 
@@ -125,8 +128,11 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
     assert [path.name for path in tmp_path.iterdir()] == ["frame.exr"]
 
 
-def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    # A grey sheet: on the laboratory's print an error of 3e-4 takes minutes.
+def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two accuracies and a small solver: that all rows are right is held by unit/study/test_accuracy.py."""
+    problem = make_problem(np.random.default_rng(1).random((12, 8)), 2, 0)
+    monkeypatch.setattr(accuracy, "ACCURACIES", (1e-2, accuracy.QUOTED))
+    monkeypatch.setattr(accuracy, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
     scene = lab.write_scene("grey", reflectance=None)
     options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
     outcome = call("study", "accuracy", scene, *options)

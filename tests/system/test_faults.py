@@ -33,6 +33,8 @@ def finished(run: Path, whole: Path) -> dict[Path, int]:
     """Frames of a disturbed run with the time of their writing; each must be whole and right."""
     frames = sorted(run.glob("frame_*.exr"))
     for path in frames:
+        if path.read_bytes() == (whole / path.name).read_bytes():
+            continue
         ours, theirs = read_frame(path)[0], read_frame(whole / path.name)[0]
         assert all(np.array_equal(ours[name], theirs[name]) for name in ("DN", "electrons")), path.name
     return {path: path.stat().st_mtime_ns for path in frames}
