@@ -7,6 +7,10 @@ LINT_READY := $(VENV)/.lint-ready
 DOCS_READY := $(VENV)/.docs-ready
 INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile
 
+# Byte code is written also where the environment says not to: the suite starts some sixty programs, each of which would
+# compile all that it imports, for a second or more.
+test test-all robustness: export PYTHONDONTWRITEBYTECODE :=
+
 # One test process a processor.
 PARALLEL := -n logical --maxprocesses 8 --dist worksteal
 

@@ -186,7 +186,9 @@ def test_radiance_of_one_reflection_is_that_of_its_irradiance() -> None:
 # ---- estimators
 
 
-@pytest.mark.parametrize(("name", "rho"), [("path", 0.8), ("factored", 0.3), ("factored", 0.8)])
+@pytest.mark.parametrize(
+    ("name", "rho"), [("path", 0.8), pytest.param("factored", 0.3, marks=pytest.mark.slow), ("factored", 0.8)]
+)
 def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None:
     found = ESTIMATORS[name](write_corner(small_scene, rho), 256, 7)
     corner, places = Corner(rho, N, K), np.array([1, -1]) * HALF / 2
@@ -197,7 +199,15 @@ def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "rho"), [("path", 0.5), ("path", 0.9), *(("factored", rho) for rho in (0.3, 0.6, 0.9))]
+    ("name", "rho"),
+    [
+        ("path", 0.5),
+        ("factored", 0.9),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("path", 0.9), ("factored", 0.3), ("factored", 0.6))
+        ),
+    ],
 )
 def test_furnace(small_scene: Callable[..., Path], name: str, rho: float) -> None:
     scene = write_scene(small_scene, "furnace", SPHERE.format(rho=rho))

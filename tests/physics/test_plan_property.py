@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.effects import EFFECTS
 from mitsim.capture.light import make_plan
 from mitsim.rig.patterns import Lighting
 from tests.physics.plan_property import Effort, answer, planned, total_error
@@ -77,7 +76,7 @@ def test_a_small_scene_keeps_its_accuracy(small: Bench, small_answer: np.ndarray
 def test_a_wrong_plan_is_seen(small: Bench, small_answer: np.ndarray) -> None:
     """The judge itself: without diffraction, or with one layer and anchor, the frames are off by what they change."""
     family = small.family("dots:4").lighting
-    for switches in ({"diffraction": False}, {"layers": False, "anchors": False}, dict.fromkeys(EFFECTS, False)):
+    for switches in ({"diffraction": False}, {"layers": False, "anchors": False}):
         plan = make_plan(small, family, 1e-2, PLANNED, switches)
         frames, _ = planned(small, plan, judged(family), PLANNED)
         error = total_error(frames, small_answer)

@@ -38,9 +38,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(bench: Bench, folder: Path) -> StudyResult:
-    """The whole study; the solver's part on a small problem."""
+    """The whole study at three accuracies of five; the solver's part on a small problem."""
     problem = make_problem(np.random.default_rng(1).random((12, 8)), 2, SEED)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(accuracy, "ACCURACIES", (3e-2, 1e-2, accuracy.QUOTED))
         patch.setattr(accuracy, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
         return find_study("accuracy")(bench, folder, Request.of(patterns=PATTERNS, seed=SEED), None)
 
