@@ -20,6 +20,7 @@ import numpy.typing as npt
 from mitsim.capture.effects import EFFECTS, names
 from mitsim.capture.evidence import COUNTED, EVEN, GROUPS, SURE, Estimate, Evidence, Part, Settings, even
 from mitsim.capture.prices import (
+    ANCHORS_OF,
     FIXED,
     MIXING,
     Numbers,
@@ -37,6 +38,8 @@ _MARGIN = 0.92
 pilot looks at differ from the family's by as much."""
 _MOST_ENTRIES = 2.0**25
 """Entries of one group's filed light beyond which settings are not chosen: 12 GB in all (`mitsim.capture.cost`)."""
+_LUCKY = -1.0
+"""Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
 _AS_GOOD = 1.1
 """Where nothing fits, settings whose error is larger than the least by this count as good as it."""
 _COARSE_CELLS = (1, 2, 4, 8)
@@ -109,6 +112,9 @@ def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], 
     best: tuple[tuple[bool, float, float], _Table, int] | None = None
     counts = [_allowed(evidence, name, switches) for name in COUNTED]
     rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
+    if evidence.occluded:
+        # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
+        rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
     for effects in _subsets(evidence, switches):
         table = _Table(accuracy, evidence, effects, rows, _given(switches), sure)
         index = table.best
@@ -148,7 +154,8 @@ def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> 
     worst = max(errors, key=lambda part: errors[part].bound ** 2 - errors[part].value ** 2, default=Part("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst
-    return hopeful.work if hopeful.fits else 0.0, worst
+    lucky = cheapest(accuracy, evidence, switches, _LUCKY)
+    return lucky.work if lucky.fits else 0.0, worst
 
 
 class _Table:
@@ -161,7 +168,8 @@ class _Table:
     effects
         that are on.
     rows
-        (m, 6) anchors, layers, cells, followed anchors, coarse cells, and whether coarse light has all layers.
+        (m, 7) anchors, layers, cells, anchors of followed light and of occluded pixels, coarse cells, and whether
+        coarse light has all layers.
     given
         parts that are left out whatever is chosen.
     """
@@ -177,7 +185,8 @@ class _Table:
     ) -> None:
         self.accuracy, self.evidence, self.effects, self.rows = accuracy, evidence, effects, rows
         self.given, self.sure = given, sure
-        self.anchors, self.layers, self.cells, self.followed_anchors, self.coarse, self._all_layers = rows.T
+        self.anchors, self.layers, self.cells, self.followed_anchors, self.occluded_anchors = rows.T[:5]
+        self.coarse, self._all_layers = rows.T[5:]
         indirect = float("interreflection" in effects)
         waves = float(bool(effects & names(lambda effect: effect.in_shadow)))
         layered = np.where(self._all_layers > 0, self.layers, 1.0)
@@ -191,6 +200,8 @@ class _Table:
             waves=waves,
             indirect=indirect,
             mixed=float(MIXING in effects),
+            occluded=float(len(evidence.occluded)),
+            occluded_anchors=self.occluded_anchors,
         )
         self._follows = bool(effects & names(lambda effect: effect.followed))
 
@@ -212,7 +223,7 @@ class _Table:
 
     def choice(self, index: int) -> Choice:
         """The choice of a row."""
-        anchors, layers, cells, followed, coarse, all_layers = (int(number) for number in self.rows[index])
+        anchors, layers, cells, followed, occluded, coarse, all_layers = (int(number) for number in self.rows[index])
         settings = Settings(
             depth=self.evidence.depth,
             anchors=anchors,
@@ -224,6 +235,8 @@ class _Table:
             coarse_layers=bool(all_layers),
             reach=self.evidence.reach,
             sharp=self.evidence.sharp,
+            occluded=self.evidence.occluded,
+            occluded_anchors=occluded,
         )
         samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.samples.items()}
         settings = replace(settings, **samples)
@@ -258,7 +271,7 @@ class _Table:
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
         squared, spread = changes.squared(chosen)
-        return np.asarray(np.sqrt(np.maximum(squared, 0) + sure * spread + sum(drawn)))
+        return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
 
     def _weight(self, part: Part) -> FloatArray:
         """(m,) how much of a part's change each row leaves."""
@@ -268,9 +281,9 @@ class _Table:
         if not light:
             left = self._follows or part.name != "followed_anchors"
             return np.asarray((getattr(self, part.name) == part.count) * left, dtype=np.float64)
-        filed = self.anchors > 1 if light == "anchored" else np.full(len(self.rows), self.numbers.indirect > 0)
+        filed = self.numbers.indirect > 0 if light == "indirect" else getattr(self, ANCHORS_OF[light]) > 1
         # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
-        return filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers)
+        return np.asarray(filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers))
 
     @cached_property
     def _left_by_layers(self) -> FloatArray:
@@ -298,7 +311,7 @@ class _Table:
     def _prices(self) -> dict[str, FloatArray]:
         """(m,) work of one sample in every group, by kind of light."""
         return {
-            name: GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.anchors, self.followed_anchors)
+            name: GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.numbers)
             for name, effort in efforts(self.evidence, self.effects).items()
         }
 
@@ -324,7 +337,7 @@ class _Table:
         kinds, total = efforts(self.evidence, self.effects), np.zeros(len(self.rows))
         for name, count in self.samples.items():
             noise = kinds[name].noise
-            on = connections(name, self.anchors, self.followed_anchors) > 0
+            on = connections(name, self.numbers) > 0
             total = total + on * np.square(noise.error) * (count / noise.samples) ** (-2 * noise.rate) / GROUPS
         return np.sqrt(total)
 
@@ -332,7 +345,7 @@ class _Table:
     def _entries(self) -> FloatArray:
         """(m,) of one group's filed light."""
         evidence, samples = self.evidence, {**self.samples}
-        for name in ("indirect", "followed"):
+        for name in ("indirect", "followed", "occluded"):
             samples.setdefault(name, np.ones(len(self.rows)))
         found = entries(evidence.direct.paths, evidence.forming.classes, self.numbers, samples)
         return np.asarray(found) + np.zeros(len(self.rows))
@@ -347,9 +360,10 @@ class _Table:
         return np.asarray(tracing + filing + shown)
 
 
-def counted(settings: Settings) -> tuple[int, int, int, int]:
+def counted(settings: Settings) -> tuple[int, int, int, int, int]:
     """The numbers in ``settings`` that :data:`COUNTED` names."""
-    return settings.anchors, len(settings.depths), settings.subdivision, settings.followed_anchors
+    apart = settings.followed_anchors, settings.occluded_anchors
+    return settings.anchors, len(settings.depths), settings.subdivision, *apart
 
 
 def _counts(evidence: Evidence, name: str) -> list[int]:
@@ -366,7 +380,10 @@ def _allowed(evidence: Evidence, name: str, switches: Mapping[str, bool]) -> lis
 
 def _given(switches: Mapping[str, bool]) -> frozenset[Part]:
     """What is left out by the user's choice."""
-    return frozenset(Part(name, int(name in COUNTED)) for name, on in switches.items() if not on)
+    off = {name for name, on in switches.items() if not on}
+    if "anchors" in off:
+        off.add("occluded_anchors")
+    return frozenset(Part(name, int(name in COUNTED)) for name in off)
 
 
 def _subsets(evidence: Evidence, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:

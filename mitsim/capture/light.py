@@ -255,7 +255,7 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
         if name in AT_ANCHORS:
             at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
             continue
-        field = "sharp_light" if name == "sharp" else name
+        field = f"{name}_light" if name in ("sharp", "occluded") else name
         found[field] = replace(getattr(evidence, field), seconds=seconds / stage.tracer.lanes)
     if at_anchors[1]:
         found["followed"] = replace(evidence.followed, seconds=at_anchors[0] / at_anchors[1])

@@ -88,7 +88,7 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert {1, 2} <= set(ladders["cells"]) <= set(direct.CELL_LADDER)
     for errors in ladders.values():
         assert all(0 <= error.value <= error.bound for error in errors.values())
-        assert errors[1].value > errors[max(errors)].value
+        assert len(errors) == 1 or errors[1].value > errors[max(errors)].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(followed.FOLLOWED_LADDER)
     assert 0 < evidence.forming.seconds < 1
     assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.from_camera.paths

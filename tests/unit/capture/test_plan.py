@@ -9,7 +9,19 @@ import pytest
 
 from mitsim.capture.choice import cheapest, doubt, parts_of, predicted
 from mitsim.capture.effects import EFFECTS, SWITCHES, parse_switches
-from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Estimate, Evidence, Forming, Noise, Part, even
+from mitsim.capture.evidence import (
+    GROUPS,
+    LOOKS,
+    Changes,
+    Effort,
+    Estimate,
+    Evidence,
+    Forming,
+    Noise,
+    Part,
+    Settings,
+    even,
+)
 from mitsim.capture.plan import Plan, PlanRow, SceneFacts, check_accuracy, decide
 from mitsim.capture.prices import FIXED, Numbers, entries
 from mitsim.core.errors import MitsimError
@@ -336,6 +348,46 @@ def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     assert entries(pixels, 49, Numbers.of(settings), settings) <= 2**25
     finest = replace(settings, followed_anchors=3, coarse_cells=8, indirect_samples=1e5, followed_samples=1e5)
     assert entries(pixels, 49, Numbers.of(finest), finest) > 2**28
+
+
+def test_occluded_pixels_count_with_their_anchors() -> None:
+    """Each of 100 pixels lights four places of its own for each of 16 x 16 anchors, in two layers twice as many; with
+    one anchor it is a pixel like the others."""
+    pixels, few = EVIDENCE.direct.paths, replace(cheapest(1e-2, EVIDENCE, {}).settings, layers=(), coarse_layers=False)
+    own = replace(few, occluded=tuple(range(100)), occluded_anchors=16, occluded_samples=9.0)
+
+    def more(settings: Settings) -> float:
+        return float(entries(pixels, 49, Numbers.of(settings), settings)) - plain
+
+    plain = float(entries(pixels, 49, Numbers.of(few), few))
+    assert more(own) == pytest.approx(100 * 256 * 4 * few.coarse_cells**2)
+    assert more(replace(own, occluded_anchors=1)) == 0
+    layered = replace(own, layers=(400.0, 300.0), coarse_layers=True)
+    plain = float(entries(pixels, 49, Numbers.of(replace(layered, occluded_anchors=1)), layered))
+    assert more(layered) == pytest.approx(2 * 100 * 256 * 4 * few.coarse_cells**2)
+
+
+def with_occluded(sizes: dict[int, float]) -> Evidence:
+    """150 pixels that leave so much by the number of their anchors."""
+    found = changes(SIZES | {Part("occluded_anchors", count): size for count, size in sizes.items()})
+    light = Effort(Noise(1e-4, 4, 0.5), 150)
+    return replace(ONE_CLASS, changes=found, occluded=tuple(range(150)), occluded_light=light)
+
+
+@pytest.mark.parametrize("accuracy", ACCURACIES)
+def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: float) -> None:
+    """One anchor is the sensor's centre, several stand for all of the sensor: for all pixels or for none. What is left
+    of either counts. (Planted: the numbers chosen apart; the occluded pixels' share not counted.)"""
+    evidence = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
+    chosen = cheapest(accuracy, evidence, {})
+    settings = chosen.settings
+    assert (settings.anchors > 1) == (settings.occluded_anchors > 1) and settings.occluded == tuple(range(150))
+    assert chosen.fits and chosen.total.bound <= accuracy
+    left = {1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5}[settings.occluded_anchors]
+    with_none = predicted(accuracy, with_occluded({1: 0.0}), replace(settings, occluded_anchors=1), {})
+    assert chosen.systematic.value == pytest.approx(math.hypot(with_none.systematic.value, left), rel=1e-6)
+    off = cheapest(1e-3, evidence, {"anchors": False})
+    assert off.settings.anchors == off.settings.occluded_anchors == 1 and off.fits, "what the user wants does not count"
 
 
 def test_warnings_of_the_devices_come_first() -> None:
