@@ -40,8 +40,8 @@ _NORMAL = 1.645
 _HELD = 8
 """Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
 _MOST_COLUMNS = 2**22
-"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all, and 20
-to add two unsorted matrices."""
+"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all, and
+20 to add two unsorted matrices."""
 _shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 
