@@ -8,9 +8,9 @@ paces. The cheapest that fits is taken.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, combinations, product
 from typing import Any
 
@@ -18,7 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.capture.effects import EFFECTS, names
-from mitsim.capture.evidence import COUNTED, EVEN, GROUPS, SURE, Estimate, Evidence, Part, Settings, even
+from mitsim.capture.evidence import (
+    COUNTED,
+    EVEN,
+    GROUPS,
+    SURE,
+    Effort,
+    Estimate,
+    Evidence,
+    Number,
+    Part,
+    Settings,
+    even,
+)
 from mitsim.capture.prices import (
     ANCHORS_OF,
     FIXED,
@@ -318,28 +330,33 @@ class _Table:
     @cached_property
     def samples(self) -> dict[str, FloatArray]:
         """(m,) samples of a group by kind of light: the least work for a sum of variances."""
-        kinds = efforts(self.evidence, self.effects)
-        parts = {name: np.sqrt(kinds[name].variance * price) for name, price in self._prices.items()}
+        parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._prices.items()}
         whole = sum(parts.values()) + np.zeros(len(self.rows))
         single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
-        for name, effort in kinds.items():
+        for name, part in parts.items():
             # Light without noise takes no share; a share of one keeps the division defined.
-            part = parts[name] + np.zeros(len(whole))
             share = np.sqrt(np.divide(part, whole, out=np.ones(len(whole)), where=part > 0))
-            needed = np.maximum(effort.noise.samples_for(single * share), _FEWEST_SAMPLES)
+            needed = np.maximum(self._by_row(name, partial(_needed, target=single * share)), _FEWEST_SAMPLES)
             found[name] = np.asarray(even(needed) if name in EVEN else np.ceil(needed))
         return found
 
     @cached_property
     def noise(self) -> FloatArray:
         """(m,) Monte Carlo error that these samples leave."""
-        kinds, total = efforts(self.evidence, self.effects), np.zeros(len(self.rows))
+        total = np.zeros(len(self.rows))
         for name, count in self.samples.items():
-            noise = kinds[name].noise
-            on = connections(name, self.numbers) > 0
-            total = total + on * np.square(noise.error) * (count / noise.samples) ** (-2 * noise.rate) / GROUPS
+            left = self._by_row(name, partial(_left, samples=count))
+            total = total + (connections(name, self.numbers) > 0) * np.square(left) / GROUPS
         return np.sqrt(total)
+
+    def _by_row(self, name: str, of: Callable[[Effort], Number]) -> FloatArray:
+        """(m,) something ``of`` the light ``name``: where there are several anchors, direct light goes to random points
+        of the sensor."""
+        found = of(efforts(self.evidence, self.effects)[name]) + np.zeros(len(self.rows))
+        if name == "direct":
+            found = np.where(self.anchors > 1, of(self.evidence.spread), found)
+        return np.asarray(found)
 
     @cached_property
     def _entries(self) -> FloatArray:
@@ -358,6 +375,18 @@ class _Table:
         filing = FIXED.filed * GROUPS * self._entries
         shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
         return np.asarray(tracing + filing + shown)
+
+
+def _variance(kind: Effort) -> Number:
+    return kind.variance
+
+
+def _needed(kind: Effort, target: Number) -> Number:
+    return kind.noise.samples_for(target)
+
+
+def _left(kind: Effort, samples: Number) -> Number:
+    return kind.noise.left(samples)
 
 
 def counted(settings: Settings) -> tuple[int, int, int, int, int]:

@@ -134,6 +134,10 @@ class Noise:
             return _FEWEST_SAMPLES + 0 * target
         return self.samples * (self.error / target) ** (1 / self.rate)
 
+    def left(self, samples: Number) -> Number:
+        """The error at so many ``samples`` a cell."""
+        return self.error * (samples / self.samples) ** -self.rate
+
 
 def even(samples: Number) -> Number:
     """The least 2^k or 3 * 2^k from ``samples`` on: so many points of a Sobol sequence are spread evenly."""
@@ -268,9 +272,9 @@ class Evidence:
     changes
         of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
         cells that was tried, and by one coarse cell a pixel, or one layer, for light of each of ``COARSE``.
-    direct, anchored, indirect, from_camera
-        what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
-        and what is followed from the camera.
+    direct, spread, anchored, indirect, from_camera
+        what direct light takes from the sensor's centre, and from random points of the sensor, its differences between
+        anchors (paths: to one of them), light over several surfaces, and what is followed from the camera.
     forming
         how frames are formed.
     apart
@@ -291,6 +295,7 @@ class Evidence:
     layers: Mapping[int, tuple[float, ...]]
     changes: Changes
     direct: Effort
+    spread: Effort
     anchored: Effort
     indirect: Effort
     from_camera: Effort

@@ -337,5 +337,6 @@ def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float
     evidence, settings, paces
         as for :func:`tracing_seconds`.
     """
-    rate = evidence.direct.noise.rate
+    direct = evidence.spread if settings.anchors > 1 else evidence.direct
+    rate = direct.noise.rate
     return paces.ray * predicted_rays(evidence.direct.paths, settings.direct_samples, rate)

@@ -185,6 +185,7 @@ class Look:
             layers=fine.layers,
             changes=Changes.between(seen, light**2),
             direct=fine.effort(light),
+            spread=fine.spread(light),
             anchored=anchored.effort(light),
             indirect=switched.effort("indirect"),
             from_camera=switched.effort("from_camera"),

@@ -102,8 +102,18 @@ class FineLight:
         return found
 
     def effort(self, light: float) -> Effort:
-        """Monte Carlo error of one estimate, relative to all ``light``, how fast it falls, and its paths."""
-        many, few = self._noise
+        """Monte Carlo error of one estimate of what the sensor's centre sees, relative to all ``light``, how fast it
+        falls, and its paths."""
+        return self._effort(self._noise_of(self._tracer, self._deposits), light)
+
+    def spread(self, light: float) -> Effort:
+        """The same of what random points of the sensor see: gloss differs over the sensor, and makes noise there."""
+        tracer = _tracer(Simulation(self.bench, self.base), _shown(self.base, self.sample), 1, spread=True)
+        seen = [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds]
+        return self._effort(self._noise_of(tracer, seen), light)
+
+    def _effort(self, noises: tuple[float, float], light: float) -> Effort:
+        many, few = noises
         steep = many > 0 and few > 0 and self._fewer < self.sample.fine
         rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
         relative = many / light if light else 0.0
@@ -113,12 +123,11 @@ class FineLight:
     def _fewer(self) -> int:
         return max(1, self.sample.fine // 4)
 
-    @cached_property
-    def _noise(self) -> tuple[float, float]:
-        """Error of a look with all samples, and with fewer."""
+    def _noise_of(self, tracer: DirectTracer, seen: list[Deposits]) -> tuple[float, float]:
+        """Error of a look of the ``tracer`` as it was ``seen`` with all samples, and with fewer."""
         simulation = Simulation(self.bench, self.base)
-        few = [self._tracer.trace(seed, 0, self._fewer) for seed in self._seeds]
-        many = noise(self._formed(simulation, self._deposits, self.sample.fine))
+        few = [tracer.trace(seed, 0, self._fewer) for seed in self._seeds]
+        many = noise(self._formed(simulation, seen, self.sample.fine))
         return many, noise(self._formed(simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
@@ -294,8 +303,8 @@ def _shown(settings: Settings, sample: Sample) -> Labels:
     return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown
 
 
-def _tracer(simulation: Simulation, pixels: Labels, anchors: int) -> DirectTracer:
-    """Direct light of some projector ``pixels`` to every anchor."""
+def _tracer(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
+    """Direct light of some projector ``pixels`` to every anchor, or ``spread`` over the sensor."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
-    return DirectTracer(*parts, pixels=pixels)
+    return DirectTracer(*parts, spread=spread, pixels=pixels)

@@ -57,6 +57,7 @@ EVIDENCE = Evidence(
     layers={1: (380.0,), 2: (400.0, 300.0), 3: (400.0, 343.0, 300.0), 4: (400.0, 369.0, 327.0, 300.0)},
     changes=changes(SIZES),
     direct=Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
+    spread=Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
     anchored=Effort(Noise(3e-4, 4, 0.5), 16_384, 1e-7),
     indirect=Effort(Noise(4e-3, 2, 0.5), 16_384, 2e-7),
     from_camera=Effort(Noise(1e-2, 2, 0.5), 20_000, 6e-7),
@@ -87,7 +88,7 @@ def random_evidence(seed: int) -> Evidence:
     looks = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), LOOKS, 6))
     efforts = {
         name: replace(getattr(EVIDENCE, name), noise=Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5))
-        for name in ("direct", "anchored", "indirect", "from_camera", "followed")
+        for name in ("direct", "spread", "anchored", "indirect", "from_camera", "followed")
     }
     return replace(EVIDENCE, changes=Changes.between(dict(zip(sizes, looks, strict=True)), 1.0), **efforts)
 
@@ -484,12 +485,26 @@ def test_accuracies_that_cannot_be_promised(accuracy: float) -> None:
         plan(accuracy)
 
 
+def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
+    """Ten times the noise takes so many more samples where there are several anchors, and none where there is one.
+    (Planted: the centre's noise for both; spread noise with one anchor.)"""
+    noisy = replace(EVIDENCE, spread=Effort(Noise(2e-2, 16, 0.5), 16_384))
+    for switches, factor in (({"anchors": False}, 1.0), ({"anchors": True}, 10.0)):
+        quiet, loud = (cheapest(3e-3, evidence, switches) for evidence in (EVIDENCE, noisy))
+        assert (loud.settings.anchors > 1) == (factor > 1)
+        if factor == 1:
+            assert loud == quiet
+        else:
+            assert loud.settings.direct_samples > 8 * quiet.settings.direct_samples
+            assert 0.3 * loud.target < loud.noise < loud.target
+
+
 def test_samples_take_the_least_work_for_the_target() -> None:
     """Variances v / N add up to the target's over 1.15, as sampling stops by a bound that lies so far above the error.
 
     N is in proportion to sqrt(v / price): the least sum of prices. Whole numbers make both a little better.
     """
-    noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "anchored", "followed")}
+    noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "spread", "anchored", "followed")}
     noises["from_camera"] = Noise(3e-2, 2, 0.5)
     evidence = replace(EVIDENCE, **{name: replace(getattr(EVIDENCE, name), noise=n) for name, n in noises.items()})
     found = cheapest(1e-3, evidence, parse_switches("+interreflection"))
