@@ -104,13 +104,11 @@ class FineLight:
     def effort(self, light: float) -> Effort:
         """Monte Carlo error of one estimate of what the sensor's centre sees, relative to all ``light``, how fast it
         falls, and its paths."""
-        return self._effort(self._noise_of(self._tracer, self._deposits), light)
+        return self._effort(self._noise, light)
 
     def spread(self, light: float) -> Effort:
         """The same of what random points of the sensor see: gloss differs over the sensor, and makes noise there."""
-        tracer = _tracer(Simulation(self.bench, self.base), _shown(self.base, self.sample), 1, spread=True)
-        seen = [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds]
-        return self._effort(self._noise_of(tracer, seen), light)
+        return self._effort(self._spread_noise, light)
 
     def _effort(self, noises: tuple[float, float], light: float) -> Effort:
         many, few = noises
@@ -122,6 +120,15 @@ class FineLight:
     @property
     def _fewer(self) -> int:
         return max(1, self.sample.fine // 4)
+
+    @cached_property
+    def _noise(self) -> tuple[float, float]:
+        return self._noise_of(self._tracer, self._deposits)
+
+    @cached_property
+    def _spread_noise(self) -> tuple[float, float]:
+        tracer = _tracer(Simulation(self.bench, self.base), _shown(self.base, self.sample), 1, spread=True)
+        return self._noise_of(tracer, [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds])
 
     def _noise_of(self, tracer: DirectTracer, seen: list[Deposits]) -> tuple[float, float]:
         """Error of a look of the ``tracer`` as it was ``seen`` with all samples, and with fewer."""
