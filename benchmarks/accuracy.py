@@ -2,8 +2,8 @@
 
     python benchmarks/accuracy.py --json FILE [--scene photograph ...] [--accuracy 1e-2 ...] [--old PATH]
 
-The answer is light of two other seeds with every effect of the scene, one step finer in anchors, layers and cells than
-the plan at 3e-4, and coarse cells as fine as the rest. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the
+The answer is light of two other seeds with every effect of the scene, one step finer in anchors, layers, cells and
+coarse cells than the plan at 3e-4. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the
 squared error of all frames a without the noise of the answer; its standard error is the jackknife's over shots.
 Captures are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version to
 be timed and judged beside this one. What FILE and the answers beside it hold already is not repeated, so the work can
@@ -47,6 +47,8 @@ PATTERNS, ACCURACIES = "dots:7", (1e-2, 3e-3, 1e-3, 3e-4)
 FINEST, NOISE = 3e-4, 1e-3
 """Accuracy whose settings the answer goes one step beyond, and the Monte Carlo error of each of its halves, whose own
 energy drops out."""
+SEEN = 3
+"""How many times as closely the pilot of the answer looks, so that more pixels count as occluded, and more is tried."""
 _OLD_START = "import sys; from mitsim.cli import main; sys.exit(main())"
 SEED, ANSWERS = 0, (811, 812)
 Frames = npt.NDArray[np.floating[Any]]
@@ -56,7 +58,7 @@ def answer(scene: str, noise: float) -> npt.NDArray[np.float32]:
     """(2, shots, pixels, pixels) irradiance of all shots in two independent halves."""
     bench = ms.open_bench(scene)
     family = bench.family(PATTERNS, SEED)
-    stand = Stand(bench, family, ANSWERS[0], Job(), FINEST)
+    stand = Stand(bench, family, ANSWERS[0], Job(), FINEST / SEEN)
     finest = stand.finest(stand.plan(FINEST), 1.0)
     samples = predicted(noise, stand.evidence, finest.settings, {}).settings
     plan = replace(finest, settings=samples, sampling_target=noise)

@@ -8,9 +8,9 @@ paces. The cheapest that fits is taken.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, combinations, product
 from typing import Any
 
@@ -18,8 +18,21 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.capture.effects import EFFECTS, names
-from mitsim.capture.evidence import COUNTED, EVEN, GROUPS, SURE, Estimate, Evidence, Part, Settings, even
+from mitsim.capture.evidence import (
+    COUNTED,
+    EVEN,
+    GROUPS,
+    SURE,
+    Effort,
+    Estimate,
+    Evidence,
+    Number,
+    Part,
+    Settings,
+    even,
+)
 from mitsim.capture.prices import (
+    ANCHORS_OF,
     FIXED,
     MIXING,
     Numbers,
@@ -37,6 +50,8 @@ _MARGIN = 0.92
 pilot looks at differ from the family's by as much."""
 _MOST_ENTRIES = 2.0**25
 """Entries of one group's filed light beyond which settings are not chosen: 12 GB in all (`mitsim.capture.cost`)."""
+_LUCKY = -1.0
+"""Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
 _AS_GOOD = 1.1
 """Where nothing fits, settings whose error is larger than the least by this count as good as it."""
 _COARSE_CELLS = (1, 2, 4, 8)
@@ -109,6 +124,9 @@ def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], 
     best: tuple[tuple[bool, float, float], _Table, int] | None = None
     counts = [_allowed(evidence, name, switches) for name in COUNTED]
     rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
+    if evidence.occluded:
+        # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
+        rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
     for effects in _subsets(evidence, switches):
         table = _Table(accuracy, evidence, effects, rows, _given(switches), sure)
         index = table.best
@@ -148,7 +166,8 @@ def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> 
     worst = max(errors, key=lambda part: errors[part].bound ** 2 - errors[part].value ** 2, default=Part("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst
-    return hopeful.work if hopeful.fits else 0.0, worst
+    lucky = cheapest(accuracy, evidence, switches, _LUCKY)
+    return lucky.work if lucky.fits else 0.0, worst
 
 
 class _Table:
@@ -161,7 +180,8 @@ class _Table:
     effects
         that are on.
     rows
-        (m, 6) anchors, layers, cells, followed anchors, coarse cells, and whether coarse light has all layers.
+        (m, 7) anchors, layers, cells, anchors of followed light and of occluded pixels, coarse cells, and whether
+        coarse light has all layers.
     given
         parts that are left out whatever is chosen.
     """
@@ -177,7 +197,8 @@ class _Table:
     ) -> None:
         self.accuracy, self.evidence, self.effects, self.rows = accuracy, evidence, effects, rows
         self.given, self.sure = given, sure
-        self.anchors, self.layers, self.cells, self.followed_anchors, self.coarse, self._all_layers = rows.T
+        self.anchors, self.layers, self.cells, self.followed_anchors, self.occluded_anchors = rows.T[:5]
+        self.coarse, self._all_layers = rows.T[5:]
         indirect = float("interreflection" in effects)
         waves = float(bool(effects & names(lambda effect: effect.in_shadow)))
         layered = np.where(self._all_layers > 0, self.layers, 1.0)
@@ -191,6 +212,8 @@ class _Table:
             waves=waves,
             indirect=indirect,
             mixed=float(MIXING in effects),
+            occluded=float(len(evidence.occluded)),
+            occluded_anchors=self.occluded_anchors,
         )
         self._follows = bool(effects & names(lambda effect: effect.followed))
 
@@ -212,7 +235,7 @@ class _Table:
 
     def choice(self, index: int) -> Choice:
         """The choice of a row."""
-        anchors, layers, cells, followed, coarse, all_layers = (int(number) for number in self.rows[index])
+        anchors, layers, cells, followed, occluded, coarse, all_layers = (int(number) for number in self.rows[index])
         settings = Settings(
             depth=self.evidence.depth,
             anchors=anchors,
@@ -224,6 +247,8 @@ class _Table:
             coarse_layers=bool(all_layers),
             reach=self.evidence.reach,
             sharp=self.evidence.sharp,
+            occluded=self.evidence.occluded,
+            occluded_anchors=occluded,
         )
         samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.samples.items()}
         settings = replace(settings, **samples)
@@ -258,7 +283,7 @@ class _Table:
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
         squared, spread = changes.squared(chosen)
-        return np.asarray(np.sqrt(np.maximum(squared, 0) + sure * spread + sum(drawn)))
+        return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
 
     def _weight(self, part: Part) -> FloatArray:
         """(m,) how much of a part's change each row leaves."""
@@ -268,9 +293,9 @@ class _Table:
         if not light:
             left = self._follows or part.name != "followed_anchors"
             return np.asarray((getattr(self, part.name) == part.count) * left, dtype=np.float64)
-        filed = self.anchors > 1 if light == "anchored" else np.full(len(self.rows), self.numbers.indirect > 0)
+        filed = self.numbers.indirect > 0 if light == "indirect" else getattr(self, ANCHORS_OF[light]) > 1
         # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
-        return filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers)
+        return np.asarray(filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers))
 
     @cached_property
     def _left_by_layers(self) -> FloatArray:
@@ -298,41 +323,46 @@ class _Table:
     def _prices(self) -> dict[str, FloatArray]:
         """(m,) work of one sample in every group, by kind of light."""
         return {
-            name: GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.anchors, self.followed_anchors)
+            name: GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.numbers)
             for name, effort in efforts(self.evidence, self.effects).items()
         }
 
     @cached_property
     def samples(self) -> dict[str, FloatArray]:
         """(m,) samples of a group by kind of light: the least work for a sum of variances."""
-        kinds = efforts(self.evidence, self.effects)
-        parts = {name: np.sqrt(kinds[name].variance * price) for name, price in self._prices.items()}
+        parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._prices.items()}
         whole = sum(parts.values()) + np.zeros(len(self.rows))
         single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
-        for name, effort in kinds.items():
+        for name, part in parts.items():
             # Light without noise takes no share; a share of one keeps the division defined.
-            part = parts[name] + np.zeros(len(whole))
             share = np.sqrt(np.divide(part, whole, out=np.ones(len(whole)), where=part > 0))
-            needed = np.maximum(effort.noise.samples_for(single * share), _FEWEST_SAMPLES)
+            needed = np.maximum(self._by_row(name, partial(_needed, target=single * share)), _FEWEST_SAMPLES)
             found[name] = np.asarray(even(needed) if name in EVEN else np.ceil(needed))
         return found
 
     @cached_property
     def noise(self) -> FloatArray:
         """(m,) Monte Carlo error that these samples leave."""
-        kinds, total = efforts(self.evidence, self.effects), np.zeros(len(self.rows))
+        total = np.zeros(len(self.rows))
         for name, count in self.samples.items():
-            noise = kinds[name].noise
-            on = connections(name, self.anchors, self.followed_anchors) > 0
-            total = total + on * np.square(noise.error) * (count / noise.samples) ** (-2 * noise.rate) / GROUPS
+            left = self._by_row(name, partial(_left, samples=count))
+            total = total + (connections(name, self.numbers) > 0) * np.square(left) / GROUPS
         return np.sqrt(total)
+
+    def _by_row(self, name: str, of: Callable[[Effort], Number]) -> FloatArray:
+        """(m,) something ``of`` the light ``name``: where there are several anchors, direct light goes to random points
+        of the sensor."""
+        found = of(efforts(self.evidence, self.effects)[name]) + np.zeros(len(self.rows))
+        if name == "direct":
+            found = np.where(self.anchors > 1, of(self.evidence.spread), found)
+        return np.asarray(found)
 
     @cached_property
     def _entries(self) -> FloatArray:
         """(m,) of one group's filed light."""
         evidence, samples = self.evidence, {**self.samples}
-        for name in ("indirect", "followed"):
+        for name in ("indirect", "followed", "occluded"):
             samples.setdefault(name, np.ones(len(self.rows)))
         found = entries(evidence.direct.paths, evidence.forming.classes, self.numbers, samples)
         return np.asarray(found) + np.zeros(len(self.rows))
@@ -347,9 +377,22 @@ class _Table:
         return np.asarray(tracing + filing + shown)
 
 
-def counted(settings: Settings) -> tuple[int, int, int, int]:
+def _variance(kind: Effort) -> Number:
+    return kind.variance
+
+
+def _needed(kind: Effort, target: Number) -> Number:
+    return kind.noise.samples_for(target)
+
+
+def _left(kind: Effort, samples: Number) -> Number:
+    return kind.noise.left(samples)
+
+
+def counted(settings: Settings) -> tuple[int, int, int, int, int]:
     """The numbers in ``settings`` that :data:`COUNTED` names."""
-    return settings.anchors, len(settings.depths), settings.subdivision, settings.followed_anchors
+    apart = settings.followed_anchors, settings.occluded_anchors
+    return settings.anchors, len(settings.depths), settings.subdivision, *apart
 
 
 def _counts(evidence: Evidence, name: str) -> list[int]:
@@ -366,7 +409,10 @@ def _allowed(evidence: Evidence, name: str, switches: Mapping[str, bool]) -> lis
 
 def _given(switches: Mapping[str, bool]) -> frozenset[Part]:
     """What is left out by the user's choice."""
-    return frozenset(Part(name, int(name in COUNTED)) for name, on in switches.items() if not on)
+    off = {name for name, on in switches.items() if not on}
+    if "anchors" in off:
+        off.add("occluded_anchors")
+    return frozenset(Part(name, int(name in COUNTED)) for name in off)
 
 
 def _subsets(evidence: Evidence, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:

@@ -13,12 +13,14 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 
 Number = float | FloatArray
-COUNTED = ("anchors", "layers", "cells", "followed_anchors")
-"""What a plan counts: points of the sensor a side for direct light, depths, cells a side of a projector pixel, and
-points of the sensor a side for light that is followed over several surfaces or from the camera."""
-COARSE = ("anchored", "indirect")
-"""Light that is filed in coarse cells: direct light's differences between anchors, and indirect light."""
-EVEN = ("direct", "anchored", "sharp")
+COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors")
+"""What a plan counts: points of the sensor a side for direct light, depths, cells a side of a projector pixel, points
+of the sensor a side for light that is followed over several surfaces or from the camera, and for direct light of
+occluded pixels."""
+COARSE = ("anchored", "occluded", "indirect")
+"""Light that is filed in coarse cells: direct light's differences between anchors, those of occluded pixels, and
+indirect light."""
+EVEN = ("direct", "anchored", "occluded", "sharp")
 """Light whose points come from a Sobol sequence alone, so that the number of samples matters."""
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
@@ -81,6 +83,10 @@ class Settings:
         than of light at ``depth``.
     sharp, sharp_samples
         pixels whose direct light is traced apart, and samples that each group is predicted to need of it.
+    occluded, occluded_anchors, occluded_samples
+        projector pixels whose light is hidden from part of the sensor, increasing, points a side from which what the
+        sensor sees of them beyond the mean is evaluated, and samples of it that each group is predicted to need. With
+        one point they are pixels like the others.
     """
 
     depth: float
@@ -99,11 +105,19 @@ class Settings:
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_samples: float = 1.0
+    occluded: tuple[int, ...] = ()
+    occluded_anchors: int = 1
+    occluded_samples: float = 1.0
 
     @property
     def depths(self) -> tuple[float, ...]:
         """Depth of each layer [mm]; the one depth of a flat scene."""
         return self.layers or (self.depth,)
+
+    @property
+    def seen_apart(self) -> tuple[int, ...]:
+        """Occluded pixels, where they have anchors of their own."""
+        return self.occluded if self.occluded_anchors > 1 else ()
 
 
 @dataclass(frozen=True)
@@ -119,6 +133,10 @@ class Noise:
         if self.error <= 0:
             return _FEWEST_SAMPLES + 0 * target
         return self.samples * (self.error / target) ** (1 / self.rate)
+
+    def left(self, samples: Number) -> Number:
+        """The error at so many ``samples`` a cell."""
+        return self.error * (samples / self.samples) ** -self.rate
 
 
 def even(samples: Number) -> Number:
@@ -254,9 +272,9 @@ class Evidence:
     changes
         of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
         cells that was tried, and by one coarse cell a pixel, or one layer, for light of each of ``COARSE``.
-    direct, anchored, indirect, from_camera
-        what direct light takes, its differences between anchors (paths: to one of them), light over several surfaces,
-        and what is followed from the camera.
+    direct, spread, anchored, indirect, from_camera
+        what direct light takes from the sensor's centre, and from random points of the sensor, its differences between
+        anchors (paths: to one of them), light over several surfaces, and what is followed from the camera.
     forming
         how frames are formed.
     apart
@@ -265,10 +283,10 @@ class Evidence:
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
     left_out
         light that no tracer finds, over that and direct light (:mod:`mitsim.transport.left_out`).
-    reach, sharp
+    reach, sharp, occluded
         as in :class:`Settings`.
-    sharp_light
-        what that light takes.
+    sharp_light, occluded_light
+        what that light takes (paths of the latter: to one anchor).
     followed
         what is followed takes at several anchors beyond its mean (paths: to one of them).
     """
@@ -277,6 +295,7 @@ class Evidence:
     layers: Mapping[int, tuple[float, ...]]
     changes: Changes
     direct: Effort
+    spread: Effort
     anchored: Effort
     indirect: Effort
     from_camera: Effort
@@ -288,6 +307,8 @@ class Evidence:
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())
     followed: Effort = field(default_factory=lambda: Effort.none())
+    occluded: tuple[int, ...] = ()
+    occluded_light: Effort = field(default_factory=lambda: Effort.none())
 
     def error(self, *parts: Part) -> Estimate:
         """Relative change of the frames by all ``parts`` together."""

@@ -37,6 +37,8 @@ _MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _LARGEST_GROWTH = 8.0
 """Most that the samples grow by in one round, because the first rounds know their error badly."""
+_LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 1.5
+"""Least that they grow by: a tenth, and where all come in even numbers (2^k, 3 * 2^k) as far as the next of them."""
 _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 """Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
 what direct light brings), direct light's with their 0.8th power or faster."""
@@ -254,7 +256,7 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
         if name in AT_ANCHORS:
             at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
             continue
-        field = "sharp_light" if name == "sharp" else name
+        field = f"{name}_light" if name in ("sharp", "occluded") else name
         found[field] = replace(getattr(evidence, field), seconds=seconds / stage.tracer.lanes)
     if at_anchors[1]:
         found["followed"] = replace(evidence.followed, seconds=at_anchors[0] / at_anchors[1])
@@ -320,10 +322,11 @@ def trace_light(
         progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
         if seen <= target or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=seen <= target)
-        rate = _FOLLOWED_RATE if simulation.indirect or simulation.from_camera else _DIRECT_RATE
+        followed = bool(simulation.indirect or simulation.from_camera)
+        rate, least = (_FOLLOWED_RATE, _LEAST_GROWTH) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH)
         # Capped before the power as well: a target that was set very low would overflow it.
         growth = min(seen / target, _LARGEST_GROWTH) ** rate
-        rounds *= min(max(1.05 * growth, 1.1), _LARGEST_GROWTH)
+        rounds *= min(max(1.05 * growth, least), _LARGEST_GROWTH)
 
 
 def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> tuple[float, float]:

@@ -272,7 +272,8 @@ class _Words:
     def rows(self) -> tuple[PlanRow, ...]:
         """A row for each effect and discretisation."""
         effects = (self._effect(effect) for effect in EFFECTS.values())
-        counted = (self._anchors(), self._layers(), self._cells(), self._followed_anchors())
+        anchors = self._anchors(), self._followed_anchors(), self._occluded_anchors()
+        counted = (anchors[0], self._layers(), self._cells(), *anchors[1:])
         return (*counted, *effects, *_fixed(self.facts))
 
     @property
@@ -297,12 +298,13 @@ class _Words:
         """By what leaves it, the bound on each part of the systematic error."""
         evidence, settings = self.evidence, self.chosen.settings
         anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
-        followed = settings.followed_anchors
+        followed, occluded = settings.followed_anchors, settings.occluded_anchors
         return {
             f"anchors ({anchors}x{anchors})": self._number("anchors", anchors).bound,
             f"layers ({layers})": self._number("layers", layers).bound,
             f"cells ({cells}x{cells})": self._number("cells", cells).bound,
             f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
+            f"occluded anchors ({occluded}x{occluded})": self._number("occluded_anchors", occluded).bound,
             **self.chosen.lacking,
             **{f"{name} (off)": e.bound for name, e in evidence.effects.items() if name not in settings.effects},
         }
@@ -332,7 +334,7 @@ class _Words:
             return PlanRow("anchors", "off", reason, one.value, 0.0)
         left = _said(self._number("anchors", anchors))
         reason = f"falloff, gloss and parallax: {anchors}x{anchors} anchors leave {left}, one {_said(one)}"
-        return PlanRow("anchors", "approximate", reason, one.value, self._seconds(anchors=1))
+        return PlanRow("anchors", "approximate", reason, one.value, self._seconds(anchors=1, occluded_anchors=1))
 
     def _layers(self) -> PlanRow:
         depths, one = self.chosen.settings.depths, self._number("layers", 1)
@@ -364,6 +366,23 @@ class _Words:
             f"light over several surfaces, in mirrors and of lamps: {anchors}x{anchors} leave {left}, one {_said(one)}"
         )
         return PlanRow(name, "approximate", reason, one.value, self._seconds(followed_anchors=1))
+
+    def _occluded_anchors(self) -> PlanRow:
+        name, anchors, pixels = (
+            "occluded-anchors",
+            self.chosen.settings.occluded_anchors,
+            len(self.evidence.occluded),
+        )
+        one = self._number("occluded_anchors", 1)
+        if not pixels:
+            return PlanRow(name, "off", "few anchors serve all projector pixels", 0.0, 0.0)
+        reason = f"{pixels} projector pixels are hidden from part of the sensor"
+        if anchors == 1:
+            return PlanRow(name, "off", f"{reason}: one anchor leaves {_said(one)}", one.value, 0.0)
+        left = _said(self._number("occluded_anchors", anchors))
+        reason = f"{reason}: {anchors}x{anchors} anchors leave {left}, one {_said(one)}"
+        # To see them apart saves time: with as many anchors for all pixels, it would take far more.
+        return PlanRow(name, "approximate", reason, one.value, 0.0)
 
     def _effect(self, effect: Effect) -> PlanRow:
         settings, name = self.chosen.settings, effect.name

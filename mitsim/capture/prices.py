@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import cast
 
 import numpy as np
@@ -25,6 +26,8 @@ MIXING = "black-level"
 _SPLIT, _EDGES = 2.0, 2.0
 """Layers, at most, that share the light of one depth; and how many times the cells of a pixel its light lies in, at
 most, where it lies across an edge or at another depth than the cells are aligned at (measured: 1.6)."""
+ANCHORS_OF = MappingProxyType({"anchored": "anchors", "followed": "followed_anchors", "occluded": "occluded_anchors"})
+"""What counts the anchors of each kind of light that has several."""
 _GEOMETRIC_ENTRIES = 0.03
 """An entry of a geometric shadow over one of a wave-optical one: a sum over features against samples of a field."""
 
@@ -49,6 +52,7 @@ class Paces:
     indirect: float
     from_camera: float
     followed: float
+    occluded: float
     sharp: float
     frame: float
     product: float
@@ -63,6 +67,7 @@ FIXED = Paces(
     indirect=5e-7,
     from_camera=1e-6,
     followed=5e-7,
+    occluded=1.5e-7,
     sharp=3e-7,
     frame=2e-3,
     product=6e-11,
@@ -86,6 +91,9 @@ class Numbers:
     waves: Number
     indirect: Number
     mixed: Number
+    occluded: Number = 0.0
+    """Pixels of their own anchors."""
+    occluded_anchors: Number = 1.0
 
     @classmethod
     def coarsest(cls) -> Numbers:
@@ -106,6 +114,8 @@ class Numbers:
             waves=float(bool(settings.effects & names(lambda effect: effect.in_shadow))),
             indirect=float("interreflection" in settings.effects),
             mixed=float(MIXING in settings.effects),
+            occluded=float(len(settings.seen_apart)),
+            occluded_anchors=float(settings.occluded_anchors),
         )
 
 
@@ -120,6 +130,7 @@ def paces_of(evidence: Evidence) -> Paces:
         indirect=evidence.indirect.seconds or FIXED.indirect,
         from_camera=evidence.from_camera.seconds or FIXED.from_camera,
         followed=evidence.followed.seconds or FIXED.followed,
+        occluded=evidence.occluded_light.seconds or FIXED.occluded,
         sharp=evidence.sharp_light.seconds or FIXED.sharp,
         frame=float(slower * FIXED.frame),
         product=float(slower * FIXED.product),
@@ -137,6 +148,8 @@ def priced() -> frozenset[str]:
 def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
     """What each kind of light that ``effects`` call for takes by the ``evidence``; connections to anchors: to one."""
     found = {"direct": evidence.direct, "anchored": evidence.anchored}
+    if evidence.occluded:
+        found["occluded"] = evidence.occluded_light
     if evidence.sharp:
         found["sharp"] = evidence.sharp_light
     if effects & names(lambda effect: effect.followed):
@@ -144,19 +157,19 @@ def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
     return found
 
 
-def connections(name: str, anchors: Number, followed_anchors: Number) -> Number:
+def connections(name: str, numbers: Numbers) -> Number:
     """Connections of each path of the light ``name``; 0 for what anchors see beyond their mean where there is one.
 
     Parameters
     ----------
     name
         as in :func:`efforts`.
-    anchors, followed_anchors
-        of direct and of followed light, a side.
+    numbers
+        of the settings.
     """
-    if name not in ("anchored", "followed"):
-        return 1.0 + 0 * anchors
-    count = np.asarray(anchors if name == "anchored" else followed_anchors, dtype=np.float64)
+    if name not in ANCHORS_OF:
+        return 1.0 + 0 * numbers.anchors
+    count = np.asarray(getattr(numbers, ANCHORS_OF[name]), dtype=np.float64)
     return cast(Number, count**2 * (count > 1))
 
 
@@ -185,6 +198,12 @@ def _entries(forming: Forming, numbers: Numbers) -> Number:
     return cast(Number, 2 * forming.pixels * forming.cells * sides * terms)
 
 
+def _lit_by_occluded(forming: Forming, lit: Number, numbers: Numbers) -> Number:
+    """Part of the rows of cells that hold light of occluded pixels in a frame ``lit`` of whose rows hold any: each
+    pixel lights its own, and a frame shows as many of them as of all pixels."""
+    return np.minimum(lit, _EDGES * numbers.occluded * np.square(lit) / forming.cells)
+
+
 def forming_seconds(forming: Forming, numbers: Numbers, frames: float, paces: Paces) -> Number:
     """Seconds of forming so many ``frames``.
 
@@ -205,6 +224,8 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: float, paces: Pa
     products = (
         _products(forming, lit, numbers.cells, numbers.layers, 1.0, numbers.waves)
         + several * _products(forming, lit, *coarse, numbers.anchors, numbers.waves)
+        + (np.asarray(numbers.occluded_anchors) > 1)
+        * _products(forming, _lit_by_occluded(forming, lit, numbers), *coarse, numbers.occluded_anchors, numbers.waves)
         + numbers.indirect * _products(forming, 1.0, *coarse, 1.0, numbers.waves)
         + (np.asarray(numbers.followed_anchors) > 1)
         * _products(forming, 1.0, *coarse, numbers.followed_anchors, numbers.waves)
@@ -254,7 +275,7 @@ def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dic
         * math.ceil(getattr(settings, f"{name}_samples"))
         * effort.paths
         * getattr(paces, name)
-        * float(connections(name, settings.anchors, settings.followed_anchors))
+        * float(connections(name, Numbers.of(settings)))
         for name, effort in efforts(evidence, settings.effects).items()
     }
 
@@ -295,6 +316,10 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
     if np.any(several):
         seen = _EDGES * np.minimum(of("anchored"), coarse) * layers
         found = found + several * _EDGES * np.square(numbers.anchors) * seen
+    beyond = numbers.occluded / pixels * (np.asarray(numbers.occluded_anchors) > 1)
+    if np.any(beyond):
+        seen = _EDGES * np.minimum(of("occluded"), coarse) * layers
+        found = found + beyond * _EDGES * np.square(numbers.occluded_anchors) * seen
     # Pixels of the projector, not of all cells: light from beyond its window is a small part.
     places = classes * coarse * numbers.coarse_layers
     if np.any(numbers.indirect):
@@ -313,5 +338,6 @@ def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float
     evidence, settings, paces
         as for :func:`tracing_seconds`.
     """
-    rate = evidence.direct.noise.rate
+    direct = evidence.spread if settings.anchors > 1 else evidence.direct
+    rate = direct.noise.rate
     return paces.ray * predicted_rays(evidence.direct.paths, settings.direct_samples, rate)

@@ -34,7 +34,7 @@ from mitsim.transport.receiver import SensorPoints
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which
 a shadow's fringes hardly move."""
-TRAYS = ("fine", "coarse", "smooth", "followed", "sharp")
+TRAYS = ("fine", "coarse", "occluded", "smooth", "followed", "sharp")
 """Parts of an :class:`FiledLight`."""
 AT_ANCHORS = ("indirect at anchors", "from camera at anchors")
 """Names of the stages that follow light to every anchor."""
@@ -47,14 +47,15 @@ class FiledLight:
     """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
 
     ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees of direct
-    light beyond that, ``smooth`` is indirect light, and ``followed`` what each anchor sees of followed light beyond its
-    average: small or smooth, so coarse cells hold them well. ``sharp`` is direct light of the pixels that are traced
-    apart. Of all light ``received``, a mean over the sensor without its mask,
-    ``outside`` came from beyond all cells: it is in no frame.
+    light beyond that, ``occluded`` the same of occluded pixels, which have more anchors; ``smooth`` is indirect light,
+    and ``followed`` what each anchor sees of followed light beyond its average: small or smooth, so coarse cells hold
+    them well. ``sharp`` is direct light of the pixels that are traced apart. Of all light ``received``, a mean over the
+    sensor without its mask, ``outside`` came from beyond all cells: it is in no frame.
     """
 
     fine: sparse.csr_array
     coarse: sparse.csr_array
+    occluded: sparse.csr_array
     smooth: sparse.csr_array
     followed: sparse.csr_array
     sharp: sparse.csr_array
@@ -142,7 +143,7 @@ class Simulation:
     ----------
     physics
         what is simulated of the bench.
-    fine, coarse, smooth, followed, sharp
+    fine, coarse, occluded, smooth, followed, sharp
         trays for the parts of an :class:`FiledLight`; ``ambient`` and ``followed_ambient`` for lamps' light in the
         cells of ``fine`` and of ``followed``.
     """
@@ -158,6 +159,7 @@ class Simulation:
         coarse = self._grid(pixels, settings.coarse_cells, settings.reach)
         self.fine = self._tray(fine)
         self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
+        self.occluded = self._tray(Bundle(coarse, settings.occluded_anchors, depths))
         self.smooth = self._tray(Bundle(coarse, 1, depths))
         several = Bundle(coarse, settings.followed_anchors, depths)
         self.followed = self._tray(several)
@@ -199,17 +201,25 @@ class Simulation:
     @cached_property
     def direct(self) -> DirectTracer:
         """Follows direct light from the projector to the sensor's centre, or to all of it where anchors are used."""
-        return self._direct(1, self.settings.anchors > 1)
+        return self._direct(1, spread=self.settings.anchors > 1)
 
     @property
     def spread(self) -> DirectTracer:
         """Follows direct light to random points of the sensor."""
-        return self._direct(1, True)
+        return self._direct(1, spread=True)
 
     @cached_property
     def anchored(self) -> DirectTracer | None:
-        """The same to every anchor."""
-        return self._direct(self.settings.anchors) if self.settings.anchors > 1 else None
+        """The same to every anchor, but for occluded pixels."""
+        settings = self.settings
+        return self._direct(settings.anchors, settings.seen_apart) if settings.anchors > 1 else None
+
+    @cached_property
+    def half_hidden(self) -> DirectTracer | None:
+        """Follows direct light of occluded pixels to anchors of their own; none where there are none."""
+        settings = self.settings
+        others = np.setdiff1d(np.arange(self.bench.n**2), settings.seen_apart)
+        return self._direct(settings.occluded_anchors, others) if settings.seen_apart else None
 
     @cached_property
     def apart(self) -> AimedTracer | None:
@@ -220,10 +230,11 @@ class Simulation:
         parts = loaded.scene, loaded.camera, physics.projector, sharp.anchors, physics.geometry
         return AimedTracer(*parts, np.array(sharp.pixels))
 
-    def _direct(self, anchors: int, spread: bool = False) -> DirectTracer:
-        """Of all pixels that are not traced apart."""
+    def _direct(self, anchors: int, without: Labels | tuple[int, ...] = (), spread: bool = False) -> DirectTracer:
+        """Of all pixels that are not traced apart, ``without`` some."""
         loaded, physics, sharp = self.bench.loaded, self.physics, self.settings.sharp
-        pixels = np.setdiff1d(np.arange(self.bench.n**2), sharp.pixels) if sharp else None
+        absent = np.union1d(without, sharp.pixels if sharp else ()).astype(np.int64)
+        pixels = np.setdiff1d(np.arange(self.bench.n**2), absent) if len(absent) else None
         return DirectTracer(loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry, spread, pixels)
 
     @cached_property
@@ -301,6 +312,16 @@ class Simulation:
         """
         return self._light(None, 1, coarse=self._beyond_mean(self.coarse, deposits, labels, samples))
 
+    def file_occluded(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`half_hidden` beyond its mean over the sensor, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        return self._light(None, 1, occluded=self._beyond_mean(self.occluded, deposits, labels, samples))
+
     def file_at_anchors(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`at_anchors` beyond its mean over the sensor, per sample.
 
@@ -359,6 +380,8 @@ class Simulation:
         stages = {"direct": Stage(self.direct, settings.direct_samples, self.file_direct, "direct")}
         if self.anchored is not None:
             stages["anchored"] = Stage(self.anchored, settings.anchored_samples, self.file_anchored, "anchored")
+        if self.half_hidden is not None:
+            stages["occluded"] = Stage(self.half_hidden, settings.occluded_samples, self.file_occluded, "occluded")
         if self.apart is not None:
             stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp")
         if self.indirect is not None:
@@ -416,6 +439,8 @@ class Simulation:
         lights, ambient = [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))], []
         if self.settings.anchors > 1:
             lights.append(Filed(self.coarse.optics, tuple(_rows(group.coarse, 0, first) for group in groups)))
+        if self.settings.seen_apart:
+            lights.append(Filed(self.occluded.optics, tuple(_rows(group.occluded, 0, first) for group in groups)))
         if self.settings.sharp:
             lights.append(Filed(self.sharp.optics, tuple(_rows(group.sharp, 0, first) for group in groups)))
         if self.settings.followed_anchors > 1:

@@ -40,7 +40,8 @@ _NORMAL = 1.645
 _HELD = 8
 """Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
 _MOST_COLUMNS = 2**22
-"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all."""
+"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all, and
+20 to add two unsorted matrices."""
 _shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 
@@ -379,6 +380,8 @@ def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_arr
     places, indices = np.unique(light.indices, return_inverse=True)
     lit = sparse.csr_array((light.data, indices, light.indptr), shape=(light.shape[0], max(len(places), 1)))
     product = (basis @ lit).tocsr()
+    # SciPy adds matrices of sorted rows entry by entry, and others by way of all their columns.
+    product.sort_indices()
     wide = places[product.indices] if len(places) else product.indices
     return sparse.csr_array((product.data, wide, product.indptr), shape=(basis.shape[0], light.shape[1]))
 

@@ -59,6 +59,7 @@ def sampled(settings: Settings, samples: int) -> Settings:
         indirect_samples=each,
         from_camera_samples=each,
         followed_samples=each / 8,
+        occluded_samples=each / 8,
     )
 
 
@@ -86,7 +87,7 @@ def trials(bench: Bench, plan: Plan, evidence: Evidence, patience: float) -> Ite
         ("samples", f"{GROUPS * samples} samples", sampled(now, samples), at_once) for samples in SAMPLES
     ]
     choices += [("cells", f"{cells}x{cells} a pixel", replace(now, subdivision=cells), None) for cells in CELLS]
-    choices += [("anchors", f"{anchors}x{anchors}", replace(now, anchors=anchors), None) for anchors in ANCHORS]
+    choices += [("anchors", f"{anchors}x{anchors}", _with_anchors(now, anchors), None) for anchors in ANCHORS]
     if len(evidence.layers) > 1:
         depths = {layers: evidence.layers[layers] for layers in LAYERS if layers in evidence.layers}
         choices += [
@@ -109,7 +110,7 @@ def without(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, 
     for name in sorted(present & names(lambda effect: effect.in_frames)):
         yield name, replace(settings, effects=settings.effects - {name})
     if settings.anchors > 1:
-        yield "anchors", replace(settings, anchors=1)
+        yield "anchors", replace(settings, anchors=1, occluded_anchors=1)
     if len(settings.depths) > 1:
         yield "layers", replace(settings, layers=())
 
@@ -128,6 +129,11 @@ def _lights(bench: Bench) -> Iterator[tuple[str, Bench]]:
     for name, (wavelengths, parts) in choices.items():
         changes = {"wavelengths_nm": wavelengths, "radiant_shares": parts}
         yield name, replace(bench, rig=replace(bench.rig, projector=model.model_copy(update=changes)))
+
+
+def _with_anchors(settings: Settings, anchors: int) -> Settings:
+    """``settings`` with so many anchors; those of occluded pixels stay, but one is one for all."""
+    return replace(settings, anchors=anchors, occluded_anchors=settings.occluded_anchors if anchors > 1 else 1)
 
 
 def _tracing(settings: Settings, evidence: Evidence) -> float:
@@ -157,7 +163,7 @@ class Stand:
     def finest(self, plan: Plan, margin: float) -> Plan:
         """Everything on, one step finer than ``plan`` in each number, and its accuracy over ``margin`` of noise."""
         evidence, now = self.evidence, plan.settings
-        anchors, layers, cells, followed = (
+        anchors, layers, cells, followed, occluded = (
             next((finer for finer in evidence.ladders[name] if finer > count), count)
             for name, count in zip(COUNTED, counted(now), strict=True)
         )
@@ -168,7 +174,8 @@ class Stand:
             subdivision=cells,
             effects=frozenset(present(self.bench)),
             followed_anchors=followed,
-            coarse_cells=cells,
+            occluded_anchors=occluded,
+            coarse_cells=min(2 * now.coarse_cells, cells),
             coarse_layers=True,
         )
         return replace(plan, settings=settings, sampling_target=plan.accuracy / margin)

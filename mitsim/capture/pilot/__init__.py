@@ -11,10 +11,11 @@ from functools import cached_property
 
 from mitsim.capture import effects
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import LOOKS, Changes, Evidence, Forming, Part, Settings
-from mitsim.capture.pilot.direct import AnchoredLight, FineLight
+from mitsim.capture.evidence import LOOKS, Changes, Effort, Evidence, Forming, Part, Settings
+from mitsim.capture.pilot.direct import AnchoredLight, FineLight, OccludedLight
 from mitsim.capture.pilot.followed import FollowedLight
 from mitsim.capture.pilot.looks import Sample
+from mitsim.capture.pilot.occluded import SMOOTH, occluded_pixels
 from mitsim.capture.pilot.reach import light_reach
 from mitsim.capture.pilot.sharp import sharp_pixels
 from mitsim.capture.pilot.switched import SwitchedEffects
@@ -27,8 +28,9 @@ from mitsim.scene.darkness import why_dark
 from mitsim.transport.left_out import left_out_light
 from mitsim.transport.lobes import SharpLight, sharp_light
 
-STAGES = ("cells", "effects", "anchors", "followed")
-"""What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light."""
+STAGES = ("cells", "effects", "anchors", "followed", "occluded")
+"""What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,
+and of occluded pixels."""
 _STAGE_OF = {
     "cells": "cells",
     "layers": "cells",
@@ -36,9 +38,14 @@ _STAGE_OF = {
     "anchored cells": "anchors",
     "anchored layers": "anchors",
     "followed_anchors": "followed",
+    "occluded_anchors": "occluded",
+    "occluded cells": "occluded",
+    "occluded layers": "occluded",
 }
 FINER = 4
 """Samples of a stage over those of the look before: standard errors are halved at least."""
+_ROUGH = 0.5
+"""Part of the accuracy that a few anchors may leave at most before it is asked which pixels are to blame."""
 _FRAMES_AS_MANY = 20.0
 """Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
 _LOBE_RAYS = 2**20
@@ -54,7 +61,7 @@ _ALIGNED = 1e-6
 
 
 class Look:
-    """A look at a scene, as short as it can be at first; each of its four stages is repeated with more samples.
+    """A look at a scene, as short as it can be at first; each of its stages is repeated with more samples.
 
     Parameters
     ----------
@@ -86,8 +93,13 @@ class Look:
         apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
         self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
         self.samples = dict.fromkeys(STAGES, Sample.of(lighting, bench.geometry.pixels))
+        self.occluded: OccludedLight | None = None
         for stage in STAGES:
             self._measure(stage)
+        if self._rough and (occluded := occluded_pixels(seen, accuracy, integer(seed, "pilot", "occluded"))):
+            self._base = replace(self._base, occluded=occluded)
+            for stage in ("anchors", "occluded"):
+                self._measure(stage)
 
     def refine(self, stage: str) -> None:
         """Repeat a ``stage`` with so many more samples that its standard errors are halved."""
@@ -106,6 +118,12 @@ class Look:
         elif stage == "anchors":
             connections = sum(part.count**2 for part in self.anchored.changes if part.name == stage)
             paths, changes = FIXED.anchored * shown * finer.anchored * connections, len(self.anchored.changes)
+        elif stage == "occluded":
+            if self.occluded is None:
+                return math.inf
+            connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
+            paths = FIXED.occluded * FINER * self.occluded.paths / LOOKS * connections
+            changes = len(self.occluded.changes)
         elif stage == "followed":
             connections = sum(part.count**2 for part in self.followed.changes)
             lanes = sum(self.switched.lanes.values())
@@ -114,6 +132,13 @@ class Look:
             followed = sum(getattr(FIXED, name) * lanes for name, lanes in self.switched.lanes.items())
             paths, changes = FIXED.direct * pixels * finer.direct + followed * finer.followed, len(self.present)
         return LOOKS * paths + changes * float(one)
+
+    @property
+    def _rough(self) -> bool:
+        """Whether a few anchors may leave too much: light that is hidden from part of the sensor, or sharp gloss."""
+        seen = {part: change for part, change in self.anchored.changes.items() if part.name == "anchors"}
+        few = Changes.between(seen, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
+        return few.bound > _ROUGH * self.accuracy
 
     def _finer(self, stage: str) -> Sample:
         sample = self.samples[stage]
@@ -127,6 +152,9 @@ class Look:
             self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
         elif stage == "followed":
             self.followed = FollowedLight(bench, self._everything, sample, self.accuracy, seed)
+        elif stage == "occluded":
+            if base.occluded:
+                self.occluded = OccludedLight(bench, base, sample, self.accuracy, seed, self.fine.judging)
         else:
             self.anchored = AnchoredLight(bench, base, sample, self.accuracy, seed, self.fine.judging)
 
@@ -148,6 +176,8 @@ class Look:
         """What has been found."""
         fine, switched, anchored = self.fine, self.switched, self.anchored
         seen = {**anchored.changes, **fine.changes, **switched.changes, **self.followed.changes}
+        if self.occluded:
+            seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
         return Evidence(
@@ -155,6 +185,7 @@ class Look:
             layers=fine.layers,
             changes=Changes.between(seen, light**2),
             direct=fine.effort(light),
+            spread=fine.spread(light),
             anchored=anchored.effort(light),
             indirect=switched.effort("indirect"),
             from_camera=switched.effort("from_camera"),
@@ -166,6 +197,8 @@ class Look:
             sharp=apart,
             sharp_light=switched.sharp_effort(),
             followed=self.followed.effort(light),
+            occluded=self._base.occluded,
+            occluded_light=self.occluded.effort(light) if self.occluded else Effort.none(),
         )
 
 

@@ -14,8 +14,8 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Effort, Forming, Noise, Part, Settings
 from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, coarsened, ladder, noise
-from mitsim.capture.simulation import FiledLight, Simulation
-from mitsim.core.arrays import FloatArray
+from mitsim.capture.simulation import FiledLight, Simulation, Tray
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.rig.patterns import Lighting
@@ -26,7 +26,10 @@ ANCHOR_LADDER, LAYER_LADDER, CELL_LADDER = (1, 2, 3, 5, 8), (1, 2, 3, 4, 6, 8, 1
 """Numbers that are tried, each step about half the error of the one before or less."""
 _FIRST_JUDGES = {"anchors": 2, "layers": 2, "cells": 1}
 """Indices of the numbers that judge at first: two steps, or one where it is known how the error falls."""
-_FEW_ANCHORS = 3
+OCCLUDED_LADDER = (1, 2, 3, 5, 8, 16, 32)
+"""Numbers that are tried for occluded pixels. An edge's penumbra has kinks, at which interpolation between N anchors
+errs by about 1 / N^1.5; 32 leave a hundredth of what one does."""
+_FEW_ANCHORS, _FEW_OCCLUDED = 3, 5
 """Anchors whose noise is measured: fewer leave a plan's choice to them unseen."""
 _JUDGING = 4
 """Layers that judge one layer for light in coarse cells: the error of one is told to a twentieth."""
@@ -57,7 +60,7 @@ class FineLight:
     def __init__(self, bench: Bench, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self._seeds = [integer(seed, "pilot", "fine", look) for look in range(LOOKS)]
-        self._tracer = _tracer(Simulation(bench, base), sample)
+        self._tracer = _tracer(Simulation(bench, base), _shown(base, sample), base.anchors)
         self._deposits = [self._tracer.trace(seed, 0, sample.fine) for seed in self._seeds]
         simulation = Simulation(bench, base)
         apart, samples = simulation.apart, sample.sharp(simulation)
@@ -99,8 +102,16 @@ class FineLight:
         return found
 
     def effort(self, light: float) -> Effort:
-        """Monte Carlo error of one estimate, relative to all ``light``, how fast it falls, and its paths."""
-        many, few = self._noise
+        """Monte Carlo error of one estimate of what the sensor's centre sees, relative to all ``light``, how fast it
+        falls, and its paths."""
+        return self._effort(self._noise, light)
+
+    def spread(self, light: float) -> Effort:
+        """The same of what random points of the sensor see: gloss differs over the sensor, and makes noise there."""
+        return self._effort(self._spread_noise, light)
+
+    def _effort(self, noises: tuple[float, float], light: float) -> Effort:
+        many, few = noises
         steep = many > 0 and few > 0 and self._fewer < self.sample.fine
         rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
         relative = many / light if light else 0.0
@@ -112,10 +123,18 @@ class FineLight:
 
     @cached_property
     def _noise(self) -> tuple[float, float]:
-        """Error of a look with all samples, and with fewer."""
+        return self._noise_of(self._tracer, self._deposits)
+
+    @cached_property
+    def _spread_noise(self) -> tuple[float, float]:
+        tracer = _tracer(Simulation(self.bench, self.base), _shown(self.base, self.sample), 1, spread=True)
+        return self._noise_of(tracer, [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds])
+
+    def _noise_of(self, tracer: DirectTracer, seen: list[Deposits]) -> tuple[float, float]:
+        """Error of a look of the ``tracer`` as it was ``seen`` with all samples, and with fewer."""
         simulation = Simulation(self.bench, self.base)
-        few = [self._tracer.trace(seed, 0, self._fewer) for seed in self._seeds]
-        many = noise(self._formed(simulation, self._deposits, self.sample.fine))
+        few = [tracer.trace(seed, 0, self._fewer) for seed in self._seeds]
+        many = noise(self._formed(simulation, seen, self.sample.fine))
         return many, noise(self._formed(simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
@@ -175,6 +194,9 @@ class AnchoredLight:
         depths [mm] that judge one layer; none for a flat scene.
     """
 
+    _ladder: tuple[int, ...] = ANCHOR_LADDER
+    _part, _name, _few_anchors = "anchors", "anchored", _FEW_ANCHORS
+
     def __init__(
         self,
         bench: Bench,
@@ -187,18 +209,34 @@ class AnchoredLight:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self.layers = layers
         self._seeds = [integer(seed, "pilot", "anchors", look) for look in range(LOOKS)]
+        self._pixels, self._samples = self._of(sample)
+
+    def _of(self, sample: Sample) -> tuple[Labels, int]:
+        """Pixels that are followed, and samples of each in a look."""
+        return np.setdiff1d(_shown(self.base, sample), self.base.occluded), sample.anchored
+
+    @property
+    def paths(self) -> int:
+        """Paths of all looks to one anchor."""
+        return LOOKS * len(self._pixels) * self._samples
 
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        found = ladder(ANCHOR_LADDER, self._frames, _FIRST_JUDGES["anchors"], self.accuracy)
-        coarse = coarsened("anchored", self._beyond, self.layers)
-        return {**{Part("anchors", count): change for count, change in found.items()}, **coarse}
+        if not len(self._pixels):
+            return {Part(self._part, 1): self._frames(1)}
+        found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], self.accuracy)
+        coarse = coarsened(self._name, self._beyond, self.layers)
+        return {**{Part(self._part, count): change for count, change in found.items()}, **coarse}
 
     def effort(self, light: float) -> Effort:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
         relative = self._noise / light if light else 0.0
-        return Effort(Noise(relative, self.sample.anchored, 0.5), self.bench.n**2)
+        return Effort(Noise(relative, self._samples, 0.5), self._lanes)
+
+    @property
+    def _lanes(self) -> int:
+        return self.bench.n**2 - len(self.base.occluded)
 
     @cached_property
     def _noise(self) -> float:
@@ -206,38 +244,74 @@ class AnchoredLight:
 
     def _beyond(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
         """Frames of what a few anchors see beyond their mean, in coarse cells and layers."""
-        coarse = replace(self.base, anchors=_FEW_ANCHORS, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        simulation, labels = Simulation(self.bench, coarse), self.sample.lighting.labels
-        looks = (simulation.file_anchored(look, labels, self.sample.anchored) for look in self._few)
-        return self._formed(simulation, [light.coarse for light in looks])
+        coarse = replace(self.base, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
+        simulation, labels = self._simulation(self._few_anchors, coarse), self.sample.lighting.labels
+        return self._formed(simulation, [self._filed(simulation, look, labels) for look in self._few])
 
     @cached_property
     def _few(self) -> list[Deposits]:
-        return self._traced(self._simulation(_FEW_ANCHORS))
+        return self._traced(self._simulation(self._few_anchors, self.base))
 
     def _frames(self, anchors: int) -> FloatArray:
-        simulation, labels = self._simulation(anchors), self.sample.lighting.labels
-        traced = self._traced(simulation)
-        return self._formed(simulation, [simulation.coarse.file(look, labels, self.sample.anchored) for look in traced])
+        simulation, labels = self._simulation(anchors, self.base), self.sample.lighting.labels
+        traced, tray = self._traced(simulation), self._tray(simulation)
+        return self._formed(simulation, [tray.file(look, labels, self._samples) for look in traced])
 
-    def _simulation(self, anchors: int) -> Simulation:
-        return Simulation(self.bench, replace(self.base, anchors=anchors))
+    def _simulation(self, anchors: int, settings: Settings) -> Simulation:
+        return Simulation(self.bench, replace(settings, anchors=anchors))
+
+    def _tray(self, simulation: Simulation) -> Tray:
+        """Where light of these pixels is filed."""
+        return simulation.coarse
+
+    def _filed(self, simulation: Simulation, look: Deposits, labels: Labels) -> sparse.csr_array:
+        """Light of a ``look`` beyond its mean over the sensor."""
+        return simulation.file_anchored(look, labels, self._samples).coarse
 
     def _traced(self, simulation: Simulation) -> list[Deposits]:
         """Light to every anchor, look by look."""
-        tracer = _tracer(simulation, self.sample)
-        return [tracer.trace(seed, 0, self.sample.anchored) for seed in self._seeds]
+        anchors = self._tray(simulation).bundle.anchors
+        tracer = _tracer(simulation, self._pixels, anchors)
+        return [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
 
     def _formed(self, simulation: Simulation, lights: list[sparse.csr_array]) -> FloatArray:
         """(looks, shots, pixels, columns) frames of light to every anchor."""
         rows = self.sample.rows
-        filed = Filed(simulation.coarse.optics, tuple(light[: len(rows)] for light in lights))
+        filed = Filed(self._tray(simulation).optics, tuple(light[: len(rows)] for light in lights))
         return ExpectedFrames([filed], Lighting(rows, self.sample.lighting.weights), 0).by_group(self.sample.columns)
 
 
-def _tracer(simulation: Simulation, sample: Sample) -> DirectTracer:
-    """Direct light to every anchor, of those projector pixels only that the sample's shots show."""
+class OccludedLight(AnchoredLight):
+    """The same of occluded pixels, which many anchors see."""
+
+    _ladder = OCCLUDED_LADDER
+    _part, _name, _few_anchors = "occluded_anchors", "occluded", _FEW_OCCLUDED
+
+    def _of(self, sample: Sample) -> tuple[Labels, int]:
+        pixels = np.intersect1d(_shown(self.base, sample), self.base.occluded)
+        return pixels, sample.occluded(len(pixels))
+
+    @property
+    def _lanes(self) -> int:
+        return len(self.base.occluded)
+
+    def _simulation(self, anchors: int, settings: Settings) -> Simulation:
+        return Simulation(self.bench, replace(settings, occluded_anchors=anchors))
+
+    def _tray(self, simulation: Simulation) -> Tray:
+        return simulation.occluded
+
+    def _filed(self, simulation: Simulation, look: Deposits, labels: Labels) -> sparse.csr_array:
+        return simulation.file_occluded(look, labels, self._samples).occluded
+
+
+def _shown(settings: Settings, sample: Sample) -> Labels:
+    """Projector pixels that the shots of a ``sample`` show, but for those that are traced apart."""
+    return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown
+
+
+def _tracer(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
+    """Direct light of some projector ``pixels`` to every anchor, or ``spread`` over the sensor."""
     loaded, physics = simulation.bench.loaded, simulation.physics
-    parts = loaded.scene, loaded.camera, physics.projector, simulation.settings.anchors, physics.geometry
-    apart = simulation.settings.sharp
-    return DirectTracer(*parts, pixels=np.setdiff1d(sample.shown, apart.pixels) if apart else sample.shown)
+    parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
+    return DirectTracer(*parts, spread=spread, pixels=pixels)

@@ -66,6 +66,7 @@ EVIDENCE = Evidence(
     layers={1: (380.0,), 2: (400.0, 300.0), 3: (400.0, 343.0, 300.0), 4: (400.0, 369.0, 327.0, 300.0)},
     changes=changes(SIZES),
     direct=Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
+    spread=Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
     anchored=Effort(Noise(3e-4, 4, 0.5), 16_384, 1e-7),
     indirect=Effort(Noise(4e-3, 2, 0.5), 16_384, 2e-7),
     from_camera=Effort(Noise(1e-2, 2, 0.5), 20_000, 6e-7),
@@ -108,7 +109,7 @@ def random_evidence(seed: int) -> Evidence:
     looks = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), LOOKS, 6))
     efforts = {
         name: replace(getattr(EVIDENCE, name), noise=Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5))
-        for name in ("direct", "anchored", "indirect", "from_camera", "followed")
+        for name in ("direct", "spread", "anchored", "indirect", "from_camera", "followed")
     }
     return replace(EVIDENCE, changes=Changes.between(dict(zip(sizes, looks, strict=True)), 1.0), **efforts)
 
@@ -387,6 +388,46 @@ def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     assert entries(pixels, 49, Numbers.of(finest), finest) > 2**28
 
 
+def test_occluded_pixels_count_with_their_anchors() -> None:
+    """Each of 100 pixels lights four places of its own for each of 16 x 16 anchors, in two layers twice as many; with
+    one anchor it is a pixel like the others."""
+    pixels, few = EVIDENCE.direct.paths, replace(cheapest(1e-2, EVIDENCE, {}).settings, layers=(), coarse_layers=False)
+    own = replace(few, occluded=tuple(range(100)), occluded_anchors=16, occluded_samples=9.0)
+
+    def more(settings: Settings) -> float:
+        return float(entries(pixels, 49, Numbers.of(settings), settings)) - plain
+
+    plain = float(entries(pixels, 49, Numbers.of(few), few))
+    assert more(own) == pytest.approx(100 * 256 * 4 * few.coarse_cells**2)
+    assert more(replace(own, occluded_anchors=1)) == 0
+    layered = replace(own, layers=(400.0, 300.0), coarse_layers=True)
+    plain = float(entries(pixels, 49, Numbers.of(replace(layered, occluded_anchors=1)), layered))
+    assert more(layered) == pytest.approx(2 * 100 * 256 * 4 * few.coarse_cells**2)
+
+
+def with_occluded(sizes: dict[int, float]) -> Evidence:
+    """150 pixels that leave so much by the number of their anchors."""
+    found = changes(SIZES | {Part("occluded_anchors", count): size for count, size in sizes.items()})
+    light = Effort(Noise(1e-4, 4, 0.5), 150)
+    return replace(ONE_CLASS, changes=found, occluded=tuple(range(150)), occluded_light=light)
+
+
+@pytest.mark.parametrize("accuracy", ACCURACIES)
+def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: float) -> None:
+    """One anchor is the sensor's centre, several stand for all of the sensor: for all pixels or for none. What is left
+    of either counts. (Planted: the numbers chosen apart; the occluded pixels' share not counted.)"""
+    evidence = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
+    chosen = cheapest(accuracy, evidence, {})
+    settings = chosen.settings
+    assert (settings.anchors > 1) == (settings.occluded_anchors > 1) and settings.occluded == tuple(range(150))
+    assert chosen.fits and chosen.total.bound <= accuracy
+    left = {1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5}[settings.occluded_anchors]
+    with_none = predicted(accuracy, with_occluded({1: 0.0}), replace(settings, occluded_anchors=1), {})
+    assert chosen.systematic.value == pytest.approx(math.hypot(with_none.systematic.value, left), rel=1e-6)
+    off = cheapest(1e-3, evidence, {"anchors": False})
+    assert off.settings.anchors == off.settings.occluded_anchors == 1 and off.fits, "what the user wants does not count"
+
+
 def test_warnings_of_the_devices_come_first() -> None:
     facts = replace(FACTS, warnings=("the field stop cuts",))
     assert plan(1e-6, facts=facts).warnings[0] == "the field stop cuts"
@@ -481,12 +522,26 @@ def test_accuracies_that_cannot_be_promised(accuracy: float) -> None:
         plan(accuracy)
 
 
+def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
+    """Ten times the noise takes so many more samples where there are several anchors, and none where there is one.
+    (Planted: the centre's noise for both; spread noise with one anchor.)"""
+    noisy = replace(EVIDENCE, spread=Effort(Noise(2e-2, 16, 0.5), 16_384))
+    for switches, factor in (({"anchors": False}, 1.0), ({"anchors": True}, 10.0)):
+        quiet, loud = (cheapest(3e-3, evidence, switches) for evidence in (EVIDENCE, noisy))
+        assert (loud.settings.anchors > 1) == (factor > 1)
+        if factor == 1:
+            assert loud == quiet
+        else:
+            assert loud.settings.direct_samples > 8 * quiet.settings.direct_samples
+            assert 0.3 * loud.target < loud.noise < loud.target
+
+
 def test_samples_take_the_least_work_for_the_target() -> None:
     """Variances v / N add up to the target's over 1.15, as sampling stops by a bound that lies so far above the error.
 
     N is in proportion to sqrt(v / price): the least sum of prices. Whole numbers make both a little better.
     """
-    noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "anchored", "followed")}
+    noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "spread", "anchored", "followed")}
     noises["from_camera"] = Noise(3e-2, 2, 0.5)
     evidence = replace(EVIDENCE, **{name: replace(getattr(EVIDENCE, name), noise=n) for name, n in noises.items()})
     found = cheapest(1e-3, evidence, parse_switches("+interreflection"))

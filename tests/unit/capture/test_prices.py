@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import pytest
 
-from mitsim.capture.evidence import GROUPS, Forming, Settings
+from mitsim.capture.evidence import GROUPS, Effort, Forming, Noise, Settings
 from mitsim.capture.prices import (
     FIXED,
     Numbers,
@@ -54,13 +54,18 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
         ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 3.0}, 3 * products(5, 3) + 3 * products(10, 3)),
         ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
         ({"followed_anchors": 3.0, "coarse_cells": 2.0}, products(5, 3) + products(60, 3)),
+        ({"occluded": 1.0, "occluded_anchors": 4.0}, products(5, 3) + products(2, 3)),
+        ({"occluded": 90.0, "occluded_anchors": 4.0, "coarse_cells": 2.0}, products(5, 3) + products(40, 3)),
         ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
     ],
 )
 def test_forming_a_frame_is_as_many_products_as_its_matrices_have(
     change: dict[str, float], multiplications: float
 ) -> None:
-    """Half of the ten rows of cells hold light; coarse light of several anchors and indirect light add frames."""
+    """Half of the ten rows of cells hold light; coarse light of several anchors and indirect light add frames.
+
+    A quarter of the pixels is lit: of one occluded pixel a quarter of two rows, of many no more than of all.
+    """
     assert forming_seconds(FORMING, replace(ONE, **change), 7.0, COUNTED) == pytest.approx(7 * multiplications)
 
 
@@ -92,6 +97,10 @@ def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_
     several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), paces) for count in (3, 1))
     assert several["direct"] == one["direct"] == GROUPS * 3 * paths
     assert several["anchored"] == 9 * GROUPS * 4 * EVIDENCE.anchored.paths and one["anchored"] == 0
+    occluded = replace(EVIDENCE, occluded=(3, 4, 5), occluded_light=Effort(Noise(1e-3, 4, 0.5), 3))
+    own = replace(settings, occluded=(3, 4, 5), occluded_anchors=8, occluded_samples=2.0)
+    assert tracing_seconds(occluded, own, replace(COUNTED, occluded=1.0))["occluded"] == 64 * GROUPS * 2 * 3
+    assert tracing_seconds(occluded, settings, replace(COUNTED, occluded=1.0))["occluded"] == 0
 
 
 def test_light_lies_in_the_cells_that_its_samples_reach() -> None:

@@ -115,7 +115,8 @@ def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
     lighting = bench.family(PATTERNS).lighting
     plan = make_plan(bench, lighting, 1e-3, SEED)
     evidence = pilot.measure(bench, lighting, 1e-3, SEED)
-    samples = {"direct_samples", "anchored_samples", "indirect_samples", "from_camera_samples", "followed_samples"}
+    kinds = ("direct", "anchored", "indirect", "from_camera", "followed", "occluded")
+    samples = {f"{name}_samples" for name in kinds}
     turned = {
         "samples": samples,
         "cells": {"subdivision"},
