@@ -107,7 +107,8 @@ class FineLight:
         return self._effort(self._noise, light)
 
     def spread(self, light: float) -> Effort:
-        """The same of what random points of the sensor see: gloss differs over the sensor, and makes noise there."""
+        """The same, as a part of ``light``, of what random points of the sensor see: gloss differs over the sensor, and
+        makes noise there."""
         return self._effort(self._spread_noise, light)
 
     def _effort(self, noises: tuple[float, float], light: float) -> Effort:
