@@ -13,7 +13,6 @@ distribution, and each test states how narrow it is. Seeds are fixed.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -22,17 +21,12 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.transport.aperture import aperture_scene_parts, register
-from mitsim.transport.cells import aligned_grid
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT
-from mitsim.transport.indirect import IndirectTracer
-from tests.physics.test_passage import LAMP, METAL, MIRROR, direct_light, mean, plate
+from tests.physics.passages import LAMP, METAL, MIRROR, SEEDS, SIGMAS, THIN, all_light, direct_light, mean, plate
 from tests.unit.transport.test_panes import WALL, slab
 
 pytestmark = pytest.mark.usefixtures("variant")
-SEEDS, SIGMAS, LENS = 8, 7.0, 50.0
-THIN = '<bsdf type="thindielectric"/>'
+LENS = 50.0
 # At x = -40 mm, from 305 to 385 mm: it throws light on the wall, and the camera sees the wall in it.
 MIRROR_WALL = f"""<shape type="rectangle"><transform name="to_world"><scale x="40" y="40"/><rotate y="1" angle="90"/>
     <translate x="-40" z="345"/></transform>{MIRROR}</shape>"""
@@ -58,23 +52,6 @@ def scene(shared_scene: Callable[..., Path], variant: str) -> Callable[..., Benc
         return open_bench(shared_scene(f"panes{next(count)}", extra=extra, **values), variant)
 
     return load
-
-
-def all_light(bench: Bench, seed: int, samples: int, aperture: float = 0.0) -> np.ndarray:
-    """(3,) of each kind at the sensor's centre: ambient, direct, indirect."""
-    loaded, optics = bench.loaded, replace(bench.projector_optics, aperture=aperture, focus=WALL)
-    aim = aligned_grid(*bench.windows, 64, 1, bench.geometry.tan_half_fov + 0.01)
-    parts = loaded.scene, loaded.camera, optics
-    tracers = (
-        (DirectTracer(*parts, 1), samples),
-        (IndirectTracer(*parts, True, True), 4 * samples),
-        (FromCameraTracer(*parts, aim, Paths(True, True, loaded.lamps)), samples),
-    )
-    light = np.zeros(3)
-    for tracer, count in tracers:
-        deposits = tracer.trace(seed, 0, count)
-        light += np.bincount(deposits.kind, deposits.value / count, minlength=3)
-    return light
 
 
 def reference_with_lens(bench: Bench, spp: int) -> tuple[float, float]:
@@ -131,7 +108,7 @@ def test_a_pane_before_the_camera_counts_light_once(scene: Callable[..., Bench])
 )
 def test_all_light_is_that_of_paths_that_meet_the_lens(scene: Callable[..., Bench], name: str) -> None:
     bench = scene(SCENES[name])
-    light = [all_light(bench, seed, 64, LENS) for seed in range(SEEDS)]
+    light = [all_light(bench, seed, 64, LENS, WALL) for seed in range(SEEDS)]
     found, error = mean([float(parts.sum()) for parts in light])
     expected, spread = reference_with_lens(bench, 128 if name in QUICK else 512)
     gate = SIGMAS * np.hypot(error, spread)

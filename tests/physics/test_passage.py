@@ -17,35 +17,21 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.transport.cells import aligned_grid
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import AMBIENT, DIRECT
-from mitsim.transport.indirect import IndirectTracer
 from tests.conftest import write_png
+from tests.physics.passages import LAMP, METAL, MIRROR, SEEDS, SIGMAS, THIN, all_light, direct_light, mean, plate
 
 pytestmark = pytest.mark.usefixtures("variant")
-SEEDS, SIGMAS, WALL = 8, 7.0, 440.0
+WALL = 440.0
 MATT = '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>'
-METAL = """<bsdf type="twosided"><bsdf type="roughconductor"><string name="material" value="none"/>
-    <float name="alpha" value="0.2"/></bsdf></bsdf>"""
-MIRROR = '<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf></bsdf>'
-THIN = '<bsdf type="thindielectric"/>'
 LEAF = """<bsdf type="mask"><texture name="opacity" type="bitmap"><string name="filename" value="leaf.png"/>
     <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/></texture>{inner}</bsdf>"""
-
-
-def plate(z: float, bsdf: str, half: float = 25.0, x: float = 0.0, turn: float = 0.0) -> str:
-    return f"""<shape type="rectangle"><transform name="to_world"><scale x="{half}" y="{half}"/>
-        <rotate y="1" angle="{180 + turn}"/><translate x="{x}" z="{z}"/></transform>{bsdf}</shape>"""
 
 
 def card(opacity: float, inner: str = MATT) -> str:
     return f'<bsdf type="mask"><float name="opacity" value="{opacity}"/>{inner}</bsdf>'
 
 
-LAMP = """<shape type="rectangle"><transform name="to_world"><scale x="15" y="15"/><translate z="120" x="-40"/>
-    </transform>    <emitter type="area"><spectrum name="radiance" value="0.5"/></emitter></shape>"""
 SCENES = {
     "leaf": plate(350, LEAF.format(inner=MATT)),
     "two cut-outs behind each other": plate(350, LEAF.format(inner=MATT), 30)
@@ -73,34 +59,6 @@ def scene(shared_scene: Callable[..., Path], variant: str) -> Callable[..., Benc
         return open_bench(path, variant)
 
     return load
-
-
-def direct_light(bench: Bench, seed: int, samples: int = 64) -> float:
-    """Of the projector over one surface, at the sensor's centre."""
-    loaded = bench.loaded
-    tracer = DirectTracer(loaded.scene, loaded.camera, bench.projector_optics, 1)
-    return float(tracer.trace(seed, 0, samples).value.sum()) / samples
-
-
-def all_light(bench: Bench, seed: int, samples: int = 128) -> np.ndarray:
-    """(3,) of each kind at the sensor's centre: ambient, direct, indirect."""
-    loaded, optics = bench.loaded, bench.projector_optics
-    aim = aligned_grid(*bench.windows, 64, 1, bench.geometry.tan_half_fov + 0.01)
-    parts = loaded.scene, loaded.camera, optics
-    tracers = (
-        (DirectTracer(*parts, 1), samples),
-        (IndirectTracer(*parts, True, True), 4 * samples),
-        (FromCameraTracer(*parts, aim, Paths(True, True, loaded.lamps)), samples),
-    )
-    light = np.zeros(3)
-    for tracer, count in tracers:
-        deposits = tracer.trace(seed, 0, count)
-        light += np.bincount(deposits.kind, deposits.value / count, minlength=3)
-    return light
-
-
-def mean(values: list[float]) -> tuple[float, float]:
-    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def reference(bench: Bench, spp: int) -> tuple[float, float]:
