@@ -10,7 +10,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Evidence, Part, Settings
 from mitsim.capture.plan import SceneFacts
 from mitsim.capture.prices import paces_of
-from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows, stages
+from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows, stages, with_occluded
 
 
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
@@ -100,3 +100,20 @@ def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
     ):
         assert told[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and told[name].seconds > 0, name
     assert told["followed-anchors"].error_if_off == pytest.approx(SIZES[Part("followed_anchors", 1)])
+
+
+def test_the_row_of_occluded_pixels_tells_their_number_and_what_they_leave() -> None:
+    """None: few anchors serve all. Some: one anchor's error, and what the chosen ones leave."""
+    none = rows(plan())["occluded-anchors"]
+    assert (none.state, none.error_if_off, none.seconds) == ("off", 0, 0) and "serve all" in none.reason
+    evidence = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
+    found = plan(evidence=evidence)
+    several, count = rows(found)["occluded-anchors"], found.settings.occluded_anchors
+    assert count > 1 and several.state == "approximate" and several.seconds == 0
+    assert several.error_if_off == pytest.approx(6e-3)
+    left = evidence.ladders["occluded_anchors"][count].value
+    hidden = "150 projector pixels are hidden from part of the sensor"
+    assert several.reason == f"{hidden}: {count}x{count} anchors leave {left:.1e}, one 6.0e-03"
+    one = rows(plan(0.1, evidence, "-anchors"))["occluded-anchors"]
+    assert (one.state, one.seconds) == ("off", 0) and one.error_if_off == pytest.approx(6e-3)
+    assert one.reason == f"{hidden}: one anchor leaves 6.0e-03"
