@@ -1,6 +1,7 @@
 """Light for a family: stopped at its target, by pixel or by class, and only for the families that it was meant for."""
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -88,6 +89,21 @@ def test_purposes_share_no_random_numbers(bench: Bench, plan: Plan, family: Ligh
     )
     assert np.array_equal(scene.flux, again.flux) and (scene.flux != board.flux).mean() > 0.95
     assert len(scene.groups) == GROUPS
+
+
+def test_light_for_another_family_says_how_much_worse_its_frames_are(bench: Bench) -> None:
+    """A shot of 4 pixels has a 64th of uniform light's samples: beyond the accuracy the run is flagged with the cause
+    and what to do, within it one line says so. (Planted: the ratio turned, nothing said.)"""
+    light = bench.light("uniform", accuracy=1e-2)
+    (found,) = light.expose("dots:8").warnings
+    assert found.startswith("the total error is up to") and found.endswith("trace it for dots:8")
+    lax = replace(light, plan=replace(light.plan, accuracy=0.1))
+    with pytest.warns(UserWarning, match=r"traced for uniform, .* trace it for dots:8$") as said:
+        shots = lax.expose("dots:8")
+    assert len(said) == 1 and not shots.warnings
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not lax.expose("uniform").warnings
 
 
 def test_merged_light_has_the_same_frames(bench: Bench, plan: Plan, family: Lighting) -> None:
