@@ -17,9 +17,10 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import Exposer, NoiseTarget
-from mitsim.capture.light import Light, Sampling, make_plan, trace_light
+from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.losses import known_losses
 from mitsim.capture.plan import Plan
+from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Request
 from mitsim.capture.shooting import Shooting, Totals
 from mitsim.core.errors import ArgumentError

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from mitsim.capture import light as module
+from mitsim.capture import planning
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.plan import Plan, SceneFacts
+from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
@@ -173,7 +175,7 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
 def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench) -> None:
     """Direct light and its anchors; other kinds keep what they had. (Planted: seconds of a sample, not of a path.)"""
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
-    timed = module._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
+    timed = planning._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
     for name in ("direct", "anchored"):
         assert 0 < getattr(timed, name).seconds < 1e-4, "a path takes microseconds at most, a sample of them far more"
     assert timed.indirect == EVIDENCE.indirect and timed.followed == EVIDENCE.followed
