@@ -32,7 +32,8 @@ import mitsim as ms
 from mitsim.capture.choice import predicted
 from mitsim.capture.evidence import Estimate
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.planning import make_plan
 from mitsim.core.framefile import read_frame
 from mitsim.core.job import Job
 from mitsim.core.seeds import integer

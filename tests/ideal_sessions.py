@@ -49,7 +49,7 @@ class Bench:
     """What is seen: true factors, and what changes the light of a shot on its way.
 
     ``optics`` takes the light (PIXELS, PIXELS) [electrons] of a shot and gives what the sensor gets; ``stated`` is
-    whether the manifests state the noise.
+    whether the manifests state the noise. Factors and scenes have ``parts`` x ``parts`` numbers for each pixel.
     """
 
     left: np.ndarray
@@ -57,11 +57,12 @@ class Bench:
     optics: Callable[[np.ndarray], np.ndarray] = lambda light: light
     peak: float = PEAK
     stated: bool = True
+    parts: int = 1
 
     def run(self, patterns: str, scene: np.ndarray, seed: int) -> Capture:
         """Noisy shots of a family, the brightest pixel at ``peak``."""
-        family = parse_patterns(patterns, len(scene), seed)
-        lights = [self.left @ (family.light(shot) * scene) @ self.right.T for shot in family.shots]
+        family, whole = parse_patterns(patterns, len(scene) // self.parts, seed), np.ones((self.parts, self.parts))
+        lights = [self.left @ (np.kron(family.light(shot), whole) * scene) @ self.right.T for shot in family.shots]
         gain = self.peak / max(light.max() for light in lights)
         rng, memory = np.random.default_rng([seed, 1]), RunMemory()
         for index, light in enumerate(lights):

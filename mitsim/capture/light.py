@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from operator import add
@@ -13,13 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
-from mitsim.capture.choice import cheapest, doubt
-from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Evidence, Settings, even
-from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
+from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
+from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS
-from mitsim.capture.simulation import AT_ANCHORS, FiledLight, Simulation
+from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
@@ -50,8 +47,6 @@ pixels may have it, and their frames are then off by ten times as much."""
 _BY_CHANCE = 1.5
 """Ratio of the variance over 49 shots to that over eight of them which eight groups of equal shots exceed by chance in
 one of fifty (20000 trials: 1.37 in one of twenty, 1.58 in one of a hundred)."""
-_REHEARSED = 2**16
-"""Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes."""
 
 
 @dataclass(frozen=True)
@@ -199,68 +194,6 @@ class Light:
         The board is the session's: one of reflectance 0.99 counts as 1.
         """
         return self.apparent.reflectance
-
-
-@single_threaded_blas()
-def make_plan(
-    bench: Bench, lighting: Lighting, accuracy: float, seed: int, switches: Mapping[str, bool] | None = None
-) -> Plan:
-    """Look at the scene for a moment and decide what to simulate.
-
-    Parameters
-    ----------
-    bench, lighting
-        the scene, and the family's pixels and shots.
-    accuracy
-        relative rms error of the expected frames.
-    seed
-        root of the pilot's random streams.
-    switches
-        effects that are switched on or off by name, whatever they are worth.
-
-    Raises
-    ------
-    MitsimError
-        for a scene that the factored estimator cannot render.
-    """
-    check_accuracy(accuracy)
-    if bench.loaded.unfit.factored is not None:
-        raise bench.loaded.unfit.factored
-    started = time.perf_counter()
-    look = pilot.Look(bench, lighting, accuracy, seed)
-    while True:
-        evidence = look.evidence
-        worth, part = doubt(accuracy, evidence, switches or {})
-        stage = pilot.stage_of(part)
-        if look.price(stage) > worth:
-            break
-        look.refine(stage)
-    chosen = cheapest(accuracy, evidence, switches or {}).settings
-    timed = _timed(evidence, Simulation(bench, chosen), lighting.labels, seed)
-    plan = decide(accuracy, timed, SceneFacts.of(bench), switches)
-    return plan.taking(plan=time.perf_counter() - started)
-
-
-def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
-    """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
-    own, found = integer(seed, "pilot", "paces"), {}
-    at_anchors = [0.0, 0]
-    for name, stage in simulation.tracers().items():
-        samples, taken = max(1, _REHEARSED // stage.tracer.lanes), []
-        # The first, small one compiles the kernel; of the others the shorter was less disturbed.
-        for count in (1, samples, samples):
-            started = time.perf_counter()
-            stage.file(stage.tracer.trace(own, 0, count), labels, count)
-            taken.append(time.perf_counter() - started)
-        seconds = min(taken[1:]) / samples
-        if name in AT_ANCHORS:
-            at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
-            continue
-        field = f"{name}_light" if name in ("sharp", "occluded") else name
-        found[field] = replace(getattr(evidence, field), seconds=seconds / stage.tracer.lanes)
-    if at_anchors[1]:
-        found["followed"] = replace(evidence.followed, seconds=at_anchors[0] / at_anchors[1])
-    return replace(evidence, **found)
 
 
 @single_threaded_blas()

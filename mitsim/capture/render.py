@@ -14,8 +14,9 @@ import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
-from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.losses import known_losses
+from mitsim.capture.planning import make_plan
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame

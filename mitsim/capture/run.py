@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,9 +17,10 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import Exposer, NoiseTarget
-from mitsim.capture.light import Light, Sampling, make_plan, trace_light
+from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.losses import known_losses
 from mitsim.capture.plan import Plan
+from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Request
 from mitsim.capture.shooting import Shooting, Totals
 from mitsim.core.errors import ArgumentError
@@ -46,6 +48,9 @@ at 0.03, 17 dB at 0.3, and 12 dB, next to no image, at 3."""
 _DILUTED = 10.0
 """Error relative to the projector's light, over the accuracy, from which a run is flagged: another order of magnitude
 than was asked for. It is stated in all runs; lamp_bench as shipped has 7."""
+_NOISIER = 2.0
+"""Monte Carlo error of a family's frames over that of the family the light was traced for, above which that is said:
+6 dB of an image. Families whose shots light as many pixels are alike to a tenth."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
@@ -197,6 +202,9 @@ def capture(
             warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
             versions=versions(),
         )
+        foreign = _foreign(light, totals, request)
+        if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
+            warnings.warn(foreign, stacklevel=4)
         return Capture.recorded(recorder, manifest)
 
 
@@ -256,7 +264,11 @@ def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request
     if not light.reached:
         yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
     elif total.bound > accuracy and not light.plan.warnings and request.noise_fraction is None:
-        yield f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"
+        reason = _foreign(light, totals, request)
+        yield (
+            f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"
+            + (f": {reason}" if reason else "")
+        )
     if totals.removed > accuracy:
         yield f"interpolation between anchors left {totals.removed:.1e} of a frame below zero; ask for more"
     if totals.heaviest > _FIREFLIES and totals.mc_error > _NEGLIGIBLE * accuracy:
@@ -270,6 +282,17 @@ def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request
         yield from _of_ambient_light(shooting, accuracy, total.bound * shooting.dilution)
     if shooting.saturated:
         yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
+
+
+def _foreign(light: Light, totals: Totals, request: Request) -> str:
+    """Why frames are noisier than the light was planned for, and what to do; empty where they are not."""
+    traced = light.plan.request.patterns if light.plan.request else request.patterns
+    if traced == request.patterns or totals.mc_error <= _NOISIER * light.sampling_error:
+        return ""
+    return (
+        f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
+        f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for {request.patterns}"
+    )
 
 
 def _of_ambient_light(shooting: Shooting, accuracy: float, of_projector: float) -> Iterator[str]:

@@ -17,8 +17,9 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.exposer import Exposer, in_chunks
-from mitsim.capture.light import Light, Sampling, make_plan, trace_light
+from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.plan import Plan
+from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Exposure
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError

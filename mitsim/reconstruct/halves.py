@@ -38,14 +38,19 @@ class Halves:
     right: Side
 
     @cached_property
-    def _squares(self) -> tuple[FloatArray, FloatArray]:
-        """(r, r') squared differences of the halves of rows, and of columns, in units of a number's variance; NaN where
-        halves cannot be told apart."""
-        rows, columns = self.left.first_half, self.right.first_half
+    def differences(self) -> tuple[FloatArray, FloatArray]:
+        """(r, r') W_0 - G W of the halves of rows, and of the halves of columns."""
         total = self.quarters.sum(axis=(0, 1))
-        by_row = self.quarters[0].sum(axis=0) - rows @ total
-        by_column = self.quarters[:, 0].sum(axis=0) - total @ columns
-        return np.square(by_row) / _spread(rows)[:, None], np.square(by_column) / _spread(columns)
+        by_row = self.quarters[0].sum(axis=0) - self.left.first_half @ total
+        by_column = self.quarters[:, 0].sum(axis=0) - total @ self.right.first_half
+        return by_row, by_column
+
+    @cached_property
+    def _squares(self) -> tuple[FloatArray, FloatArray]:
+        """The squares of :attr:`differences` in units of a number's variance; NaN where halves cannot be told apart."""
+        rows, columns = (_told(half_spread(side.first_half)) for side in (self.left, self.right))
+        by_row, by_column = self.differences
+        return np.square(by_row) / rows[:, None], np.square(by_column) / columns
 
     @cached_property
     def typical(self) -> float:
@@ -63,9 +68,13 @@ class Halves:
         return np.asarray(np.outer(self.left.singular, self.right.singular) > 0)
 
 
-def _spread(half: FloatArray) -> FloatArray:
-    """(r,) variance of W_0 - G W for white noise of variance 1: the diagonal of G (I - G); NaN where too small."""
-    spread = np.diag(half) - np.einsum("ij,ji->i", half, half)
+def half_spread(half: FloatArray) -> FloatArray:
+    """(r,) variance of W_0 - G W for white noise of variance 1, G being ``half``: the diagonal of G (I - G)."""
+    return np.asarray(np.diag(half) - np.einsum("ij,ji->i", half, half))
+
+
+def _told(spread: FloatArray) -> FloatArray:
+    """``spread`` where it is not too small; otherwise NaN."""
     return np.where(spread >= _LEAST_SPREAD, spread, np.nan)
 
 

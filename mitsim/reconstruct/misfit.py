@@ -78,7 +78,7 @@ class Misfit:
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
         cause = f"; likely cause: {self.cause.value[0]}" if self.cause else ""
-        return f"misfit: chi-square {self.chi_square:.3g} a datum{noise}, {self.unexplained:.1e} unexplained{cause}"
+        return f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, {self.unexplained:.1e} unexplained{cause}"
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
@@ -97,13 +97,18 @@ class Misfit:
         """The ``status`` of a solution with this misfit."""
         if not self.flagged or self.cause is None:
             return status
-        times = f", {self.chi_square:.3g} times what its noise makes" if self.stated else ""
+        times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
         sentence = (
             f"{self.unexplained:.1%} of the measurements fit no image{times}; likely cause: {self.cause.value[0]}"
         )
         if not status.verdict.good:
             return replace(status, flags=(*status.flags, f"Misfit: {sentence}; {self.cause.value[1]}."))
         return replace(status, verdict=Verdict.MISFIT, sentence=f"Misfit: {sentence}", remedy=self.cause.value[1])
+
+
+def shown(chi_square: float) -> str:
+    """A ``chi_square`` as people read it: fitting images differ in the third decimal, others by orders of magnitude."""
+    return f"{chi_square:.3f}" if chi_square < 10 else f"{chi_square:.3g}"
 
 
 class Residuals:

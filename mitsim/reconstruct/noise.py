@@ -9,14 +9,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import FactorNoise, RunManifest
 from mitsim.core.measurement import Measurement
-from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
-
-EDGES = 2.9
-"""Energy of hard edges at any place within a pixel over that of the ramp that their image shows: the dipole of an edge
-at t is t (1 - t) / 2 with a mean square of 1/120; the slopes that the image shows around it bring 1/346."""
-PRINT = (1 + EDGES) / 2
-"""The same of print that may have hard edges or none: their mean."""
 
 
 class FrameNoise:
@@ -125,52 +118,6 @@ def factor_energy(
         spread = np.square(seen @ (other.basis * other.singular)).sum(axis=1)
         spare = 1 - own.rank / own.data_rows
         total += own.sensor_size * deviation**2 * spare * float(np.square(lit).sum(axis=1) @ spread)
-    return total
-
-
-def print_energy(
-    prepared: Prepared,
-    factors: tuple[FloatArray, FloatArray],
-    patterns: tuple[FloatArray, FloatArray],
-    image: FloatArray,
-) -> float:
-    """Energy outside the model's range of print that changes within a projector pixel.
-
-    Light of slope g a pixel moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T, Phi_R' being the slope of Phi_R along
-    its columns. With C = S_L V_L^T g / 12 that is sum_pq (C^T C o P_R P_R^T o Phi_R'^T Phi_R')[p, q] in all, of which
-    |C T|^2 is in the range, T being :func:`moved_responses`; and the same of the other side.
-
-    Parameters
-    ----------
-    prepared, factors, patterns
-        the factorised model, its factors, and P_L (n, K) and P_R (n', K').
-    image
-        (n, n').
-    """
-    total = 0.0
-    left, right = prepared.left, prepared.right
-    sides = (left, right, factors[1], patterns[1], image), (right, left, factors[0], patterns[0], image.T)
-    for other, own, factor, lit, seen in sides:
-        if seen.shape[1] > 1:
-            slope = np.gradient(factor, axis=1)
-            along = (other.basis * other.singular).T @ np.gradient(seen, axis=1) / 12
-            everything = np.sum((along.T @ along) * (lit @ lit.T) * (slope.T @ slope))
-            total += float(everything - np.square(along @ moved_responses(own, factor, lit)).sum())
-    return EDGES * max(total, 0.0)
-
-
-def moved_responses(side: Side, factor: FloatArray, patterns: FloatArray) -> FloatArray:
-    """(n, r) sum_j diag(p_j) Phi'^T U_j: what coefficients see of light one pixel beside the centre of its own.
-
-    Parameters
-    ----------
-    side, factor, patterns
-        one side of the model, its factor Phi (m, n), and its patterns (n, K).
-    """
-    slope = np.gradient(factor, axis=1) if factor.shape[1] > 1 else np.zeros_like(factor)
-    total = np.zeros((factor.shape[1], len(side.singular)))
-    for column, slab in zip(patterns.T, side.slabs, strict=True):
-        total[:, slab.columns] += column[:, None] * (slope.T @ slab.matrix)
     return total
 
 

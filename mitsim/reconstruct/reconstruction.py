@@ -23,9 +23,10 @@ from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
+from mitsim.reconstruct.detail import print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import Misfit, judge
-from mitsim.reconstruct.noise import FrameNoise, factor_energy, print_energy
+from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Status, Verdict
 from mitsim.reconstruct.tv import solve_tv

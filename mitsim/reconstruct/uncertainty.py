@@ -22,9 +22,8 @@ and the same with the sides exchanged. G is taken apart into a few products of a
 blocks share no row, such as ``random``, rho leaves out what is correlated between coefficients.)
 
 Print that changes within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its
-light g / 12 pixels off the centre, which moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T, Phi_R' being the slope of
-Phi_R along its columns; what that does to the image stands for print that is finer than the image shows, which may have
-hard edges or none.
+light g / 12 pixels off the centre; what that does to the image stands for print that may have hard edges or none, which
+is the least. Finer print is told by what halves of the sensor disagree on (:mod:`mitsim.reconstruct.detail`).
 
 Simulated light is off by its sampling, projector pixel by projector pixel: an error of the image that is kept as the
 image is. What lambda takes away, lambda x / (sigma^2 + lambda) of each coefficient x, is no noise, but as large as the
@@ -43,7 +42,9 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.framefile import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.noise import PRINT, FrameNoise, moved_responses
+from mitsim.reconstruct.detail import PRINT, disagreement, moved_responses
+from mitsim.reconstruct.halves import Halves
+from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
@@ -202,21 +203,32 @@ class Propagation:
         near = gaussian_filter(seen, _NEAR, mode="nearest")
         return everywhere * near / near.mean() if near.any() else everywhere
 
-    def of_factors(self, noise: FactorNoise, image: FloatArray) -> FloatArray:
-        """(n, n') variance of an ``image`` by ``noise`` of the factors."""
+    def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, n') variances of an ``image`` by ``noise`` of the left factor, and of the right one."""
         left, right = self._sides
         rows = _of_factor(left, right, self.patterns[0], self.terms, image)
         columns = _of_factor(right, left, self.patterns[1], self.terms[::-1], image.T).T
-        return np.asarray(noise.left**2 * rows + noise.right**2 * columns)
+        return noise.left**2 * rows, noise.right**2 * columns
 
     def of_print(self, image: FloatArray) -> FloatArray:
         """(n, n') mean square of what an ``image`` is off by when its print changes within every projector pixel."""
         left, right = self._sides
-        gain = self.gain
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
-        moved = [moved_responses(*side) for side in zip(self._sides, self.factors, self.patterns, strict=True)]
+        moved = [each.sum(axis=0) for each in self._moved]
         seen = moved[0].T @ rows @ (right.basis * right.singular), (left.basis * left.singular).T @ columns @ moved[1]
-        return PRINT * sum((np.square(self.prepared.image(gain * each)) for each in seen), np.zeros_like(image))
+        return PRINT * sum((np.square(self.prepared.image(self.gain * each)) for each in seen), np.zeros_like(image))
+
+    def of_disagreement(self, halves: Halves, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """(n, n') variance of the image by what ``halves`` of the sensor disagree on beyond chance.
+
+        Parameters
+        ----------
+        halves
+            of the image's data.
+        rows, columns
+            (n, n') variances of the image by known errors that change from sensor row to row, and column to column.
+        """
+        return disagreement(self.prepared, self.gain, halves, self._moved, (rows, columns))
 
     def _spread(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
@@ -226,6 +238,11 @@ class Propagation:
         """(n, n') variance of the image, that of each of its coefficients being ``variances`` (r, r')."""
         left, right = (np.square(side.basis) for side in self._sides)
         return np.asarray(left @ variances @ right.T)
+
+    @cached_property
+    def _moved(self) -> tuple[FloatArray, FloatArray]:
+        left, right = zip(self._sides, self.factors, self.patterns, strict=True)
+        return moved_responses(*left), moved_responses(*right)
 
     @property
     def _sides(self) -> tuple[Side, Side]:
@@ -258,12 +275,15 @@ def uncertainty(
         its data in the diagonal basis.
     """
     zero, data = np.zeros_like(image), problem.data_count
+    frames = propagation.of_frames(noise.rows, noise.columns)
+    left, right = propagation.of_factors(factors, image) if factors else (zero, zero)
+    told = propagation.of_disagreement(problem.halves, frames + left, frames + right) if problem.halves else zero
     variances = {
-        "frame_noise": propagation.of_frames(noise.rows, noise.columns),
+        "frame_noise": frames,
         "ambient_frame": propagation.of_ambient_frame(*noise.ambient) if noise.ambient else zero,
         "rendering": propagation.of_white(noise.discretisation / data) + propagation.of_light(noise.light_error**2),
-        "calibration_noise": propagation.of_factors(factors, image) if factors else zero,
-        "print_detail": propagation.of_print(image),
+        "calibration_noise": left + right,
+        "print_detail": np.maximum(propagation.of_print(image), told),
         "exposure": np.square(exposure * image),
         "regularisation_bias": propagation.of_regularisation(problem, float(noise.variance.mean())),
     }

@@ -22,6 +22,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri, grey_png, lightness
+from mitsim.reconstruct.misfit import shown
 from mitsim.study import plots
 from mitsim.study.metrics import Quality
 from mitsim.study.trust import Trust
@@ -157,6 +158,7 @@ def render_html(report: ReportData) -> str:
     )
     environment.filters.update(
         sci=_scientific,
+        chi=lambda value: _DASH if value is None else shown(value),
         db=_decibel,
         seconds=_seconds,
         trouble=_trouble,

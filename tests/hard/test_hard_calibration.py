@@ -346,7 +346,7 @@ def test_a_saturated_session_is_flagged(
     """
     from mitsim.capture.bench import open_bench
     from mitsim.capture.effects import EFFECTS
-    from mitsim.capture.light import make_plan
+    from mitsim.capture.planning import make_plan
 
     def simple_plan(*arguments: object) -> object:
         return make_plan(*arguments, switches=dict.fromkeys(EFFECTS, False))

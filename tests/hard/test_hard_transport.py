@@ -21,8 +21,8 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.light import make_plan
 from mitsim.capture.pilot import measure
+from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics

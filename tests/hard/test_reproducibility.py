@@ -18,8 +18,9 @@ from threadpoolctl import threadpool_limits
 from mitsim.capture import light
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import LOOKS, Changes, Part
-from mitsim.capture.light import make_plan, trace_light
+from mitsim.capture.light import trace_light
 from mitsim.capture.pilot import direct, looks
+from mitsim.capture.planning import make_plan
 from mitsim.core import parallel
 from mitsim.core.framefile import read_frame
 from mitsim.optics import frames

@@ -16,7 +16,8 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
-from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.planning import make_plan
 from mitsim.capture.render import projected
 from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped

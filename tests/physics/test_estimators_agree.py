@@ -32,8 +32,9 @@ import pytest
 from scipy import stats
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.light import Light, Sampling, make_plan, trace_light
+from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.plan import Plan
+from mitsim.capture.planning import make_plan
 from mitsim.capture.render import projected
 from mitsim.rig.patterns import Lighting
 

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from scipy.signal import max_len_seq
 
-from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.planning import make_plan
 from mitsim.optics.glint import GlintFrames, glint_frames
 from mitsim.optics.samplers import geometric_samplers
 from mitsim.rig.patterns import Lighting, parse_patterns

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.light import make_plan
+from mitsim.capture.planning import make_plan
 from mitsim.rig.patterns import Lighting
 from tests.physics.plan_property import Effort, answer, planned, total_error
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.light import Light, Sampling, make_plan, trace_light
+from mitsim.capture.light import Light, Sampling, trace_light
+from mitsim.capture.planning import make_plan
 from mitsim.rig.patterns import Lighting
 from tests.hard.test_hard_transport import GLINT, PLACE, SCALE, gauss, glossy, lobe
 

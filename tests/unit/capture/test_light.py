@@ -1,6 +1,7 @@
 """Light for a family: stopped at its target, by pixel or by class, and only for the families that it was meant for."""
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +11,13 @@ import numpy as np
 import pytest
 
 from mitsim.capture import light as module
+from mitsim.capture import planning
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.plan import Plan, SceneFacts
+from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
@@ -90,6 +93,21 @@ def test_purposes_share_no_random_numbers(bench: Bench, plan: Plan, family: Ligh
     assert len(scene.groups) == GROUPS
 
 
+def test_light_for_another_family_says_how_much_worse_its_frames_are(bench: Bench) -> None:
+    """A shot of 4 pixels has a 64th of uniform light's samples: beyond the accuracy the run is flagged with the cause
+    and what to do, within it one line says so. (Planted: the ratio turned, nothing said.)"""
+    light = bench.light("uniform", accuracy=1e-2)
+    (found,) = light.expose("dots:8").warnings
+    assert found.startswith("the total error is up to") and found.endswith("trace it for dots:8")
+    lax = replace(light, plan=replace(light.plan, accuracy=0.1))
+    with pytest.warns(UserWarning, match=r"traced for uniform, .* trace it for dots:8$") as said:
+        shots = lax.expose("dots:8")
+    assert len(said) == 1 and not shots.warnings
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not lax.expose("uniform").warnings
+
+
 def test_merged_light_has_the_same_frames(bench: Bench, plan: Plan, family: Lighting) -> None:
     light = trace_light(bench, plan, family, 3)
     merged = light.merged()
@@ -157,7 +175,7 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
 def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench) -> None:
     """Direct light and its anchors; other kinds keep what they had. (Planted: seconds of a sample, not of a path.)"""
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
-    timed = module._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
+    timed = planning._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
     for name in ("direct", "anchored"):
         assert 0 < getattr(timed, name).seconds < 1e-4, "a path takes microseconds at most, a sample of them far more"
     assert timed.indirect == EVIDENCE.indirect and timed.followed == EVIDENCE.followed

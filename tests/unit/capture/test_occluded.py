@@ -13,8 +13,8 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
-from mitsim.capture.light import make_plan
 from mitsim.capture.pilot.occluded import occluded_pixels
+from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting, parse_patterns

@@ -14,8 +14,9 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
-from mitsim.capture.light import Light, Sampling, make_plan, trace_light
+from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.pilot.reach import light_reach
+from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.rig.patterns import Lighting

@@ -15,7 +15,8 @@ from mitsim.capture import run
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.light import make_plan, trace_light
+from mitsim.capture.light import trace_light
+from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Exposure
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame

@@ -16,8 +16,8 @@ from mitsim.capture.calibrate import calibrate
 from mitsim.capture.checkpoint import Checkpoint
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
-from mitsim.capture.light import make_plan
 from mitsim.capture.plan import Plan
+from mitsim.capture.planning import make_plan
 from mitsim.capture.session import SIDES, Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame

@@ -12,7 +12,8 @@ import pytest
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS
-from mitsim.capture.light import Sampling, make_plan, trace_light
+from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Request
 from mitsim.core.job import Job
 from mitsim.study import accuracy, find_study, plots

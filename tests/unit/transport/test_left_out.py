@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.light import make_plan
+from mitsim.capture.planning import make_plan
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.cells import aligned_grid
 from mitsim.transport.left_out import left_out_light
