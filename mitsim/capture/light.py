@@ -236,7 +236,7 @@ def make_plan(
         look.refine(stage)
     chosen = cheapest(accuracy, evidence, switches or {}).settings
     timed = _timed(evidence, Simulation(bench, chosen), lighting.labels, seed)
-    plan = decide(accuracy, timed, SceneFacts.of(bench), switches)
+    plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches)
     return plan.taking(plan=time.perf_counter() - started)
 
 

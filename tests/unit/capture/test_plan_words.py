@@ -9,6 +9,7 @@ import pytest
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Part
 from mitsim.capture.plan import SceneFacts
+from mitsim.scene.guard.estimators import Unfit
 from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows
 
 
@@ -18,7 +19,7 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         field_stop_cuts=cuts,
         geometry=geometry,
         spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
-        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5)),
+        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5), unfit=Unfit()),
     )
 
 
