@@ -313,6 +313,8 @@ class Bench:
         """The same rig before a diffuse board of that ``reflectance`` on the aligned plane, larger than the view."""
         import mitsuba as mi
 
+        from mitsim.scene.guard.estimators import Unfit
+
         z = self.geometry.scene_distance
         half = 1.1 * (self.geometry.tan_half_fov * z + self.geometry.half_width)
         place = mi.ScalarAffineTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180).scale([half, half, 1])
@@ -324,7 +326,8 @@ class Bench:
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
-        return replace(self, loaded=replace(self.loaded, scene=scene, lamps=(), mirrors=False, glossy=False))
+        alone = replace(self.loaded, scene=scene, lamps=(), mirrors=False, glossy=False, unfit=Unfit())
+        return replace(self, loaded=alone)
 
 
 def open_bench(

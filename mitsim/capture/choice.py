@@ -254,7 +254,7 @@ class _Table:
         settings = replace(settings, **samples)
         lacking = {
             "light over sharp lobes": self.evidence.unresolved,
-            "light over mirrors or curved glass both ways (left out)": self.evidence.left_out,
+            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": self.evidence.left_out,
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mitsim.capture.choice import Choice, cheapest, predicted
 from mitsim.capture.effects import EFFECTS, Effect
 from mitsim.capture.evidence import GROUPS, Estimate, Evidence, Settings
+from mitsim.capture.losses import known_losses
 from mitsim.capture.prices import (
     Numbers,
     Paces,
@@ -172,7 +173,7 @@ class SceneFacts:
     keystone
         how far the projector's window is off a square [projector pixels].
     warnings
-        what the model of the devices does not cover.
+        what the model of the devices does not cover, and which of the scene's light frames are known to lack.
     """
 
     notes: Mapping[str, str]
@@ -180,9 +181,9 @@ class SceneFacts:
     warnings: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, bench: Bench) -> SceneFacts:
-        """The facts of ``bench``."""
-        geometry, warnings = bench.geometry, []
+    def of(cls, bench: Bench, switches: Mapping[str, bool] | None = None) -> SceneFacts:
+        """The facts of ``bench``, without what effects that the user's ``switches`` put out would bring."""
+        geometry, warnings = bench.geometry, [*known_losses(bench.loaded, switches or {})]
         if bench.field_stop_cuts:
             warnings.append(
                 "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred "

@@ -9,9 +9,9 @@ from dataclasses import replace
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.choice import cheapest, doubt
-from mitsim.capture.evidence import Evidence
+from mitsim.capture.evidence import GROUPS, Evidence
 from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
-from mitsim.capture.simulation import AT_ANCHORS, Simulation
+from mitsim.capture.simulation import AT_ANCHORS, Simulation, Stage
 from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
@@ -19,6 +19,9 @@ from mitsim.rig.patterns import Lighting
 
 _REHEARSED = 2**16
 """Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes."""
+_LONG, _MORE = 5.0, 16
+"""Seconds of a stage from which its pace is told by so many times as many paths: a hundredth of what it takes, and the
+cost of launches and of filing few entries no longer counts as if it grew with the paths."""
 
 
 @single_threaded_blas()
@@ -57,8 +60,15 @@ def make_plan(
         look.refine(stage)
     chosen = cheapest(accuracy, evidence, switches or {}).settings
     timed = _timed(evidence, Simulation(bench, chosen), lighting.labels, seed)
-    plan = decide(accuracy, timed, SceneFacts.of(bench), switches)
+    plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches)
     return plan.taking(plan=time.perf_counter() - started)
+
+
+def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
+    """What so many ``samples`` of a ``stage`` take to be traced and filed."""
+    started = time.perf_counter()
+    stage.file(stage.tracer.trace(seed, 0, samples), labels, samples)
+    return time.perf_counter() - started
 
 
 def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
@@ -69,10 +79,10 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
         samples, taken = max(1, _REHEARSED // stage.tracer.lanes), []
         # The first, small one compiles the kernel; of the others the shorter was less disturbed.
         for count in (1, samples, samples):
-            started = time.perf_counter()
-            stage.file(stage.tracer.trace(own, 0, count), labels, count)
-            taken.append(time.perf_counter() - started)
+            taken.append(_seconds(stage, own, labels, count))
         seconds = min(taken[1:]) / samples
+        if GROUPS * stage.predicted * seconds > _LONG:
+            seconds = min(seconds, _seconds(stage, own, labels, _MORE * samples) / (_MORE * samples))
         if name in AT_ANCHORS:
             at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
             continue

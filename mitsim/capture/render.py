@@ -15,7 +15,6 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.light import Sampling, trace_light
-from mitsim.capture.losses import known_losses
 from mitsim.capture.planning import make_plan
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -205,7 +204,7 @@ def render(
         plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
-        warnings = (*light.warnings, *known_losses(bench.loaded, effects or {}))
+        warnings = light.warnings
         frame = next(iter(light.frames(uniform, seed)))
         mean = frame.irradiance[..., None]
         error = np.full_like(mean, math.sqrt(frame.variance))

@@ -260,10 +260,10 @@ def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
 
 def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
-    yield from known_losses(light.simulation.bench.loaded, request.effects)
+    foretold = set(light.plan.warnings) - set(known_losses(light.bench.loaded, request.effects))
     if not light.reached:
         yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
-    elif total.bound > accuracy and not light.plan.warnings and request.noise_fraction is None:
+    elif total.bound > accuracy and not foretold and request.noise_fraction is None:
         reason = _foreign(light, totals, request)
         yield (
             f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"

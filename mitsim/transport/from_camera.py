@@ -37,6 +37,9 @@ from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 
+_SELDOM_MET = 1e3
+"""Density [1/sr] of a turn above which connections seldom meet its lobe, a thousandth of a steradian, as of a GGX lobe
+of roughness 0.009: direct light over such lobes is traced apart, light over a mirror besides is not."""
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
 
@@ -47,7 +50,8 @@ class Paths:
 
     ``mirrors``: over delta reflections and transmissions on the camera's side; ``interreflection``: any number of
     bounces; ``emitters``: other lights of the scene, all of them one class of ambient light. ``caustics_alone``: of all
-    this, only what mirrors bring from the projector's lens to the last surface, which no connection finds.
+    this, only what mirrors bring from the projector's lens to the last surface, which no connection finds, and light
+    over a mirror and a sharp lobe, which few do.
     """
 
     mirrors: bool = False
@@ -245,10 +249,18 @@ class _Walk(Walk):
         """
         active = self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
         if self.paths.caustics_alone:
-            active &= self.by_delta
+            active = (active & self.by_delta) | self._over_mirror_and_lobe()
         hit = self.connector.hit(self.ray, si.t, self.rng, active, self.since)
-        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, hit.pdf))
+        found = self.by_delta | self.paths.caustics_alone
+        share = dr.select(found, 1, self._share(self.came_pdf, hit.pdf))
         self._keep_of_projector(hit.met, self._radiance(hit.radiance) * share, hit.pixel, self.surfaces - 1)
+
+    def _over_mirror_and_lobe(self) -> mi.Bool:
+        """Paths over one sharp lobe that was seen in a mirror, or whose light came over one: connections of either side
+        would have to meet the lobe by chance."""
+        seen = self.in_mirror & ~self.by_delta & (self.came_pdf > _SELDOM_MET)
+        lit = ~self.in_mirror & self.by_delta & (self.part > camera_part(mi.Float(_SELDOM_MET)))
+        return self.active & (self.surfaces == 2) & (seen | lit)
 
     def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""

@@ -1,9 +1,9 @@
 """Light that no tracer finds: a scene and its pinhole projector in, how much of it there is out.
 
 Light that mirrors or curved glass bring both from the projector to a surface and from there to the camera (a print in a
-bottle), and the part of indirect light that is followed from the camera to a caustic: a path from the camera meets no
-pinhole, and none from the projector the sensor's centre. A small lens in the pinhole's place casts the same light, and
-paths run into it.
+bottle), or that comes over a mirror and a lobe too sharp for connections, and the part of indirect light that is
+followed from the camera to a caustic: a path from the camera meets no pinhole, and none from the projector the sensor's
+centre. A small lens in the pinhole's place casts the same light, and paths run into it.
 """
 
 from __future__ import annotations

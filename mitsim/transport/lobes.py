@@ -16,14 +16,17 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.rig.camera import CameraGeometry
+from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import check_finite
 from mitsim.transport.landing import landing
 from mitsim.transport.paths import launches
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.receiver import Receiver, sampled_wavelengths
+from mitsim.transport.receiver import Receiver, Reception, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, streams
 
 _SHARP = 100.0
@@ -31,6 +34,10 @@ _SHARP = 100.0
 
 Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
 """
+_PLENTY = 2**12
+"""Rays met on the sensor that tell the light of a few pixels to a few percent; fewer are followed by a second look."""
+_CONNECTIONS = 2**18
+"""Connections that tell all other light, some 0.1 s: it is bounded, so a percent of it or less is left open."""
 _SHARPEST = 0.1
 """Part of the light over sharper lobes than the width that is reported: the peak of a GGX lobe is met that often."""
 
@@ -49,6 +56,8 @@ class SharpLight:
         (n^2,) ``irradiance`` of each projector pixel, and the second moment of its connection [W^2 m^-4].
     width
         radius of the lobes on the sensor [mm], 1 / sqrt(pi q) of all but the sharpest tenth of the light.
+    rest
+        all other direct light, mean over the sensor [W m^-2].
     """
 
     irradiance: float
@@ -57,6 +66,7 @@ class SharpLight:
     by_pixel: FloatArray
     moments: FloatArray
     width: float
+    rest: float = 0.0
 
     @classmethod
     def none(cls, pixels: int) -> SharpLight:
@@ -68,6 +78,9 @@ def sharp_light(
     scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry, seed: int, samples: int
 ) -> SharpLight:
     """Direct light over lobes too sharp for connections.
+
+    What few rays find comes from small parts of a few pixels, as off curved surfaces: these pixels and their neighbours
+    are looked at once more, with as many rays.
 
     Parameters
     ----------
@@ -85,23 +98,19 @@ def sharp_light(
     """
     lanes = projector.n**2
     lobes = _Lobes(scene, camera, projector, geometry)
-    squares, widths, weights = 0.0, [], []
-    by_pixel, moments = np.zeros(lanes), np.zeros(lanes)
-    for sample, pixel in launches(lanes, 0, samples):
-        mean, product, density = lobes.meet(seed, sample, pixel)
-        check_finite(mean)
-        check_finite(product)
-        number = np.array(pixel)
-        by_pixel += np.bincount(number, mean, minlength=lanes) / samples
-        moments += np.bincount(number, product, minlength=lanes) / samples
-        squares += float(np.square(mean).sum())
-        widths.append(1 / np.sqrt(np.pi * density[mean > 0]))
-        weights.append(mean[mean > 0])
-    total, moment = float(by_pixel.sum()), float(moments.sum())
-    error = np.sqrt(max(squares / samples - total**2 / lanes, 0.0) / samples)
+    found = lobes.look(np.arange(lanes), seed, 0, samples)
+    if 0 < len(found.widths) < _PLENTY:
+        pixels = with_neighbours(found.by_pixel > 0, projector.n)
+        found = lobes.look(pixels, seed, samples, samples * lanes // len(pixels))
+    total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
     hits = total**2 / moment if moment else 0.0
-    width = _quantile(np.concatenate(widths), np.concatenate(weights), _SHARPEST)
-    return SharpLight(total, float(error), hits, by_pixel, moments, width)
+    rest = 0.0
+    if total:
+        others = _OtherLobes(scene, camera, projector, 1, geometry, spread=True)
+        count = max(1, _CONNECTIONS // lanes)
+        rest = float(others.trace(seed, 0, count).value.sum()) / count
+    width = _quantile(found.widths, found.weights, _SHARPEST)
+    return SharpLight(total, found.error, hits, found.by_pixel, found.moments, width, rest)
 
 
 def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
@@ -109,6 +118,30 @@ def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
     order = np.argsort(values)
     sums = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(sums, part * sums[-1])]) if values.size else math.inf
+
+
+def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
+    """Numbers of the pixels that are chosen, and of all that touch one of them.
+
+    Parameters
+    ----------
+    chosen
+        (side^2,) of a square of pixels, row by row.
+    side
+        of the square.
+    """
+    return np.flatnonzero(ndimage.binary_dilation(chosen.reshape(side, side), np.ones((3, 3))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Irradiance and second moment of every projector pixel, the former's error, and width and weight of each lobe."""
+
+    by_pixel: FloatArray
+    moments: FloatArray
+    error: float
+    widths: FloatArray
+    weights: FloatArray
 
 
 @dataclass
@@ -126,6 +159,21 @@ class _Met:
         return _Met(mean, self.moment + more.moment, dr.select(new, more.density, self.density))
 
 
+class _OtherLobes(DirectTracer):
+    """Direct light but for that over sharp lobes."""
+
+    def _connected(
+        self,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        light: mi.Spectrum,
+        sensor: mi.Point3f,
+        active: mi.Bool,
+    ) -> tuple[Reception, mi.Float]:
+        reception, value = super()._connected(si, direction, light, sensor, active)
+        return reception, dr.select(reception.pdf > dr.opaque(mi.Float, _SHARP), 0, value)
+
+
 class _Lobes:
     """Rays of the projector that sharp lobes of the surfaces that they light send to the sensor."""
 
@@ -134,6 +182,24 @@ class _Lobes:
     ) -> None:
         self.camera, self.geometry = camera, geometry
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
+
+    def look(self, pixels: Labels, seed: int, first: int, samples: int) -> _Found:
+        """What rays ``first`` to ``first + samples`` - 1 of each of some ``pixels`` meet."""
+        squares, widths, weights = 0.0, [], []
+        by_pixel, moments = np.zeros(self.rays.projector.n**2), np.zeros(self.rays.projector.n**2)
+        for sample, place in launches(len(pixels), first, samples):
+            pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
+            mean, product, density = self.meet(seed, sample, pixel)
+            check_finite(mean)
+            check_finite(product)
+            number = np.array(pixel)
+            by_pixel += np.bincount(number, mean, minlength=len(by_pixel)) / samples
+            moments += np.bincount(number, product, minlength=len(by_pixel)) / samples
+            squares += float(np.square(mean).sum())
+            widths.append(1 / np.sqrt(np.pi * density[mean > 0]))
+            weights.append(mean[mean > 0])
+        variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
+        return _Found(by_pixel, moments, math.sqrt(variance / samples), np.concatenate(widths), np.concatenate(weights))
 
     def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Estimates x of the mean irradiance, x I, and density q of one of the points met; (lanes,)."""

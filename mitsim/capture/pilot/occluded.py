@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from mitsim.capture.evidence import Settings
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.transport.direct import DirectTracer
+from mitsim.transport.lobes import with_neighbours
 
 _ANCHORS, SMOOTH = 5, 3
 """Anchors a side that tell where light is rough over the sensor, and how many hold all of what is smooth: what a
@@ -47,7 +47,7 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     found = pixels[_most(rough, rest)]
     every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
     # Few rays miss what is hidden by a little; it lies beside what is hidden by much.
-    while len(near := np.setdiff1d(_beside(found, n, pixels), np.flatnonzero(looked))):
+    while len(near := np.intersect1d(_beside(found, n), pixels[~looked[pixels]])):
         if looked.sum() + len(near) > 9 * _MOST * n**2:
             return ()
         every[near], _ = _roughness(simulation, settings, near, _NEAR, integer(seed, "near", int(looked.sum())))
@@ -56,11 +56,11 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     return tuple(np.sort(found).tolist()) if len(found) <= _MOST * n**2 else ()
 
 
-def _beside(found: Labels, n: int, pixels: Labels) -> Labels:
-    """The pixels of ``found`` and their neighbours, of those in ``pixels``."""
-    place = np.zeros((n, n), dtype=bool)
-    place.flat[found] = True
-    return np.intersect1d(np.flatnonzero(binary_dilation(place, np.ones((3, 3)))), pixels)
+def _beside(found: Labels, n: int) -> Labels:
+    """The pixels of ``found`` and their neighbours."""
+    chosen = np.zeros(n**2, dtype=bool)
+    chosen[found] = True
+    return with_neighbours(chosen, n)
 
 
 def _most(rough: FloatArray, rest: float) -> Labels:

@@ -12,7 +12,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.lobes import SharpLight
+from mitsim.transport.lobes import SharpLight, with_neighbours
 
 _FEW = 8
 """Anchors a side up to which ordinary light does as well: sharp pixels are traced apart only where that is cheaper."""
@@ -26,6 +26,9 @@ _WORTH = 0.5
 """Part of the paths that tracing apart must save before it is done for their sake alone; it costs a pass of its own."""
 SHARP_RATE = 0.75
 """Power of the samples that the error falls with, as rays are stratified (flat plates of 1e-3 and 1e-4: 0.7 to 0.9)."""
+_SEEN = 0.5
+"""Hits of one connection of each pixel from which the pilot's ordinary looks, 64 connections or more, tell how a lobe's
+light varies over the sensor: they meet it thirty times."""
 _TRIAL, _LARGEST_TRIAL = 16, 2**21
 """Samples that tell how noisy the light is, and connections of them, some 0.5 s."""
 _AFFORDABLE = 2.0**29
@@ -60,21 +63,31 @@ def sharp_pixels(
     if anchors > _MOST:
         return None
     order = np.argsort(-sharp.moments, kind="stable")
-    # One pixel at least stays with the others.
     lit = min(int(np.count_nonzero(sharp.moments)), len(order) - 1)
     moments = np.cumsum(sharp.moments[order])[:lit]
     paths = _paths(moments, light**2 / len(order) * _EVEN, len(order), anchors)
     if anchors <= _FEW:
-        count = int(np.argmin(paths[1:])) + 1
+        count = max(int(np.argmin(paths[1:])) + 1, _unseen(sharp, order[:lit], _LEFT * accuracy * whole))
         if paths[count] > _WORTH * paths[0]:
             return None
     else:
         order = np.argsort(-sharp.by_pixel, kind="stable")
         held = np.cumsum(sharp.by_pixel[order])[:lit]
         count = min(int(np.searchsorted(held, sharp.irradiance - _LEFT * accuracy * whole)) + 1, lit)
-    pixels = np.sort(order[:count])
+    # Beside a lobe's light is that of its tails, which ordinary looks meet as seldom where it is small.
+    pixels = with_neighbours(np.isin(np.arange(len(order)), order[:count]), simulation.bench.n)
+    # One pixel at least stays with the others.
+    if len(pixels) == len(order):
+        pixels = np.sort(order[:count])
     chosen = SharpPixels(tuple(pixels.tolist()), anchors, _window(simulation, pixels, seed))
     return chosen if _connections(simulation, chosen, accuracy, seed) <= _AFFORDABLE else None
+
+
+def _unseen(sharp: SharpLight, order: Labels, negligible: float) -> int:
+    """Pixels, the first in ``order``, without which the others' light is ``negligible`` or seen by ordinary looks."""
+    held, moments = (np.cumsum(values[order][::-1])[::-1] for values in (sharp.by_pixel, sharp.moments))
+    told = (held <= negligible) | (np.square(held) >= _SEEN * moments)
+    return int(np.argmax(told)) if told.any() else len(order)
 
 
 def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, seed: int) -> float:

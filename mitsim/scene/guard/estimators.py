@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import mitsuba as mi
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""
-_MIRRORS = ("conductor", "dielectric", "plastic", "pplastic", "thindielectric")
+_MIRRORS = ("conductor", "dielectric", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
 _SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path runs into."""
@@ -120,8 +121,14 @@ class _References:
     nodes: Sequence[mi.parser.SceneNode]
 
     def to(self, plugins: Sequence[str]) -> Iterator[tuple[mi.parser.SceneNode, str]]:
-        """Nodes, and names of their properties, that refer to one of the ``plugins``; the scene itself only lists."""
-        for node in self.nodes[1:]:
+        """Nodes, and names of their properties, that refer to one of the ``plugins``.
+
+        Neither the scene nor a material that no shape has: they only list.
+        """
+        materials = PLUGINS["bsdf"].split()
+        users = [node for node in self.nodes[1:] if node.props.plugin_name() not in materials]
+        used = (other for node in users for other in self.below(node, materials))
+        for node in chain(users, used):
             for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
                 if self.plugin(node, name) in plugins:
                     yield node, name

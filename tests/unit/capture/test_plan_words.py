@@ -10,6 +10,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Evidence, Part, Settings
 from mitsim.capture.plan import SceneFacts
 from mitsim.capture.prices import paces_of
+from mitsim.scene.guard.estimators import Unfit
 from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows, stages, with_occluded
 
 
@@ -19,7 +20,7 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         field_stop_cuts=cuts,
         geometry=geometry,
         spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
-        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5)),
+        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5), unfit=Unfit()),
     )
 
 

@@ -102,6 +102,55 @@ def test_light_that_mirrors_bring_is_told_as_lost(small_scene: Write) -> None:
     assert not plain.render("reference", spp=4).warnings
 
 
+DIFFUSE, METAL = '<bsdf type="diffuse"/>', '<bsdf type="conductor"/>'
+BITMAP = '<texture type="checkerboard" name="{}"/>'
+
+
+def plate(bsdf: str) -> str:
+    return f'<shape type="rectangle"><transform name="to_world"><translate z="300"/></transform>{bsdf}</shape>'
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        f'<bsdf type="twosided">{METAL}</bsdf>',
+        f'<bsdf type="twosided">{DIFFUSE}{METAL}</bsdf>',
+        f'<bsdf type="blendbsdf"><float name="weight" value="0.5"/>{DIFFUSE}<bsdf type="dielectric"/></bsdf>',
+        f'<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="twosided">{METAL}</bsdf></bsdf>',
+        f'<bsdf type="bumpmap">{BITMAP.format("bump")}{METAL}</bsdf>',
+        f'<bsdf type="normalmap">{BITMAP.format("normalmap")}{METAL}</bsdf>',
+        '<bsdf type="plastic"/>',
+    ],
+)
+def test_mirrors_inside_of_other_materials_are_mirrors(small_scene: Write, bsdf: str) -> None:
+    """By name in the file as by the flags of the loaded surface; nothing where no shape has the material."""
+    loaded = open_bench(small_scene(extra=plate(bsdf), integrator="volpath")).loaded
+    assert loaded.mirrors and loaded.unfit.caustics is not None
+    unused = open_bench(small_scene("unused", extra=bsdf.replace("<bsdf", '<bsdf id="spare"', 1))).loaded
+    assert not unused.mirrors and unused.unfit.caustics is None and unused.unfit.reference is None
+
+
+@pytest.mark.parametrize("bsdf", ["pplastic", "roughconductor", "roughplastic", "roughdielectric", "principled"])
+def test_glossy_materials_are_no_mirrors(small_scene: Write, bsdf: str) -> None:
+    loaded = open_bench(small_scene(extra=plate(f'<bsdf type="{bsdf}"/>'))).loaded
+    assert loaded.glossy and not loaded.mirrors and loaded.unfit.caustics is None
+
+
+@pytest.mark.slow
+def test_plans_captures_and_frames_say_once_what_they_lack(small_scene: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And end with 1; a calibration lacks nothing, as a board stands in the scene's place, and no lamp shines."""
+    monkeypatch.setattr("mitsim.capture.pilot._CAUSTIC_PATHS", 2**12)
+    bench = open_bench(small_scene(extra=BALL.format("conductor") + BULB))
+    lamps = bench.loaded.unfit.lamps
+    assert lamps is not None and bench.with_board(0.9).loaded.unfit.lamps is None
+    plan = bench.plan("uniform", accuracy=0.1)
+    assert plan.payload()["warnings"].count(lamps) == 1 and lamps not in bench.with_board(0.9).plan("uniform").warnings
+    assert bench.capture(plan).warnings.count(lamps) == 1
+    assert bench.render("factored", accuracy=0.1).warnings.count(lamps) == 1
+    for off in ("mirrors", "ambient"):
+        assert lamps not in bench.plan("uniform", accuracy=0.1, effects={off: False}).warnings
+
+
 def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
     """It is no pane and casts no glint there, and an instance does not show its materials."""
     group = '<shape type="shapegroup" id="group">{}</shape>'
