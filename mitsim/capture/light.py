@@ -15,7 +15,7 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
 from mitsim.capture.plan import Plan
-from mitsim.capture.prices import CHECKED_SHOTS
+from mitsim.capture.prices import CHECKED_SHOTS, LAST_CHECKED_SHOTS
 from mitsim.capture.simulation import FiledLight, Simulation
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
@@ -225,8 +225,8 @@ def trace_light(
     sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
-    shots = len(lighting.weights)
-    checked = lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, CHECKED_SHOTS)).astype(int)))
+    checked, last = (_some(lighting, count) for count in (CHECKED_SHOTS, LAST_CHECKED_SHOTS))
+    followed = bool(simulation.indirect or simulation.from_camera)
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, labels, stream) for stream in streams]
     rounds = 1.0
@@ -252,14 +252,23 @@ def trace_light(
         # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
         target = sampling.target(expected) if sampling.target else plan.sampling_target
         seen = error if sampling.target else bound * monte_carlo_bound(expected)
+        if seen <= target and followed and not sampling.target and len(last.weights) > len(checked.weights):
+            # Followed light has heavy paths, which strike single shots: what is stated in the end is seen before.
+            expected = light.frames(last, seed, leaking=False)
+            error, seen = monte_carlo_error(expected), monte_carlo_bound(expected)
         progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
         if seen <= target or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=seen <= target)
-        followed = bool(simulation.indirect or simulation.from_camera)
         rate, least = (_FOLLOWED_RATE, _LEAST_GROWTH) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH)
         # Capped before the power as well: a target that was set very low would overflow it.
         growth = min(seen / target, _LARGEST_GROWTH) ** rate
         rounds *= min(max(1.05 * growth, least), _LARGEST_GROWTH)
+
+
+def _some(lighting: Lighting, count: int) -> Lighting:
+    """So many shots of a ``lighting``, evenly spread."""
+    shots = len(lighting.weights)
+    return lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, count)).astype(int)))
 
 
 def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> tuple[float, float]:

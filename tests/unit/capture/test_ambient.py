@@ -109,9 +109,10 @@ def test_it_holds_the_lamps_light_alone(captured: Capture, light: Light) -> None
     exposer = Exposer(light.bench.rig, captured.exposure_s, 0)
     electrons = read_frame(captured.folder / "ambient.exr")[0]["electrons"]
     assert electrons == pytest.approx(exposer.electrons(expected.projector_off), rel=1e-6)
-    # Light is linear: all dots together are uniform light, whose frame holds the ambient light once.
-    white = light.frames(parse_patterns("uniform", N).lighting, 2)
-    assert shown.sum(axis=0) - 15 * off == pytest.approx(next(iter(white)).irradiance, rel=1e-4)
+    # Light is linear: all dots together are uniform light and 15 times what black pixels leak; ambient light comes once.
+    white = next(iter(light.frames(parse_patterns("uniform", N).lighting, 2))).irradiance
+    together = off + (1 + 15 * light.simulation.physics.black_level) * (white - off)
+    assert shown.sum(axis=0) - 15 * off == pytest.approx(together, rel=1e-6)
 
 
 def test_black_pixels_leak_into_frames_but_not_into_it(light: Light) -> None:

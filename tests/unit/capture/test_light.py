@@ -85,6 +85,24 @@ def test_a_target_stops_the_sampling(bench: Bench, plan: Plan, family: Lighting)
     assert tighter.sampling_error <= found.sampling_error / 3 and tighter.paths > found.paths
 
 
+def test_followed_light_is_sampled_until_all_shots_keep_the_target(
+    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eight shots that keep it are not enough where a heavy path may strike another; for direct light they are.
+    (Planted: only the eight are asked.)"""
+    target, asked = plan.sampling_target, []
+
+    def bound(frames: ExpectedFrames) -> float:
+        asked.append(len(frames))
+        return 2 * target if asked == [8, 16] else 0.5 * target
+
+    monkeypatch.setattr("mitsim.capture.light.monte_carlo_bound", bound)
+    assert trace_light(bench, plan, family, 3).reached and asked == [8]
+    asked.clear()
+    followed = replace(plan, settings=replace(plan.settings, effects=frozenset({"interreflection"})))
+    assert trace_light(bench, followed, family, 3).reached and asked == [8, 16, 8, 16]
+
+
 def test_purposes_share_no_random_numbers(bench: Bench, plan: Plan, family: Lighting) -> None:
     scene, again, board = (
         trace_light(bench, plan, family, 3, Sampling(purpose=name)) for name in ("scene", "scene", "board")
