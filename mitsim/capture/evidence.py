@@ -250,6 +250,8 @@ class Forming:
         of the family.
     seconds
         that the pilot measured for a frame of one anchor, layer and cell a pixel, with a wave-optical shadow.
+    product
+        seconds of a multiplication in a large product of matrices, on all processors; 0 where nobody has timed it.
     """
 
     pixels: int
@@ -259,6 +261,7 @@ class Forming:
     shots: int
     classes: int
     seconds: float = 0.0
+    product: float = 0.0
 
 
 @dataclass(frozen=True)

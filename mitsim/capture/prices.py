@@ -124,9 +124,12 @@ class Numbers:
 
 def paces_of(evidence: Evidence) -> Paces:
     """Those that the ``evidence`` measured, where it measured any."""
-    one = FIXED.frame + FIXED.product * _products(evidence.forming, evidence.forming.lit, 1.0, 1.0, 1.0, 1.0)
-    # The frame that the pilot forms is small: what it takes tells of the machine, not of large products.
-    slower = evidence.forming.seconds / one if evidence.forming.seconds else 1.0
+    forming = evidence.forming
+    products = float(_products(forming, forming.lit, 1.0, 1.0, 1.0, 1.0))
+    slower = forming.seconds / (FIXED.frame + FIXED.product * products) if forming.seconds else 1.0
+    product = forming.product or slower * FIXED.product
+    # The frame that the pilot forms is small: beside its products there is what every frame takes.
+    frame = max(forming.seconds - product * products, 0.0) if forming.product else slower * FIXED.frame
     return Paces(
         direct=evidence.direct.seconds or FIXED.direct,
         anchored=evidence.anchored.seconds or FIXED.anchored,
@@ -135,10 +138,10 @@ def paces_of(evidence: Evidence) -> Paces:
         followed=evidence.followed.seconds or FIXED.followed,
         occluded=evidence.occluded_light.seconds or FIXED.occluded,
         sharp=evidence.sharp_light.seconds or FIXED.sharp,
-        frame=float(slower * FIXED.frame),
-        product=float(slower * FIXED.product),
-        entry=float(slower * FIXED.entry),
-        filed=float(slower * FIXED.filed),
+        frame=float(frame),
+        product=float(product),
+        entry=float(product / FIXED.product * FIXED.entry),
+        filed=float(product / FIXED.product * FIXED.filed),
         ray=evidence.direct.seconds * FIXED.ray / FIXED.direct or FIXED.ray,
     )
 
