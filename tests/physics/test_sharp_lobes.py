@@ -113,7 +113,8 @@ def on_ball(alpha: float, sensor: np.ndarray, count: int = 700) -> float:
     return float(np.pi * SCALE * emitted.sum() * (even[1] - even[0]) ** 2)
 
 
-@pytest.mark.parametrize(("alpha", "accuracy"), [(2e-2, 1e-2), pytest.param(5e-3, 1e-2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("alpha", "accuracy"), [(2e-2, 1e-2), (5e-3, 1e-2)])
+@pytest.mark.slow
 def test_a_ball(traced: Callable[..., Light], alpha: float, accuracy: float) -> None:
     """A highlight that one or two of the projector's pixels light."""
     place = '<point name="center" x="10" y="5" z="370"/><float name="radius" value="20"/>'

@@ -122,7 +122,8 @@ class Look:
             connections = sum(part.count**2 for part in self.anchored.changes if part.name == stage)
             paths, changes = FIXED.anchored * shown * finer.anchored * connections, len(self.anchored.changes)
         elif stage == "occluded":
-            if self.occluded is None:
+            count = len(self.occluded.pixels) if self.occluded else 0
+            if self.occluded is None or finer.occluded(count) == now.occluded(count):
                 return math.inf
             connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
             paths = FIXED.occluded * FINER * self.occluded.paths / LOOKS * connections

@@ -224,7 +224,7 @@ class AnchoredLight:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self.layers = layers
         self._seeds = [integer(seed, "pilot", "anchors", look) for look in range(LOOKS)]
-        self._pixels, self._samples = self._of(sample)
+        self.pixels, self._samples = self._of(sample)
 
     def _of(self, sample: Sample) -> tuple[Labels, int]:
         """Pixels that are followed, and samples of each in a look."""
@@ -233,12 +233,12 @@ class AnchoredLight:
     @property
     def paths(self) -> int:
         """Paths of all looks to one anchor."""
-        return LOOKS * len(self._pixels) * self._samples
+        return LOOKS * len(self.pixels) * self._samples
 
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        if not len(self._pixels):
+        if not len(self.pixels):
             return {Part(self._part, 1): self._frames(1)}
         found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], self.accuracy)
         coarse = coarsened(self._name, self._beyond, self.layers)
@@ -286,7 +286,7 @@ class AnchoredLight:
     def _traced(self, simulation: Simulation) -> list[Deposits]:
         """Light to every anchor, look by look."""
         anchors = self._tray(simulation).bundle.anchors
-        tracer = _tracer(simulation, self._pixels, anchors)
+        tracer = _tracer(simulation, self.pixels, anchors)
         return [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
 
     def _formed(self, simulation: Simulation, lights: list[sparse.csr_array]) -> FloatArray:

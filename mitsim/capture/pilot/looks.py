@@ -31,8 +31,9 @@ _SHARP_PATHS = 2**18
 """Paths of sharp pixels in one look: each is filed in four cells, again and again."""
 _MOST_SHARP = 256
 """Samples of a sharp pixel in a look: its error is then 3e-3 (plates of roughness 1e-3 and 1e-4)."""
-_OCCLUDED, _FEWEST_OCCLUDED = 2**9, 4
-"""Points on occluded pixels in a look, each seen from up to 32 x 32 anchors, and the fewest of one pixel."""
+_OCCLUDED, _MOST_OCCLUDED, _FEWEST_OCCLUDED = 2**9, 2**11, 4
+"""Points on occluded pixels in a first look, each seen from up to 32 x 32 anchors, the most in any (2^21 connections,
+some 0.5 GB in four looks), and the fewest of one pixel."""
 EVEN_CELLS = 0.25
 """Half as large cells leave this much of the error where light is smooth: they are of second order."""
 _UNKNOWN_GAIN = 0.5
@@ -95,7 +96,7 @@ class Sample:
 
     def occluded(self, pixels: int) -> int:
         """Samples of each of so many occluded ``pixels``, in each look."""
-        return max(_FEWEST_OCCLUDED, self.effort * _OCCLUDED // max(pixels, 1))
+        return max(_FEWEST_OCCLUDED, min(self.effort * _OCCLUDED, _MOST_OCCLUDED) // max(pixels, 1))
 
     def sharp(self, simulation: Simulation) -> int:
         """Samples of each pixel that a ``simulation`` traces apart, in each look."""

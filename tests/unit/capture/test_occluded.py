@@ -13,6 +13,7 @@ import pytest
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
+from mitsim.capture.pilot.looks import Sample
 from mitsim.capture.pilot.occluded import occluded_pixels
 from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation
@@ -111,3 +112,12 @@ def test_the_plan_gives_them_anchors_and_the_others_few(bench: Bench) -> None:
     assert row.state == "approximate" and row.reason.startswith(f"{len(settings.occluded)} projector pixels are hidden")
     loose = make_plan(bench, Lighting.uniform(N), 0.1, 0)
     assert loose.row("occluded-anchors").state == "off" and loose.settings.seen_apart == ()
+
+
+@pytest.mark.parametrize("pixels", [1, 12, 300])
+def test_a_longer_look_has_an_end(pixels: int) -> None:
+    """Whatever certainty is worth: a look at one pixel grew until 20 GB were full. (Planted: no limit.)"""
+    sample = Sample.of(parse_patterns("dots:3", N).lighting, 64)
+    counts = [replace(sample, effort=4**looks).occluded(pixels) for looks in range(12)]
+    assert counts == sorted(counts) and counts[0] >= 4 and counts[-1] == counts[5]
+    assert counts[-1] * pixels <= max(2**11, 4 * pixels)
