@@ -522,6 +522,12 @@ def test_accuracies_that_cannot_be_promised(accuracy: float) -> None:
         plan(accuracy)
 
 
+def test_nothing_is_worth_knowing_where_no_luck_would_keep_the_accuracy() -> None:
+    """Every number of cells is known to leave all of the light. (Planted: a second's worth.)"""
+    sizes = {part: 1.0 if part.name == "cells" else size for part, size in SIZES.items()}
+    assert doubt(1e-3, replace(EVIDENCE, changes=changes(sizes), apart={}), {})[0] == 0.0
+
+
 def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
     """Ten times the noise takes so many more samples where there are several anchors, and none where there is one.
     (Planted: the centre's noise for both; spread noise with one anchor.)"""
