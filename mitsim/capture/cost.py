@@ -70,5 +70,5 @@ def _paths(pixels: int, settings: Settings) -> float:
     """Paths of one group's largest stage, about."""
     anchored = settings.anchors**2 * settings.anchored_samples * (settings.anchors > 1)
     followed = settings.followed_anchors**2 * settings.followed_samples * (settings.followed_anchors > 1)
-    occluded = len(settings.seen_apart) / pixels * settings.occluded_anchors**2 * settings.occluded_samples
+    occluded = len(settings.with_own_anchors) / pixels * settings.occluded_anchors**2 * settings.occluded_samples
     return pixels * max(settings.direct_samples, anchored, followed, occluded, settings.indirect_samples)

@@ -115,7 +115,7 @@ class Settings:
         return self.layers or (self.depth,)
 
     @property
-    def seen_apart(self) -> tuple[int, ...]:
+    def with_own_anchors(self) -> tuple[int, ...]:
         """Occluded pixels, where they have anchors of their own."""
         return self.occluded if self.occluded_anchors > 1 else ()
 

@@ -117,7 +117,7 @@ class Numbers:
             waves=float(bool(settings.effects & names(lambda effect: effect.in_shadow))),
             indirect=float("interreflection" in settings.effects),
             mixed=float(MIXING in settings.effects),
-            occluded=float(len(settings.seen_apart)),
+            occluded=float(len(settings.with_own_anchors)),
             occluded_anchors=float(settings.occluded_anchors),
         )
 

@@ -212,14 +212,14 @@ class Simulation:
     def anchored(self) -> DirectTracer | None:
         """The same to every anchor, but for occluded pixels."""
         settings = self.settings
-        return self._direct(settings.anchors, settings.seen_apart) if settings.anchors > 1 else None
+        return self._direct(settings.anchors, settings.with_own_anchors) if settings.anchors > 1 else None
 
     @cached_property
-    def half_hidden(self) -> DirectTracer | None:
+    def anchored_occluded(self) -> DirectTracer | None:
         """Follows direct light of occluded pixels to anchors of their own; none where there are none."""
         settings = self.settings
-        others = np.setdiff1d(np.arange(self.bench.n**2), settings.seen_apart)
-        return self._direct(settings.occluded_anchors, others) if settings.seen_apart else None
+        others = np.setdiff1d(np.arange(self.bench.n**2), settings.with_own_anchors)
+        return self._direct(settings.occluded_anchors, others) if settings.with_own_anchors else None
 
     @cached_property
     def apart(self) -> AimedTracer | None:
@@ -313,7 +313,7 @@ class Simulation:
         return self._light(None, 1, coarse=self._beyond_mean(self.coarse, deposits, labels, samples))
 
     def file_occluded(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
-        """Light of :attr:`half_hidden` beyond its mean over the sensor, per sample.
+        """Light of :attr:`anchored_occluded` beyond its mean over the sensor, per sample.
 
         Parameters
         ----------
@@ -380,8 +380,10 @@ class Simulation:
         stages = {"direct": Stage(self.direct, settings.direct_samples, self.file_direct, "direct")}
         if self.anchored is not None:
             stages["anchored"] = Stage(self.anchored, settings.anchored_samples, self.file_anchored, "anchored")
-        if self.half_hidden is not None:
-            stages["occluded"] = Stage(self.half_hidden, settings.occluded_samples, self.file_occluded, "occluded")
+        if self.anchored_occluded is not None:
+            stages["occluded"] = Stage(
+                self.anchored_occluded, settings.occluded_samples, self.file_occluded, "occluded"
+            )
         if self.apart is not None:
             stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp")
         if self.indirect is not None:
@@ -439,7 +441,7 @@ class Simulation:
         lights, ambient = [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))], []
         if self.settings.anchors > 1:
             lights.append(Filed(self.coarse.optics, tuple(_rows(group.coarse, 0, first) for group in groups)))
-        if self.settings.seen_apart:
+        if self.settings.with_own_anchors:
             lights.append(Filed(self.occluded.optics, tuple(_rows(group.occluded, 0, first) for group in groups)))
         if self.settings.sharp:
             lights.append(Filed(self.sharp.optics, tuple(_rows(group.sharp, 0, first) for group in groups)))

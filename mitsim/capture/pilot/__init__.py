@@ -9,6 +9,8 @@ import math
 from dataclasses import replace
 from functools import cached_property
 
+import numpy as np
+
 from mitsim.capture import effects
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import LOOKS, Changes, Effort, Evidence, Forming, Part, Settings
@@ -99,7 +101,16 @@ class Look:
         self.occluded: OccludedLight | None = None
         for stage in STAGES:
             self._measure(stage)
-        if self._rough and (occluded := occluded_pixels(seen, accuracy, integer(seed, "pilot", "occluded"))):
+        if self._rough:
+            self._look_for_occluded()
+
+    def _look_for_occluded(self) -> None:
+        """Give pixels that are hidden from part of the sensor anchors of their own."""
+        own = integer(self.seed, "pilot", "occluded")
+        occluded = occluded_pixels(Simulation(self.bench, self._base), self.accuracy, own)
+        shown = np.isin(self.samples["occluded"].shown, occluded)
+        # Unless the sample's shots show some of either kind, nobody knows how many anchors each takes.
+        if shown.any() and not shown.all():
             self._base = replace(self._base, occluded=occluded)
             for stage in ("anchors", "occluded"):
                 self._measure(stage)

@@ -238,8 +238,6 @@ class AnchoredLight:
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        if not len(self.pixels):
-            return {Part(self._part, 1): self._frames(1)}
         found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], self.accuracy)
         coarse = coarsened(self._name, self._beyond, self.layers)
         return {**{Part(self._part, count): change for count, change in found.items()}, **coarse}

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from mitsim.capture.evidence import Settings
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
@@ -40,9 +37,9 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     seed
         of the rays.
     """
-    n, settings = simulation.bench.n, replace(simulation.settings, occluded=(), occluded_anchors=1)
-    pixels = np.setdiff1d(np.arange(n**2), settings.sharp.pixels) if settings.sharp else np.arange(n**2)
-    rough, whole = _roughness(simulation, settings, pixels, _FIRST, seed)
+    n, sharp = simulation.bench.n, simulation.settings.sharp
+    pixels = np.setdiff1d(np.arange(n**2), sharp.pixels) if sharp else np.arange(n**2)
+    rough, whole = _roughness(simulation, pixels, _FIRST, seed)
     rest = (_LEFT * accuracy) ** 2 * whole
     found = pixels[_most(rough, rest)]
     every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
@@ -50,7 +47,7 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     while len(near := np.intersect1d(_beside(found, n), pixels[~looked[pixels]])):
         if looked.sum() + len(near) > 9 * _MOST * n**2:
             return ()
-        every[near], _ = _roughness(simulation, settings, near, _NEAR, integer(seed, "near", int(looked.sum())))
+        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(looked.sum())))
         looked[near] = True
         found = _most(every, rest)
     return tuple(np.sort(found).tolist()) if len(found) <= _MOST * n**2 else ()
@@ -70,15 +67,13 @@ def _most(rough: FloatArray, rest: float) -> Labels:
     return order[: int(np.argmax(left <= rest)) + 1] if rough.sum() > rest else order[:0]
 
 
-def _roughness(
-    simulation: Simulation, settings: Settings, pixels: Labels, samples: int, seed: int
-) -> tuple[FloatArray, float]:
+def _roughness(simulation: Simulation, pixels: Labels, samples: int, seed: int) -> tuple[FloatArray, float]:
     """(m,) square of what a smooth function of the place on the sensor leaves of each pixel's light, and of all light.
 
     Parameters
     ----------
-    simulation, settings
-        the bench, and what is simulated.
+    simulation
+        the bench.
     pixels
         (m,) of the projector.
     samples

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.capture import pilot
 from mitsim.capture.bench import Bench, open_bench
-from mitsim.capture.evidence import Settings
+from mitsim.capture.evidence import Settings, SharpPixels
 from mitsim.capture.pilot.looks import Sample
 from mitsim.capture.pilot.occluded import occluded_pixels
 from mitsim.capture.planning import make_plan
@@ -111,7 +112,31 @@ def test_the_plan_gives_them_anchors_and_the_others_few(bench: Bench) -> None:
     row = plan.row("occluded-anchors")
     assert row.state == "approximate" and row.reason.startswith(f"{len(settings.occluded)} projector pixels are hidden")
     loose = make_plan(bench, Lighting.uniform(N), 0.1, 0)
-    assert loose.row("occluded-anchors").state == "off" and loose.settings.seen_apart == ()
+    assert loose.row("occluded-anchors").state == "off" and loose.settings.with_own_anchors == ()
+
+
+@pytest.mark.parametrize("shows", ["none", "nothing else"])
+def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
+    bench: Bench, shows: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sample then tells of one kind alone. (Planted: apart all the same; nobody knew of several anchors.)"""
+    monkeypatch.setattr("mitsim.capture.pilot.Look._rough", True)
+    lit = np.zeros(N**2, dtype=bool)
+    lit[: 8 * N] = True  # above the card
+    if shows != "none":
+        lit = np.isin(np.arange(N**2), occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0))
+    lighting = Lighting((~lit).astype(np.int64), np.array([[1.0, 0.0]]))
+    evidence = pilot.measure(bench, lighting, 1e-3, 0)
+    assert evidence.occluded == () and {1, 2, 3} <= set(evidence.ladders["anchors"])
+
+
+def test_pixels_that_are_traced_apart_are_no_occluded_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: the look goes by a simulation without them.)"""
+    found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0)
+    sharp = SharpPixels(found[::2], 2, (-0.1, 0.1, -0.1, 0.1))
+    monkeypatch.setattr("mitsim.capture.pilot.sharp_pixels", lambda *_: sharp)
+    evidence = pilot.measure(bench, parse_patterns("dots:3", N).lighting, 1e-3, 0)
+    assert evidence.occluded and not set(evidence.occluded) & set(sharp.pixels)
 
 
 @pytest.mark.parametrize("pixels", [1, 12, 300])
