@@ -2,7 +2,7 @@
 
 All of it: effects left out, anchors, layers and cells, sampling (:mod:`tests.physics.plan_property`). An error whose
 lower bound (95 %) is above the accuracy fails. That nothing cheaper would do
-is held by tests/unit/capture/test_plan.py.
+is held by tests/unit/capture/test_choice.py.
 """
 
 from collections.abc import Callable

@@ -22,7 +22,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.rig.patterns import Lighting, parse_patterns
-from tests.unit.capture.test_plan import EVIDENCE
+from tests.unit.capture.invented_evidence import EVIDENCE
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16

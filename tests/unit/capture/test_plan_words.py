@@ -11,7 +11,7 @@ from mitsim.capture.evidence import Evidence, Part, Settings
 from mitsim.capture.plan import SceneFacts
 from mitsim.capture.prices import paces_of
 from mitsim.scene.guard.estimators import Unfit
-from tests.unit.capture.test_plan import EVIDENCE, SIZES, changes, plan, rows, stages, with_occluded
+from tests.unit.capture.invented_evidence import EVIDENCE, SIZES, changes, plan, rows, stages, with_occluded
 
 
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:

@@ -16,7 +16,7 @@ from mitsim.capture.prices import (
     tracing_seconds,
 )
 from mitsim.optics.frames import PROBES
-from tests.unit.capture.test_plan import EVIDENCE, plan
+from tests.unit.capture.invented_evidence import EVIDENCE, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
 ONE = Numbers.coarsest()
