@@ -124,6 +124,7 @@ def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], 
     best: tuple[tuple[bool, float, float], _Table, int] | None = None
     counts = [_allowed(evidence, name, switches) for name in COUNTED]
     rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
+    rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
     if evidence.occluded:
         # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
         rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
@@ -148,8 +149,15 @@ def predicted(
     settings
         effects and numbers.
     """
+    return _table_of(accuracy, evidence, settings, switches, sure).choice(0)
+
+
+def _table_of(
+    accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool], sure: float
+) -> _Table:
+    """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
     row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
-    return _Table(accuracy, evidence, settings.effects, row, _given(switches), sure).choice(0)
+    return _Table(accuracy, evidence, settings.effects, row, _given(switches), sure)
 
 
 def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
@@ -161,9 +169,8 @@ def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> 
         as for :func:`cheapest`.
     """
     careful, hopeful = (cheapest(accuracy, evidence, switches, sure) for sure in (SURE, 0.0))
-    parts = [part for part in parts_of(evidence, hopeful.settings) if part in evidence.changes.parts]
-    errors = {part: evidence.error(part) for part in sorted(parts)}
-    worst = max(errors, key=lambda part: errors[part].bound ** 2 - errors[part].value ** 2, default=Part("cells", 1))
+    unsure = _table_of(accuracy, evidence, hopeful.settings, switches, 0.0).unsure
+    worst = max(sorted(unsure), key=lambda part: unsure[part], default=Part("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst
     lucky = cheapest(accuracy, evidence, switches, _LUCKY)
@@ -180,8 +187,8 @@ class _Table:
     effects
         that are on.
     rows
-        (m, 7) anchors, layers, cells, anchors of followed light and of occluded pixels, coarse cells, and whether
-        coarse light has all layers.
+        (m, 8) anchors, layers, cells, anchors of followed light and of occluded pixels, width of cells of the former,
+        coarse cells, and whether coarse light has all layers.
     given
         parts that are left out whatever is chosen.
     """
@@ -198,7 +205,7 @@ class _Table:
         self.accuracy, self.evidence, self.effects, self.rows = accuracy, evidence, effects, rows
         self.given, self.sure = given, sure
         self.anchors, self.layers, self.cells, self.followed_anchors, self.occluded_anchors = rows.T[:5]
-        self.coarse, self._all_layers = rows.T[5:]
+        self.followed_width, self.coarse, self._all_layers = rows.T[5:]
         indirect = float("interreflection" in effects)
         waves = float(bool(effects & names(lambda effect: effect.in_shadow)))
         layered = np.where(self._all_layers > 0, self.layers, 1.0)
@@ -209,6 +216,7 @@ class _Table:
             coarse_cells=self.coarse,
             coarse_layers=layered,
             followed_anchors=self.followed_anchors,
+            followed_width=self.followed_width,
             waves=waves,
             indirect=indirect,
             mixed=float(MIXING in effects),
@@ -235,7 +243,8 @@ class _Table:
 
     def choice(self, index: int) -> Choice:
         """The choice of a row."""
-        anchors, layers, cells, followed, occluded, coarse, all_layers = (int(number) for number in self.rows[index])
+        numbers = (int(number) for number in self.rows[index])
+        anchors, layers, cells, followed, occluded, width, coarse, all_layers = numbers
         settings = Settings(
             depth=self.evidence.depth,
             anchors=anchors,
@@ -243,6 +252,7 @@ class _Table:
             subdivision=cells,
             effects=self.effects,
             followed_anchors=followed,
+            followed_width=width,
             coarse_cells=coarse,
             coarse_layers=bool(all_layers),
             reach=self.evidence.reach,
@@ -277,6 +287,13 @@ class _Table:
         """(m,) systematic error without what is given."""
         return self._systematic(self.sure, self.given)
 
+    @property
+    def unsure(self) -> dict[Part, float]:
+        """By part that the only row leaves, what chance may add to the square of its error."""
+        weights = {part: float(self._weight(part)[0]) for part in self.evidence.changes.parts}
+        errors = {part: self.evidence.error(part) for part, weight in weights.items() if weight}
+        return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
+
     def _systematic(self, sure: float, ignored: frozenset[Part]) -> FloatArray:
         """(m,) what all that is left out or made coarse adds up to, but for parts that are ``ignored``."""
         changes, apart = self.evidence.changes, self.evidence.apart
@@ -291,7 +308,9 @@ class _Table:
         if not part.count:
             return np.full(len(self.rows), float(part.name not in self.effects))
         if not light:
-            left = self._follows or part.name != "followed_anchors"
+            left = float(self._follows or not part.name.startswith("followed"))
+            if part.name == "followed_width":
+                left = left * (self.followed_anchors > 1) * (np.square(1 / self.coarse) if part.count == 1 else 1.0)
             return np.asarray((getattr(self, part.name) == part.count) * left, dtype=np.float64)
         filed = self.numbers.indirect > 0 if light == "indirect" else getattr(self, ANCHORS_OF[light]) > 1
         # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
@@ -389,9 +408,9 @@ def _left(kind: Effort, samples: Number) -> Number:
     return kind.noise.left(samples)
 
 
-def counted(settings: Settings) -> tuple[int, int, int, int, int]:
+def counted(settings: Settings) -> tuple[int, int, int, int, int, int]:
     """The numbers in ``settings`` that :data:`COUNTED` names."""
-    apart = settings.followed_anchors, settings.occluded_anchors
+    apart = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
     return settings.anchors, len(settings.depths), settings.subdivision, *apart
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 
 Number = float | FloatArray
-COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors")
+COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors", "followed_width")
 """What a plan counts: points of the sensor a side for direct light, depths, cells a side of a projector pixel, points
 of the sensor a side for light that is followed over several surfaces or from the camera, and for direct light of
-occluded pixels."""
+occluded pixels, and projector pixels a side of a cell for what the former see beyond their mean."""
 COARSE = ("anchored", "occluded", "indirect")
 """Light that is filed in coarse cells: direct light's differences between anchors, those of occluded pixels, and
 indirect light."""
@@ -75,6 +75,8 @@ class Settings:
     followed_anchors, followed_samples
         points a side of the sensor that light over several surfaces, or in mirrors, is followed to, and samples that
         each group is predicted to need of what they see beyond their mean.
+    followed_width
+        projector pixels a side of a cell of that, in one layer; 1: as ``coarse_cells`` and ``coarse_layers`` say.
     coarse_cells, coarse_layers
         cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
         they have all layers or one.
@@ -100,6 +102,7 @@ class Settings:
     from_camera_samples: float = 1.0
     followed_anchors: int = 1
     followed_samples: float = 1.0
+    followed_width: int = 1
     coarse_cells: int = 1
     coarse_layers: bool = False
     reach: float | None = None
@@ -219,7 +222,7 @@ class Changes:
         looks = len(self.products)
         pairs = np.zeros((looks, looks, len(chosen)))
         for i, j in zip(*np.triu_indices(looks, 1), strict=True):
-            pairs[i, j] = np.einsum("mp,pq,mq->m", chosen, self.products[i, j], chosen)
+            pairs[i, j] = np.einsum("mp,mp->m", chosen @ self.products[i, j], chosen)
         total, kept = pairs.sum(axis=(0, 1)), looks * (looks - 1) / 2
         of_look = pairs.sum(axis=0) + pairs.sum(axis=1)
         without = (total - of_look) / (kept - looks + 1)

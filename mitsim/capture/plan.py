@@ -299,12 +299,13 @@ class _Words:
         """By what leaves it, the bound on each part of the systematic error."""
         evidence, settings = self.evidence, self.chosen.settings
         anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
-        followed, occluded = settings.followed_anchors, settings.occluded_anchors
+        followed, occluded, width = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
         return {
             f"anchors ({anchors}x{anchors})": self._number("anchors", anchors).bound,
             f"layers ({layers})": self._number("layers", layers).bound,
             f"cells ({cells}x{cells})": self._number("cells", cells).bound,
             f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
+            f"cells of their light ({width} pixels)": self._number("followed_width", width).bound,
             f"occluded anchors ({occluded}x{occluded})": self._number("occluded_anchors", occluded).bound,
             **self.chosen.lacking,
             **{f"{name} (off)": e.bound for name, e in evidence.effects.items() if name not in settings.effects},
@@ -362,11 +363,10 @@ class _Words:
         if anchors == 1:
             reason = f"light over several surfaces, in mirrors and of lamps: one point leaves {_said(one)}"
             return PlanRow(name, "off", reason, one.value, 0.0)
-        left = _said(self._number("followed_anchors", anchors))
-        reason = (
-            f"light over several surfaces, in mirrors and of lamps: {anchors}x{anchors} leave {left}, one {_said(one)}"
-        )
-        return PlanRow(name, "approximate", reason, one.value, self._seconds(followed_anchors=1))
+        left, width = _said(self._number("followed_anchors", anchors)), self.chosen.settings.followed_width
+        cells = f" in cells of {width}x{width} pixels" if width > 1 else ""
+        reason = f"light over several surfaces, in mirrors and of lamps: {anchors}x{anchors}{cells} leave {left}, one "
+        return PlanRow(name, "approximate", reason + _said(one), one.value, self._seconds(followed_anchors=1))
 
     def _occluded_anchors(self) -> PlanRow:
         name, anchors, pixels = (

@@ -16,6 +16,7 @@ import numpy as np
 
 from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, Settings
+from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import PROBES, formed_frames
 
 ROUNDS, CHECKED_SHOTS = 1.5, 8
@@ -91,6 +92,7 @@ class Numbers:
     coarse_cells: Number
     coarse_layers: Number
     followed_anchors: Number
+    followed_width: Number
     waves: Number
     indirect: Number
     mixed: Number
@@ -98,10 +100,16 @@ class Numbers:
     """Pixels of their own anchors."""
     occluded_anchors: Number = 1.0
 
+    @property
+    def of_followed(self) -> tuple[FloatArray, FloatArray]:
+        """Cells a side of a projector pixel, and layers, for what anchors see of followed light."""
+        width = np.asarray(self.followed_width)
+        return np.where(width > 1, 1 / width, self.coarse_cells), np.where(width > 1, 1.0, self.coarse_layers)
+
     @classmethod
     def coarsest(cls) -> Numbers:
         """One of everything, and a wave-optical shadow."""
-        return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
+        return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, settings: Settings) -> Numbers:
@@ -114,6 +122,7 @@ class Numbers:
             coarse_cells=float(settings.coarse_cells),
             coarse_layers=layers if settings.coarse_layers else 1.0,
             followed_anchors=float(settings.followed_anchors),
+            followed_width=float(settings.followed_width),
             waves=float(bool(settings.effects & names(lambda effect: effect.in_shadow))),
             indirect=float("interreflection" in settings.effects),
             mixed=float(MIXING in settings.effects),
@@ -198,8 +207,9 @@ def _products(forming: Forming, lit: Number, cells: Number, layers: Number, anch
 
 def _entries(forming: Forming, numbers: Numbers) -> Number:
     """Entries of all shadows that are prepared, as many as wave-optical ones take as long."""
-    coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect + (np.asarray(numbers.followed_anchors) > 1)
-    sides = numbers.cells * numbers.layers + coarse * numbers.coarse_cells * numbers.coarse_layers
+    coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
+    followed = (np.asarray(numbers.followed_anchors) > 1) * math.prod(numbers.of_followed)
+    sides = numbers.cells * numbers.layers + coarse * numbers.coarse_cells * numbers.coarse_layers + followed
     terms = forming.terms * numbers.waves + _GEOMETRIC_ENTRIES * (1 - numbers.waves)
     return cast(Number, 2 * forming.pixels * forming.cells * sides * terms)
 
@@ -234,7 +244,7 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
         * _products(forming, _lit_by_occluded(forming, lit, numbers), *coarse, numbers.occluded_anchors, numbers.waves)
         + numbers.indirect * _products(forming, 1.0, *coarse, 1.0, numbers.waves)
         + (np.asarray(numbers.followed_anchors) > 1)
-        * _products(forming, 1.0, *coarse, numbers.followed_anchors, numbers.waves)
+        * _products(forming, 1.0, *numbers.of_followed, numbers.followed_anchors, numbers.waves)
     )
     if mixes:
         products = products + numbers.mixed * forming.classes * forming.pixels**2
@@ -332,7 +342,8 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
     if np.any(numbers.indirect):
         found = found + numbers.indirect * np.minimum(_SPLIT * of("indirect"), places)
     if np.any(followed):
-        seen = np.minimum(_SPLIT * of("followed"), places)
+        cells, seen_in = numbers.of_followed
+        seen = np.minimum(_SPLIT * of("followed"), classes * np.square(cells) * seen_in)
         found = found + followed * _EDGES * np.square(numbers.followed_anchors) * seen
     return cast(Number, pixels * found)
 

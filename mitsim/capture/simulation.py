@@ -161,7 +161,9 @@ class Simulation:
         self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
         self.occluded = self._tray(Bundle(coarse, settings.occluded_anchors, depths))
         self.smooth = self._tray(Bundle(coarse, 1, depths))
-        several = Bundle(coarse, settings.followed_anchors, depths)
+        wide = self._grid(-(-pixels // settings.followed_width), 1, settings.reach)
+        broad = (wide, (settings.depth,)) if settings.followed_width > 1 else (coarse, depths)
+        several = Bundle(broad[0], settings.followed_anchors, broad[1])
         self.followed = self._tray(several)
         self.sharp = self._tray(self._apart(pixels))
         lamps = _bands(*_AMBIENT_NM, _AMBIENT_BANDS)
@@ -335,7 +337,7 @@ class Simulation:
     def _beyond_mean(self, tray: Tray, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
         """Light in a ``tray`` beyond its mean over the sensor."""
         weights = self._mean_weights(tray.bundle.anchors)
-        mean = self.smooth.file(deposits.averaged(weights), labels, samples)
+        mean = replace(tray.bundle, anchors=1).file(deposits.averaged(weights), labels, samples)
         return tray.file(deposits, labels, samples) - tray.bundle.repeated(mean)
 
     def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:

@@ -163,7 +163,7 @@ class Stand:
     def finest(self, plan: Plan, margin: float) -> Plan:
         """Everything on, one step finer than ``plan`` in each number, and its accuracy over ``margin`` of noise."""
         evidence, now = self.evidence, plan.settings
-        anchors, layers, cells, followed, occluded = (
+        anchors, layers, cells, followed, occluded, _ = (
             next((finer for finer in evidence.ladders[name] if finer > count), count)
             for name, count in zip(COUNTED, counted(now), strict=True)
         )
@@ -174,6 +174,7 @@ class Stand:
             subdivision=cells,
             effects=frozenset(present(self.bench)),
             followed_anchors=followed,
+            followed_width=max(now.followed_width // 2, 1),
             occluded_anchors=occluded,
             coarse_cells=min(2 * now.coarse_cells, cells),
             coarse_layers=True,

@@ -40,6 +40,7 @@ _STAGE_OF = {
     "anchored cells": "anchors",
     "anchored layers": "anchors",
     "followed_anchors": "followed",
+    "followed_width": "followed",
     "occluded_anchors": "occluded",
     "occluded cells": "occluded",
     "occluded layers": "occluded",
@@ -140,7 +141,7 @@ class Look:
             paths = FIXED.occluded * FINER * self.occluded.paths / LOOKS * connections
             changes = len(self.occluded.changes)
         elif stage == "followed":
-            connections = sum(part.count**2 for part in self.followed.changes)
+            connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
             lanes = sum(self.switched.lanes.values())
             paths, changes = FIXED.followed * lanes * finer.followed * connections, len(self.followed.changes)
         else:
@@ -166,7 +167,7 @@ class Look:
         elif stage == "effects":
             self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
         elif stage == "followed":
-            self.followed = FollowedLight(bench, self._everything, sample, self.accuracy, seed)
+            self.followed = FollowedLight(bench, self._everything, sample, self.accuracy, seed, self.fine.judging)
         elif stage == "occluded":
             if base.occluded:
                 self.occluded = OccludedLight(bench, base, sample, self.accuracy, seed, self.fine.judging)

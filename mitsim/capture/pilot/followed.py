@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
-from mitsim.capture.pilot.looks import Sample, ladder, noise, norm
+from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, ladder, noise, norm
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.histogram import Deposits
+from mitsim.transport.paths import Tracer
 
-FOLLOWED_LADDER = (1, 2, 3, 5)
+FOLLOWED_LADDER = (1, 2, 3, 5, 8, 12)
 """Numbers of anchors that are tried."""
+WIDTHS = (1, 2, 4)
+"""Projector pixels a side of a cell that are tried: what anchors see beyond their mean is little light, and need not be
+as fine as all of it; wider cells hold light of many anchors in memory."""
+_AT_ONCE = 2**21
+"""Connections that are traced at a time, 0.5 GB while they are filed."""
 _FIRST_JUDGE = 1
 """Index of the number that judges at first."""
 _FEW_ANCHORS = 2
@@ -38,48 +45,81 @@ class FollowedLight:
         where the search for enough may stop.
     seed
         root of the random streams.
+    layers
+        depths [mm] that judge one layer; none for a flat scene.
     """
 
-    def __init__(self, bench: Bench, everything: Settings, sample: Sample, accuracy: float, seed: int) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        everything: Settings,
+        sample: Sample,
+        accuracy: float,
+        seed: int,
+        layers: tuple[float, ...] = (),
+    ) -> None:
         self.bench, self.everything, self.sample, self.accuracy = bench, everything, sample, accuracy
+        self._layers = layers
         self._seeds = [integer(seed, "pilot", "followed", look) for look in range(LOOKS)]
 
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried; none where there is no such light."""
-        if not norm(self._frames(1)):
+        if not self._tracers(self._simulation()) or not norm(self._frames(1)):
             return {}
         found = ladder(FOLLOWED_LADDER, self._frames, _FIRST_JUDGE, self.accuracy)
-        return {Part("followed_anchors", count): change for count, change in found.items()}
+        anchors = {Part("followed_anchors", count): change for count, change in found.items()}
+        # Where the judge was never judged, few anchors serve, and their light is held in any cells.
+        return {**anchors, **self._widths} if len(found) > _FIRST_JUDGE + 1 else anchors
 
     def effort(self, light: float) -> Effort:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
         if not self.changes:
             return Effort.none()
-        simulation, labels, samples = self._simulation(_FEW_ANCHORS), self.sample.lighting.labels, self.sample.followed
-        beyond = [simulation.file_at_anchors(look, labels, samples).followed for look in self._few]
-        error = noise(self._formed(simulation, beyond))
-        lanes = sum(tracer.lanes for tracer in simulation.at_anchors if tracer is not None)
-        return Effort(Noise(error / light if light else 0.0, samples, 0.5), lanes // _FEW_ANCHORS**2)
+        error, samples = noise(self._beyond_mean()), self.sample.followed
+        lanes = sum(tracer.lanes for tracer in self._tracers(self._simulation()))
+        return Effort(Noise(error / light if light else 0.0, samples, 0.5), lanes)
+
+    @property
+    def _widths(self) -> dict[Part, FloatArray]:
+        """Change of the frames by every width of cells for what a few anchors see beyond their mean."""
+        one = self._beyond_mean()
+        missing = (self._beyond_mean(coarse_cells=2) - one) / (1 - EVEN_CELLS)
+        layered = self._beyond_mean(coarse_layers=True, layers=self._layers) if self._layers else one
+        wide = {width: layered + missing - self._beyond_mean(followed_width=width) for width in WIDTHS[1:]}
+        return {Part("followed_width", width): change for width, change in {1: missing, **wide}.items()}
+
+    def _beyond_mean(self, **cells: Any) -> FloatArray:
+        """Frames of what a few anchors see beyond their mean, in such ``cells``."""
+        simulation = self._simulation(followed_anchors=_FEW_ANCHORS, **cells)
+        labels, samples = self.sample.lighting.labels, self.sample.followed
+        filed = [simulation.file_at_anchors(look, labels, samples).followed for look in self._few]
+        return self._formed(simulation, filed)
 
     @cached_property
     def _few(self) -> list[Deposits]:
-        return self._traced(self._simulation(_FEW_ANCHORS))
+        """Light to a few anchors, look by look."""
+        tracers, samples = self._tracers(self._simulation(followed_anchors=_FEW_ANCHORS)), self.sample.followed
+        return [Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers]) for seed in self._seeds]
 
     def _frames(self, anchors: int) -> FloatArray:
-        simulation, labels = self._simulation(anchors), self.sample.lighting.labels
-        traced = self._few if anchors == _FEW_ANCHORS else self._traced(simulation)
-        filed = [simulation.followed.file(look, labels, self.sample.followed) for look in traced]
-        return self._formed(simulation, filed)
+        simulation, samples = self._simulation(followed_anchors=anchors), self.sample.followed
+        tracers = self._tracers(simulation)
+        each = max(1, _AT_ONCE // sum(tracer.lanes for tracer in tracers))
+        parts = [(first, min(each, samples - first)) for first in range(0, samples, each)]
 
-    def _simulation(self, anchors: int) -> Simulation:
-        return Simulation(self.bench, replace(self.everything, followed_anchors=anchors))
+        def filed(seed: int) -> sparse.csr_array:
+            traced = (tracer.trace(seed, *part) for part in parts for tracer in tracers)
+            return sum(simulation.followed.file(some, self.sample.lighting.labels, samples) for some in traced)
 
-    def _traced(self, simulation: Simulation) -> list[Deposits]:
-        """Light to every anchor, look by look."""
-        tracers = [tracer for tracer in simulation.at_anchors if tracer is not None]
-        samples = self.sample.followed
-        return [Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers]) for seed in self._seeds]
+        return self._formed(simulation, [filed(seed) for seed in self._seeds])
+
+    def _simulation(self, **numbers: Any) -> Simulation:
+        return Simulation(self.bench, replace(self.everything, **numbers))
+
+    @staticmethod
+    def _tracers(simulation: Simulation) -> list[Tracer]:
+        return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
     def _formed(self, simulation: Simulation, lights: list[sparse.csr_array]) -> FloatArray:
         """(looks, shots, pixels, columns) frames of light to every anchor."""

@@ -9,11 +9,13 @@ import pytest
 from mitsim.capture.choice import cheapest, doubt, parts_of, predicted
 from mitsim.capture.effects import parse_switches
 from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Evidence, Noise, Part, Settings
+from mitsim.capture.pilot import stage_of
 from mitsim.capture.prices import FIXED, Numbers, entries
 from tests.unit.capture.invented_evidence import (
     ACCURACIES,
     APART,
     EVIDENCE,
+    ONE_CLASS,
     SIZES,
     changes,
     plan,
@@ -219,3 +221,32 @@ def test_samples_take_the_least_work_for_the_target() -> None:
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) < found.target / 1.15
     ratios = [n / math.sqrt(v / price) for v, n, price in kinds]
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02) and min(counts) > 50
+
+
+def test_wide_cells_hold_light_of_many_anchors() -> None:
+    """8 x 8 anchors of 49 classes are 10^8 places, of cells of two pixels a quarter of that. (Planted: as many places
+    whatever the width; the width's own error not counted.)"""
+    many = {Part("followed_anchors", count): size for count, size in {1: 7e-3, 2: 3e-3, 5: 6e-4, 8: 2e-5}.items()}
+    wide = {Part("followed_width", width): size for width, size in {1: 0.0, 2: 5e-5, 4: 4e-4}.items()}
+    followed = Effort(Noise(2e-2, 2, 0.5), 36_384)
+    sizes = {part: size for part, size in SIZES.items() if part.name != "followed_anchors"} | many
+    without, found = (replace(EVIDENCE, changes=changes(each), followed=followed) for each in (sizes, sizes | wide))
+    assert not cheapest(5e-4, without, {}).fits
+    chosen = cheapest(5e-4, found, {})
+    settings = chosen.settings
+    assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 2)
+    assert entries(EVIDENCE.direct.paths, 49, Numbers.of(settings), settings) <= 2**25
+    narrow = predicted(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
+    assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
+    assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
+
+
+def test_doubt_about_coarse_cells_names_them() -> None:
+    """Indirect light in coarse cells may be 2e-3 off or not at all: to know it saves fine cells. (Planted: doubt about
+    effects and numbers alone.)"""
+    place = EVIDENCE.changes.parts.index(Part("indirect cells", 1))
+    products = EVIDENCE.changes.products.copy()
+    products[:, :, place, place] = changes({Part("indirect cells", 1): 1e-4}, 8e-3).products[:, :, 0, 0]
+    unsure = replace(ONE_CLASS, changes=Changes(EVIDENCE.changes.parts, products))
+    worth, part = doubt(1e-3, unsure, {})
+    assert worth > 0 and part == Part("indirect cells", 1) and stage_of(part) == "effects"

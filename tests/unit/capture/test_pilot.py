@@ -87,9 +87,12 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert {1, 2, 3} <= set(ladders["anchors"]) <= set(direct.ANCHOR_LADDER)
     assert {1, 2, 3} <= set(ladders["layers"]) <= set(direct.LAYER_LADDER)
     assert {1, 2} <= set(ladders["cells"]) <= set(direct.CELL_LADDER)
-    for errors in ladders.values():
+    for name, errors in ladders.items():
         assert all(0 <= error.value <= error.bound for error in errors.values())
-        assert len(errors) == 1 or errors[1].value > errors[max(errors)].value
+        coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
+        assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
+    widths = ladders["followed_width"]
+    assert tuple(widths) == followed.WIDTHS and widths[1].value < widths[2].value < widths[4].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(followed.FOLLOWED_LADDER)
     assert 0 < evidence.forming.seconds < 1
     assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.from_camera.paths
@@ -157,6 +160,32 @@ def test_anchors_of_followed_light_come_true(bench: Bench, evidence: Evidence) -
     assert promised(found[1].value, actual)
     few = np.linalg.norm(frames(bench, replace(base, followed_anchors=2), 64, 256) - judge) / light
     assert few < actual / 2
+
+
+@pytest.mark.parametrize("width", [2, 4])
+def test_wide_cells_of_followed_light_come_true(bench: Bench, evidence: Evidence, width: int) -> None:
+    """What anchors see beyond their mean, in cells of several pixels and one layer, against cells of half a pixel and
+    two layers. (Planted: the mean filed in the cells of indirect light; cells twice as wide.)"""
+    every = frozenset(effects.present(bench)) - {"speckle"}
+    base = Settings(depth=evidence.depth, subdivision=2, effects=every, followed_anchors=2, layers=evidence.layers[2])
+    judge = frames(bench, replace(base, coarse_cells=2, coarse_layers=True))
+    wide = replace(base, coarse_cells=2, coarse_layers=True, followed_width=width)
+    filed = Simulation(bench, wide)
+    assert filed.followed.bundle.grid.rows.size == pytest.approx(2 * width * filed.smooth.bundle.grid.rows.size)
+    actual = change(frames(bench, wide), judge)
+    assert actual > 1e-3, "the scene has to call for it"
+    assert promised(evidence.ladders["followed_width"][width].value, actual)
+
+
+def test_light_to_many_anchors_is_traced_in_parts(
+    bench: Bench, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
+    (Planted: every part from the first sample on.)"""
+    monkeypatch.setattr(followed, "_AT_ONCE", 2 * 9 * evidence.followed.paths)
+    again = measured(bench, seed=3).ladders["followed_anchors"]
+    for count, error in evidence.ladders["followed_anchors"].items():
+        assert again[count] == pytest.approx(error, rel=1e-6)
 
 
 @pytest.fixture(scope="module")

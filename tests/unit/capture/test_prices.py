@@ -58,6 +58,7 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
         ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 3.0}, 3 * products(5, 3) + 3 * products(10, 3)),
         ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
         ({"followed_anchors": 3.0, "coarse_cells": 2.0}, products(5, 3) + products(60, 3)),
+        ({"followed_anchors": 3.0, "followed_width": 2.0, "coarse_layers": 3.0}, products(5, 3) + products(15, 3)),
         ({"occluded": 1.0, "occluded_anchors": 4.0}, products(5, 3) + products(2, 3)),
         ({"occluded": 90.0, "occluded_anchors": 4.0, "coarse_cells": 2.0}, products(5, 3) + products(40, 3)),
         ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
@@ -90,6 +91,7 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
         ({"cells": 2.0, "layers": 2.0}, 4 * 3 * one),
         ({"anchors": 2.0, "coarse_cells": 2.0}, (1 + 2) * 3 * one),
         ({"anchors": 2.0, "indirect": 1.0}, (1 + 2) * 3 * one),
+        ({"followed_anchors": 2.0, "followed_width": 4.0, "coarse_layers": 3.0}, (1 + 0.25) * 3 * one),
     ):
         assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
 
@@ -120,5 +122,6 @@ def test_light_lies_in_the_cells_that_its_samples_reach() -> None:
         (replace(ONE, anchors=2.0, coarse_cells=2.0), 2 + 2 * 2**2 * 2 * 4),
         (replace(ONE, indirect=1.0, coarse_cells=2.0), 2 + 7 * 2**2),
         (replace(ONE, followed_anchors=2.0, coarse_cells=4.0), 2 + 2 * 2**2 * 2 * 20),
+        (replace(ONE, followed_anchors=4.0, followed_width=2.0, coarse_layers=3.0), 2 + 2 * 4**2 * 7 / 2**2),
     ):
         assert entries(100, 7, numbers, settings) == 100 * found, numbers
