@@ -18,7 +18,7 @@ from mitsim.rig.patterns import Lighting
 
 _SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
 """Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming; but more
-where they show fewer pixels than this all together, which are no fair sample of the scene."""
+where they show fewer pixels than this all together, which are no fair sample of the scene, or a mirror does."""
 _COLUMNS = 64
 """Columns of pixels that the pilot looks at: a frame's neighbours are alike, and each column costs its forming."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
@@ -54,12 +54,23 @@ class Sample:
     effort: int = 1
 
     @classmethod
-    def of(cls, lighting: Lighting, pixels: int) -> Sample:
-        """A few shots of ``lighting`` and columns of a sensor of ``pixels`` a side, evenly spread."""
+    def of(cls, lighting: Lighting, pixels: int, mirrors: bool) -> Sample:
+        """A few shots of a family and columns of the sensor, evenly spread.
+
+        Parameters
+        ----------
+        lighting
+            the family.
+        pixels
+            of the sensor, a side.
+        mirrors
+            whether a shot's light may be that of few of the pixels that it shows, in a mirror.
+        """
         shots, count = len(lighting.weights), min(pixels, _COLUMNS)
         columns = (np.arange(count) + (np.arange(count) * _GOLDEN) % 1) * pixels / count
         lit = np.bincount(lighting.labels, minlength=lighting.weights.shape[1]) @ (lighting.weights[0] != 0)
-        wanted = min(max(_SHOTS, _SHOWN // max(int(lit), 1)), _MOST_SHOTS, shots)
+        few = _MOST_SHOTS if mirrors else _SHOWN // max(int(lit), 1)
+        wanted = min(max(_SHOTS, few), _MOST_SHOTS, shots)
         chosen = np.unique(np.linspace(0, shots - 1, wanted).astype(int))
         return cls(lighting.shots(chosen), columns.astype(np.int64))
 

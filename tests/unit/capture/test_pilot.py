@@ -284,3 +284,21 @@ def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Pa
     )
     found = effects.present(open_bench(small_scene(), projector=projector))
     assert found == ("interreflection", "diffraction", "aperture", "blur", "black-level", "speckle")
+
+
+@pytest.mark.slow
+def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> None:
+    """A mirror brings the light of a few projector pixels to the sensor; shots that do not show them see black pixels
+    alone, and four of 49 have no such shot among them. What black pixels change, against the frames of all shots in
+    closed form, (1 - b) of a class and b of all. (Planted: four shots, as of a print: 6.0e-5 of 8.8e-5.)"""
+    bench = shipped_bench("mirror")
+    lighting = parse_patterns("dots:7", bench.n).lighting
+    found = pilot.measure(bench, lighting, 1e-3, 1).effects["black-level"]
+    made = Simulation(bench, Settings(depth=400.0, effects=frozenset(effects.present(bench))))
+    glint, black = made.glint_frames(lighting.labels), made.physics.black_level
+    assert glint is not None
+    seen = np.zeros((49, 512, 512))
+    seen[glint.classes] = glint.irradiance
+    everything = black * seen.sum(axis=0)
+    actual = np.linalg.norm(everything - black * seen) / np.linalg.norm(everything + (1 - black) * seen)
+    assert found.value == pytest.approx(actual, rel=0.1)
