@@ -24,6 +24,9 @@ docs/decisions/0002-automatic-lambda.md."""
 MISFIT_RATIO = 1.2
 """Noise outside the model's range over the noise within, above which the model does not explain the frames: 0.92 to
 1.02 in the captures of flat prints that benchmarks/lambda_losses.py makes, 1.4 and more with depth and gloss."""
+_FAINT, _FEWEST = 2.0, 20
+"""An octave's energy over its noise below which its signal may be noise that was not told, and numbers that tell it:
+twenty vary by a third."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +134,41 @@ def is_misfit(problem: DiagonalProblem) -> bool:
 def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
     """Noise variance of each number (r, r') of ``problem.projected``, or of all.
 
-    Most have the noise that is outside the model's range, where there are more data to tell it; or, where the model
-    does not explain the frames, what the halves of the sensor disagree on. What strikes single rows and columns comes
-    on top.
+    Most have the noise that is outside the model's range, where there are more data to tell it, or what the halves of
+    the sensor disagree on where that is more: noise of the factors lies within the range alone. Where the model does
+    not explain the frames, the halves know. What strikes single rows and columns comes on top.
     """
-    white = noise_variance(problem)
-    if not problem.halves:
+    white, halves = noise_variance(problem), problem.halves
+    if not halves:
         return white
-    return (problem.halves.typical if is_misfit(problem) else white) + problem.halves.excess
+    level = halves.typical if is_misfit(problem) else float(np.fmax(white, halves.typical))
+    return _believable(problem, level + halves.excess)
+
+
+def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
+    """``noise`` (r, r') of a ``problem``, raised by the part of it that both halves of the sensor agree on.
+
+    By octaves of sigma: what little exceeds the noise stands, at small sigma, for a scene of any brightness. Where that
+    is brighter than the mean of all octaves before, there is noise alone, there and in all octaves beyond.
+    """
+    measured = problem.sigma > 0
+    sigma, found = problem.sigma[measured], noise[measured]
+    octave = np.log2(sigma.max() / sigma).astype(np.intp)
+    sizes = np.bincount(octave)
+    data, level, square = (
+        np.bincount(octave, values) / np.maximum(sizes, 1)
+        for values in (np.square(problem.projected[measured]), found, np.square(sigma))
+    )
+    power = np.divide(np.maximum(data - level, 0.0), square, out=np.zeros_like(square), where=square > 0)
+    before = np.cumsum(sizes * power) / np.cumsum(sizes)
+    faint = (data < _FAINT * level) & (sizes >= _FEWEST)
+    doubtful = faint[1:] & (power[1:] > before[:-1])
+    if not doubtful.any():
+        return noise
+    beyond = octave > int(np.argmax(doubtful))
+    raised = noise.copy()
+    raised[measured] = np.where(beyond, found * np.maximum(data / level, 1.0)[octave], found)
+    return raised
 
 
 def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
