@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.detail import disagreement, moved_responses, slope_of
+from mitsim.reconstruct.detail import Model, disagreement, moved_responses, slope_of
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
@@ -41,12 +41,12 @@ def test_moved_light_is_seen_by_the_difference_of_neighbours() -> None:
     expected = np.zeros((5, len(side.singular)))
     for pattern, slab in zip(patterns.T, side.slabs, strict=True):
         expected[:, slab.columns] += np.outer(pattern, 0.01 * step[:, 0] @ slab.matrix)
-    assert moved_responses(side, factor, patterns).sum(axis=0) == pytest.approx(expected, abs=1e-12)
+    assert moved_responses(side, slope_of(factor), patterns).sum(axis=0) == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_single_pixel_has_no_neighbour() -> None:
     factor, one = np.random.default_rng(0).random((12, 1)), np.ones((1, 1))
-    assert not moved_responses(prepare(factor, factor, one, one).left, factor, one).any()
+    assert not Model(prepare(factor, factor, one, one), (factor, factor), (one, one)).moved[0].any()
 
 
 @pytest.mark.parametrize("step", [-3.0, 0.4, 2.3])
@@ -79,11 +79,8 @@ def test_disagreement_is_the_energy_of_the_image_error(patterns: str) -> None:
     prepared = prepare(*factors, P_L, P_R)
     sigma = np.outer(prepared.left.singular, prepared.right.singular)
     gain = sigma / (sigma**2 + 1e-4 * sigma.max() ** 2)
-    moved = (
-        moved_responses(prepared.left, factors[0], P_L),
-        moved_responses(prepared.right, factors[1], P_R),
-    )
-    slopes, zero, struck, told = [slope_of(factor) for factor in factors], np.zeros((N, N)), 0.0, 0.0
+    model = Model(prepared, factors, (P_L, P_R))
+    slopes, zero, struck, told = model.slopes, np.zeros((N, N)), 0.0, 0.0
     for _ in range(200):
         rows, columns = 0.5 * rng.standard_normal((N, N)), 2 * rng.standard_normal((N, N))
         sums, image = prepared.accumulator(), rng.random((N, N))
@@ -95,7 +92,7 @@ def test_disagreement_is_the_energy_of_the_image_error(patterns: str) -> None:
         problem = prepared.problem(sums)
         expected = prepared.image(gain * sigma * prepared.coefficients(image))
         struck += np.square(prepared.image(gain * problem.projected) - expected).mean()
-        told += disagreement(prepared, gain, problem.halves, moved, (zero, zero)).mean()
+        told += disagreement(model, gain, problem.halves, (zero, zero)).mean()
     assert told == pytest.approx(struck, rel=0.1 if patterns == "uniform" else 0.06)
 
 
@@ -107,7 +104,7 @@ def test_noise_alone_is_no_disagreement(patterns: str) -> None:
     for seed in range(20):
         shots, factors = camera.run(patterns, np.full((N, N), 0.7), seed), camera.calibrated(seed, 0.01)
         sums, image = accumulated(shots, factors), reconstruct(shots, factors, 1e-9)
-        propagation = Propagation(sums.prepared, factors.sides, shots.patterns, 1e-9)
+        propagation = Propagation(sums.model, 1e-9)
         frames = propagation.of_frames(sums.noise.rows, sums.noise.columns)
         assert factors.manifest.noise and image.ok
         left, right = propagation.of_factors(factors.manifest.noise, image.image)

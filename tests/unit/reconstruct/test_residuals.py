@@ -8,6 +8,7 @@ import pytest
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
 from mitsim.reconstruct import misfit
 from mitsim.reconstruct.causes import Evidence, _beyond, _orthonormal
+from mitsim.reconstruct.detail import Model
 from mitsim.reconstruct.misfit import Residuals
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import prepare
@@ -103,7 +104,7 @@ def test_an_ambient_frame_s_noise_goes_into_an_oblong_image_from_both_its_sides(
         sums = prepared.accumulator()
         sums.add(unit.reshape(5, 6), 0, 0)
         images.append(prepared.solve(sums, lam).image)
-    found = Propagation(prepared, (sides[0], sides[1]), patterns, lam).of_ambient_frame(
+    found = Propagation(Model(prepared, (sides[0], sides[1]), patterns), lam).of_ambient_frame(
         np.full(5, 3.0), np.full(6, 3.0)
     )
     np.testing.assert_allclose(found, 3.0 * np.square(images).sum(axis=0), rtol=1e-9)
