@@ -96,6 +96,33 @@ def test_disagreement_is_the_energy_of_the_image_error(patterns: str) -> None:
     assert told == pytest.approx(struck, rel=0.1 if patterns == "uniform" else 0.06)
 
 
+def test_noise_is_taken_off_what_halves_disagree_on() -> None:
+    """White noise in the frames, as much in the image as the dipoles' error: what is told stays that of dipoles.
+
+    40 draws of some 100 numbers, half of their energy signal: good to 2 sqrt(2 / 4000) = 4 %, three of them.
+    (Planted: no noise taken off; its level in the image for that in the difference; G^2 summed for divided by.)
+    """
+    rng, family = np.random.default_rng(6), parse_patterns("dots:3", N, 0)
+    factors, (P_L, P_R) = (shadow(), shadow(0.37)), (family.left.astype(float), family.right.astype(float))
+    model = Model(prepare(*factors, P_L, P_R), factors, (P_L, P_R))
+    propagation, told = Propagation(model, 1e-6), 0.0
+    white, right = propagation.of_white(1.0), model.prepared.right
+    dipoles = rng.standard_normal((40, N, N))
+    seen = [model.moved[0].sum(axis=0).T @ d @ (right.basis * right.singular) for d in dipoles]
+    errors = [model.prepared.image(propagation.gain * each) for each in seen]
+    struck = float(np.square(errors).mean())
+    deviation = np.sqrt(struck / white.mean())
+    for d in dipoles:
+        sums = model.prepared.accumulator()
+        for i, left in enumerate(P_L.T):
+            for j, right in enumerate(P_R.T):
+                noise = deviation * rng.standard_normal((len(factors[0]), len(factors[1])))
+                sums.add(model.slopes[0] @ (np.outer(left, right) * d) @ factors[1].T + noise, i, j)
+        known = deviation**2 * white
+        told += disagreement(model, propagation.gain, model.prepared.problem(sums).halves, (known, known)).mean()
+    assert told / 40 == pytest.approx(struck, rel=0.12)
+
+
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])
 def test_noise_alone_is_no_disagreement(patterns: str) -> None:
     """20 sessions of an even scene with noise in frames and factors, two sides: above 3 standard deviations are 2 and 0

@@ -17,7 +17,7 @@ from mitsim.reconstruct.regularisation import DiagonalProblem
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation, scene_energy
 from mitsim.rig.patterns import parse_patterns
-from tests.ideal_sessions import bench, picture
+from tests.ideal_sessions import Bench, bench, picture
 
 N, PIXELS = 6, 14
 FAMILIES = "uniform", "dots:3", "hadamard:2", "random:3"
@@ -187,6 +187,23 @@ def test_what_lambda_takes_away() -> None:
     detail = np.hypot(*np.gradient(picture()))
     assert found[detail > np.quantile(detail, 0.8)].mean() > 1.5 * found[detail < np.quantile(detail, 0.2)].mean()
     assert not Propagation(sums.model, 0.0).of_regularisation(problem, 0.0).any()
+
+
+def test_what_lambda_takes_away_of_as_many_data_as_unknowns() -> None:
+    """8 x 8 pixels under 2 x 2 patterns leave no data to tell the noise: the mean of the frames' stated variance is
+    taken; their sum would change the answer by percents. (Planted: their sum.)"""
+    rng = np.random.default_rng(0)
+    camera = Bench(*(rng.random((8, 16)) for _ in range(2)), peak=20.0)
+    shots, factors = camera.run("dots:2", picture(), 0), camera.calibrated(0)
+    sums = accumulated(shots, factors)
+    problem, stated = sums.prepared.problem(sums.frames), float(np.mean(sums.noise.variance))
+    lam = 1e-2 * problem.scale
+    uncertainties = reconstruct(shots, factors, lam).uncertainties
+    assert uncertainties and sums.noise.variance.shape == (2, 2)
+    got = np.square(uncertainties.sources["regularisation_bias"])
+    propagation = Propagation(sums.model, lam)
+    assert got == pytest.approx(propagation.of_regularisation(problem, stated), rel=1e-9)
+    assert got.mean() > 1.01 * propagation.of_regularisation(problem, 4 * stated).mean()
 
 
 @pytest.mark.parametrize("patterns", ["dots:3", "hadamard:4"])
