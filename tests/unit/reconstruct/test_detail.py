@@ -100,7 +100,8 @@ def test_noise_is_taken_off_what_halves_disagree_on() -> None:
     """White noise in the frames, as much in the image as the dipoles' error: what is told stays that of dipoles.
 
     40 draws of some 100 numbers, half of their energy signal: good to 2 sqrt(2 / 4000) = 4 %, three of them.
-    (Planted: no noise taken off; its level in the image for that in the difference; G^2 summed for divided by.)
+    (Planted: no noise taken off; its level in the image for that in the difference; G^2
+    multiplied for divided by; columns taken for rows.)
     """
     rng, family = np.random.default_rng(6), parse_patterns("dots:3", N, 0)
     factors, (P_L, P_R) = (shadow(), shadow(0.37)), (family.left.astype(float), family.right.astype(float))
@@ -119,8 +120,14 @@ def test_noise_is_taken_off_what_halves_disagree_on() -> None:
                 noise = deviation * rng.standard_normal((len(factors[0]), len(factors[1])))
                 sums.add(model.slopes[0] @ (np.outer(left, right) * d) @ factors[1].T + noise, i, j)
         known = deviation**2 * white
-        told += disagreement(model, propagation.gain, model.prepared.problem(sums).halves, (known, known)).mean()
+        halves = model.prepared.problem(sums).halves
+        assert halves
+        told += propagation.of_disagreement(halves, known, known).mean()
     assert told / 40 == pytest.approx(struck, rel=0.12)
+    # Light that moves along the rows is told by halves of the rows, and by what is known of those alone.
+    everything = propagation.of_disagreement(halves, known, known)
+    assert propagation.of_disagreement(halves, known, 1e6 * known) == pytest.approx(everything)
+    assert everything.any() and not propagation.of_disagreement(halves, 1e6 * known, known).any()
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])

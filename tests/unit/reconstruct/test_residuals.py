@@ -85,7 +85,9 @@ def test_noise_of_a_measurement_is_its_shots_and_that_of_the_ambient_frame_where
     np.testing.assert_allclose(noise.of(light, 1), digital.variance(light, 1) + 50)
     np.testing.assert_allclose(noise.of(light, 2), digital.variance(light, 2))
     noise.power = 8.0
-    assert noise.rendering == pytest.approx(2.5e-5 * 8)
+    assert noise.rendering == noise.discretisation == pytest.approx(2.5e-5 * 8)
+    noise.light_error = 0.01  # then sampling is told by it
+    assert noise.discretisation == pytest.approx(1.6e-5 * 8)
 
 
 def oblong() -> tuple[list[np.ndarray], list[np.ndarray]]:
