@@ -174,6 +174,15 @@ def test_energy_is_told_by_the_data_and_goes_on_beyond_them() -> None:
         assert 1 / 1.5 < found[first:last].sum() / order[first:last].sum() < 1.5, (first, last)
 
 
+def test_energy_is_that_of_the_data_in_every_octave_that_tells_it() -> None:
+    """Six octaves of 50 numbers without noise, whose energies follow no power. (Planted: the power from the second.)"""
+    rng, levels = np.random.default_rng(0), np.array([1.0, 9.0, 0.2, 5.0, 0.1, 3.0])
+    sigma = np.repeat(2.0 ** -(np.arange(6) + 0.5 * (np.arange(6) > 0)), 50).reshape(6, 50)
+    data = sigma * np.sqrt(levels)[:, None] * rng.standard_normal(sigma.shape)
+    found = scene_energy(DiagonalProblem(sigma, data, float(np.square(data).sum()), 301), 0.0)
+    assert found[:, 0] == pytest.approx(np.square(data / sigma).mean(axis=1), rel=1e-9)
+
+
 def test_what_lambda_takes_away() -> None:
     """Over all of the image, the lost part of the energy; more where the image has detail than where it is even."""
     shots, factors = bench().run("uniform", picture(), 0), bench().calibrated(0)
@@ -224,6 +233,15 @@ def test_truth_lies_within_twice_the_uncertainty(patterns: str) -> None:
         inside.append(np.abs(image.image - scene) < 1.96 * known)
         assert budget["calibration_noise"] > 0.3 * budget["frame_noise"], "it shall matter"
     assert np.mean(inside) == pytest.approx(0.95, abs=0.015)
+
+
+def test_light_that_a_run_states_to_be_off_is_off_in_the_image() -> None:
+    """Every scene pixel's light by 3 %, which next to no lambda leaves as it is."""
+    shots, factors = bench().run("dots:3", picture(), 0), bench().calibrated(0)
+    shots.manifest = shots.manifest.model_copy(update={"light_error": 0.03})
+    image = reconstruct(shots, factors, 1e-9)
+    assert image.uncertainties is not None
+    assert image.uncertainties.sources["rendering"] == pytest.approx(0.03, rel=1e-3)
 
 
 def test_exposure_scales_the_image() -> None:
