@@ -6,7 +6,8 @@ Speed: streaming sums against dense Phi_L^T Y Phi_R products of the same frames,
 factorisation, each the median of warm repetitions within this run. Accuracy: noise-free recovery at
 lambda = 0, block against full, and the error of three forms of the solution against a 50-digit answer over
 lambda (gram: the paper's; svd+Q: singular vectors of the stacked matrix but the paper's Q; svd: projected
-frames).
+frames). Trust: seconds of the stages of whole reconstructions from noisy frames in memory, the best of the repetitions,
+and what the uncertainty takes of adding up and solving; slopes of the factors, which the misfit needs too, count there.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ import argparse
 import json
 import os
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import mpmath
 import numpy as np
 
 from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.study.solver_cost import dots, paper_factor
 
@@ -152,6 +156,21 @@ def rounding(rng: np.random.Generator) -> list[dict[str, float]]:
     return rows
 
 
+def trust(factor: np.ndarray, repeat: int, seed: int) -> dict[str, float]:
+    """Best seconds by stage and family, and the uncertainty's part of adding up and solving."""
+    sys.path.insert(0, str(Path(__file__).parent.parent))
+    from tests.ideal_sessions import Bench, picture
+
+    camera, result = Bench(factor, factor), {}
+    for family in ("uniform", "dots:4", "dots:7"):
+        shots, factors = camera.run(family, picture(seed, N), seed), camera.calibrated(seed)
+        runs = [reconstruct(shots, factors).seconds for _ in range(repeat)]
+        best = {stage: min(run[stage] for run in runs) for stage in runs[0]}
+        result |= {f"{family}, {stage}_s": seconds for stage, seconds in best.items()}
+        result[f"{family}, uncertainty / solve"] = best["uncertainty"] / (best["accumulate"] + best["solve"])
+    return result
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="write the figures to this file")
@@ -165,9 +184,10 @@ def main() -> None:
         "load": os.getloadavg()[0],
         "speed": speed(factor, options.repeat, np.random.default_rng(options.seed)),
         "recovery": recovery(factor, np.random.default_rng(options.seed)),
+        "trust": trust(factor, options.repeat, options.seed),
         "rounding": rounding(np.random.default_rng(options.seed)),
     }
-    for section in ("speed", "recovery"):
+    for section in ("speed", "recovery", "trust"):
         for name, value in report[section].items():
             print(f"{name:36s} {value:.3g}")
     print(" ".join(f"{name:>21s}" for name in report["rounding"][0]))

@@ -11,6 +11,9 @@ into an error of the image, place by place. A surface beside the calibrated dist
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
@@ -37,50 +40,70 @@ _NEAR = 2.0
 cover alike (within 1 %, 48 arrangements of prints, mask and patterns)."""
 
 
-def print_energy(
-    prepared: Prepared,
-    factors: tuple[FloatArray, FloatArray],
-    patterns: tuple[FloatArray, FloatArray],
-    image: FloatArray,
-) -> float:
-    """Energy outside the model's range of print that changes within a projector pixel.
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A factorised model, and what it sees of light beside the centres of its pixels.
+
+    Parameters
+    ----------
+    prepared
+        the factorised model.
+    factors
+        Phi_L (m, n) and Phi_R (m', n'), centred where the model is.
+    patterns
+        P_L (n, K) and P_R (n', K').
+    """
+
+    prepared: Prepared
+    factors: tuple[FloatArray, FloatArray]
+    patterns: tuple[FloatArray, FloatArray]
+
+    @property
+    def sides(self) -> tuple[Side, Side]:
+        """The factorised sides."""
+        return self.prepared.left, self.prepared.right
+
+    @cached_property
+    def slopes(self) -> tuple[FloatArray, FloatArray]:
+        """Phi_L' and Phi_R', see :func:`slope_of`."""
+        return slope_of(self.factors[0]), slope_of(self.factors[1])
+
+    @cached_property
+    def moved(self) -> tuple[FloatArray, FloatArray]:
+        """:func:`moved_responses` of both sides."""
+        left, right = zip(self.sides, self.slopes, self.patterns, strict=True)
+        return moved_responses(*left), moved_responses(*right)
+
+
+def print_energy(model: Model, image: FloatArray) -> float:
+    """Energy outside a ``model``'s range of print that changes within a projector pixel, when its ``image`` is (n, n').
 
     Light of slope g a pixel moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T, Phi_R' being the slope of Phi_R along
     its columns. With C = S_L V_L^T g / 12 that is sum_pq (C^T C o P_R P_R^T o Phi_R'^T Phi_R')[p, q] in all, of which
     |C T|^2 is in the range, T being :func:`moved_responses`; and the same of the other side.
-
-    Parameters
-    ----------
-    prepared, factors, patterns
-        the factorised model, its factors, and P_L (n, K) and P_R (n', K').
-    image
-        (n, n').
     """
     total = 0.0
-    left, right = prepared.left, prepared.right
-    sides = (left, right, factors[1], patterns[1], image), (right, left, factors[0], patterns[0], image.T)
-    for other, own, factor, lit, seen in sides:
+    own = tuple(zip(model.sides, model.slopes, model.patterns, model.moved, strict=True))
+    for (other, *_), (_, slope, lit, moved), seen in (own[0], own[1], image), (own[1], own[0], image.T):
         if seen.shape[1] > 1:
-            slope = slope_of(factor)
             along = (other.basis * other.singular).T @ np.gradient(seen, axis=1) / 12
             everything = np.sum((along.T @ along) * (lit @ lit.T) * (slope.T @ slope))
-            total += float(everything - np.square(along @ moved_responses(own, factor, lit).sum(axis=0)).sum())
+            total += float(everything - np.square(along @ moved.sum(axis=0)).sum())
     return EDGES * max(total, 0.0)
 
 
-def moved_responses(side: Side, factor: FloatArray, patterns: FloatArray) -> FloatArray:
+def moved_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> FloatArray:
     """(2, n, r) sum_j diag(p_j) Phi'^T U_j over each half of the sensor: what coefficients see of light one pixel
     beside the centre of its own.
 
     Parameters
     ----------
-    side, factor, patterns
-        one side of the model, its factor Phi (m, n), and its patterns (n, K).
+    side, slope, patterns
+        one side of the model, the slope Phi' (m, n) of its factor, and its patterns (n, K).
     """
-    slope = slope_of(factor)
-    total = np.zeros((2, factor.shape[1], len(side.singular)))
+    total = np.zeros((2, slope.shape[1], len(side.singular)))
     for half, strips in zip(total, side.halves, strict=True):
-        own = np.concatenate([slope[strip] for strip in strips]).T if strips else np.zeros((factor.shape[1], 0))
+        own = np.concatenate([slope[strip] for strip in strips]).T if strips else np.zeros((slope.shape[1], 0))
         for column, slab in zip(patterns.T, side.slabs, strict=True):
             seen = np.concatenate([slab.matrix[strip] for strip in strips]) if strips else slab.matrix[:0]
             half[:, slab.columns] += column[:, None] * (own @ seen)
@@ -100,29 +123,21 @@ def slope_of(factor: FloatArray) -> FloatArray:
     return np.asarray(np.gradient(factor, axis=1) if abs(shift) < 1 else -shift * np.gradient(factor, axis=0))
 
 
-def disagreement(
-    prepared: Prepared,
-    gain: FloatArray,
-    halves: Halves,
-    moved: tuple[FloatArray, FloatArray],
-    known: tuple[FloatArray, FloatArray],
-) -> FloatArray:
+def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[FloatArray, FloatArray]) -> FloatArray:
     """(n, n') variance of an image by what halves of the sensor disagree on; 0 where that is no more than chance.
 
     Parameters
     ----------
-    prepared, gain
-        the factorised model, and G (r, r').
+    model, gain
+        and its G (r, r').
     halves
         of its data.
-    moved
-        :func:`moved_responses` of both sides.
     known
         (n, n') variances of the image by known errors that change from sensor row to row, and from column to column.
     """
     total = np.zeros_like(known[0])
-    sides = (prepared.left, prepared.right), (prepared.right, prepared.left)
-    for axis, ((own, other), response, variance) in enumerate(zip(sides, moved, known, strict=True)):
+    sides = model.sides, model.sides[::-1]
+    for axis, ((own, other), response, variance) in enumerate(zip(sides, model.moved, known, strict=True)):
         weights, light = np.square(gain.T if axis else gain), np.square(other.singular)
         whole = response.sum(axis=0)
         parts = whole, response[0] - whole @ own.first_half
@@ -134,7 +149,7 @@ def disagreement(
         beyond = float(np.square(difference).sum()) - level * float(spread.sum())
         chance = level * float(np.sqrt(2 * np.square(spread).sum()))
         if told > _LEAST_TOLD * struck and beyond > _SIGNIFICANT * chance:
-            excess = np.square(prepared.image(difference)) - variance * float(spread.sum() / weights.sum())
+            excess = np.square(model.prepared.image(difference)) - variance * float(spread.sum() / weights.sum())
             total += struck / told * gaussian_filter(excess, _NEAR, mode="nearest")
     return np.maximum(total, 0.0)
 
@@ -142,9 +157,10 @@ def disagreement(
 def _shift(factor: FloatArray) -> float:
     """Sensor pixels by which a shadow moves from one scene pixel to the next; 0 where it is no moving shadow."""
     rows = len(factor)
-    spectrum = np.fft.rfft(factor - factor.mean(axis=0), 2 * rows, axis=0)
-    size = float(np.square(factor - factor.mean(axis=0)).sum())
-    correlation = np.fft.irfft((spectrum[:, 1:] * spectrum[:, :-1].conj()).sum(axis=1), 2 * rows)
+    shadows = np.ascontiguousarray((factor - factor.mean(axis=0)).T)  # transforms are faster along lines of memory
+    spectra = np.fft.rfft(shadows, 2 * rows)
+    size = float(np.square(shadows).sum())
+    correlation = np.fft.irfft((spectra[1:] * spectra[:-1].conj()).sum(axis=0), 2 * rows)
     place = int(np.argmax(correlation))
     before, peak, after = correlation[np.arange(place - 1, place + 2) % (2 * rows)]
     if not (peak > _ALIKE * size and before + after < 2 * peak):

@@ -55,7 +55,7 @@ class Halves:
     @cached_property
     def typical(self) -> float:
         """Noise variance of most numbers, by the median; NaN when unknown."""
-        return _median(np.concatenate([square[self._measured] for square in self._squares]))
+        return float(_medians(np.concatenate([square[self._measured] for square in self._squares])[None])[0])
 
     @cached_property
     def excess(self) -> FloatArray:
@@ -78,15 +78,19 @@ def _told(spread: FloatArray) -> FloatArray:
     return np.where(spread >= _LEAST_SPREAD, spread, np.nan)
 
 
-def _median(squares: FloatArray) -> float:
-    """Variance of normal numbers by the median of their ``squares``, which a few that are no noise do not move."""
-    known = squares[~np.isnan(squares)]
-    return float(np.median(known)) / _MEDIAN if known.size else float("nan")
+def _medians(squares: FloatArray) -> FloatArray:
+    """Variance of each row of normal numbers by the median of their ``squares``, which a few that are no noise do not
+    move; NaN where none is known."""
+    ordered, count = np.sort(squares, axis=1), np.count_nonzero(~np.isnan(squares), axis=1)  # NaN come last
+    middle = [
+        np.take_along_axis(ordered, place[:, None], axis=1) for place in (np.maximum(count - 1, 0) // 2, count // 2)
+    ]
+    return np.asarray((middle[0] + middle[1])[:, 0] / (2 * _MEDIAN))
 
 
 def _excess(squares: FloatArray) -> FloatArray:
     """(rows,) variance of each row of ``squares`` above that of the middle row, beyond what chance explains."""
-    level = np.array([_median(row) for row in squares])
+    level = _medians(squares)
     count = np.maximum((~np.isnan(squares)).sum(axis=1), 1)
     middle = np.nanmedian(level) if not np.isnan(level).all() else np.nan
     significant = level > middle * (1 + _SIGNIFICANT * MEDIAN_SPREAD / np.sqrt(count))

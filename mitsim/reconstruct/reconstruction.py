@@ -23,7 +23,7 @@ from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
-from mitsim.reconstruct.detail import print_energy
+from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import Misfit, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
@@ -237,18 +237,23 @@ class Accumulated:
 
     Attributes
     ----------
-    prepared
-        the model, factorised.
+    model
+        that the frames are of, factorised.
     frames, noise
         sums of all frames, and of their noise.
     kept
         the frames themselves while they are few; all or none.
     """
 
-    prepared: Prepared
+    model: Model
     frames: Accumulator
     noise: FrameNoise
     kept: tuple[Measurement, ...]
+
+    @property
+    def prepared(self) -> Prepared:
+        """The factorised model."""
+        return self.model.prepared
 
     def misfit(self, shots: Capture, factors: Factors, image: FloatArray) -> Misfit | None:
         """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
@@ -267,7 +272,7 @@ class Accumulated:
             self.kept or shots.measured(),
             self.noise,
             factor_energy(self.prepared, shots.patterns, stated, image) if stated else None,
-            print_energy(self.prepared, factors.sides, shots.patterns, image),
+            print_energy(self.model, image),
             Evidence(factors, shots.patterns),
         )
 
@@ -281,10 +286,9 @@ class Accumulated:
         solution
             of these sums.
         """
-        sides = factors.sides
         calibrated = factors.manifest.digital.exposure_uncertainty if factors.manifest.digital else 0.0
         return uncertainty(
-            Propagation(self.prepared, sides, shots.patterns, solution.lam),
+            Propagation(self.model, solution.lam),
             self.noise,
             factors.manifest.noise,
             math.hypot(shots.manifest.digital.exposure_uncertainty, calibrated),
@@ -309,7 +313,7 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
         noise.add(measurement)
         if few:
             kept.append(measurement)
-    return Accumulated(prepared, frames, noise, tuple(kept))
+    return Accumulated(Model(prepared, factors.sides, shots.patterns), frames, noise, tuple(kept))
 
 
 def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:

@@ -42,12 +42,11 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.framefile import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.detail import PRINT, disagreement, moved_responses
+from mitsim.reconstruct.detail import PRINT, Model, disagreement
 from mitsim.reconstruct.halves import Halves
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.sides import Side
-from mitsim.reconstruct.solver import Prepared
 
 _LOST = 1e-5
 """Part of the energy of G that its few products may leave out: 0.3 % of its norm, less than 1 % of a variance."""
@@ -60,8 +59,6 @@ _SIGNIFICANT = 3.0
 """Standard deviations of the noise's energy that an octave's signal must have."""
 _NEAR = 2.0
 """Scene pixels around a place whose detail tells of lost detail there: of 1, 2 and 4 that which covers best."""
-_DIGITS = 9
-"""Digits to which answers of coefficients, at most of order 1, are alike: rounding moves them by 1e-15."""
 NO_UNCERTAINTY = {"uncertainty": None, "uncertainty_budget": None}
 """Entries of result.json where it is not known."""
 
@@ -114,38 +111,33 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
-    """How noise of a model's data comes to be noise of its image.
+    """How noise of a ``model``'s data comes to be noise of its image at ``lam``, lambda."""
 
-    Parameters
-    ----------
-    prepared
-        the factorised model.
-    factors
-        Phi_L (m, n) and Phi_R (m', n'), centred where the model is.
-    patterns
-        P_L (n, K) and P_R (n', K').
-    lam
-        lambda of the image.
-    """
-
-    prepared: Prepared
-    factors: tuple[FloatArray, FloatArray]
-    patterns: tuple[FloatArray, FloatArray]
+    model: Model
     lam: float
 
     @cached_property
     def gain(self) -> FloatArray:
         """G (r, r'), 0 where nothing is measured."""
-        sigma = np.outer(self.prepared.left.singular, self.prepared.right.singular)
-        return np.divide(sigma, np.square(sigma) + self.lam, out=np.zeros_like(sigma), where=sigma > 0)
+        return np.divide(
+            self._sigma, np.square(self._sigma) + self.lam, out=np.zeros_like(self._sigma), where=self._sigma > 0
+        )
 
     @cached_property
     def terms(self) -> tuple[FloatArray, FloatArray]:
-        """g (r, k) and h (r', k) of which G is the sum of products, as few as leave out ``_LOST`` of its energy."""
-        left, values, right = np.linalg.svd(self.gain, full_matrices=False)
-        beyond = 1 - np.cumsum(np.square(values)) / np.square(values).sum()
-        count = int(np.argmax(beyond <= _LOST)) + 1
-        return left[:, :count] * values[:count], right[:count].T
+        """g (r, k) and h (r', k) of which G is the sum of products, few that leave out ``_LOST`` of its energy.
+
+        Each takes away the row and the column of the largest number that is left: for so smooth a table as many as an
+        SVD takes or one more, in a tenth of the time.
+        """
+        rest, energy = self.gain.copy(), float(np.square(self.gain).sum())
+        rows, columns = list[FloatArray](), list[FloatArray]()
+        while not rows or np.square(rest).sum() > _LOST * energy:
+            row, column = np.unravel_index(np.argmax(np.abs(rest)), rest.shape)
+            rows.append(rest[:, column] / rest[row, column])
+            columns.append(rest[row].copy())
+            rest -= np.outer(rows[-1], columns[-1])
+        return np.stack(rows, axis=1), np.stack(columns, axis=1)
 
     def of_white(self, variance: float) -> FloatArray:
         """(n, n') variance of the image by independent noise of this ``variance`` in all data."""
@@ -159,7 +151,7 @@ class Propagation:
         rows, columns
             (K, K', m) and (K, K', m') mean variance of a datum of each pattern by sensor row, and by sensor column.
         """
-        left, right = self._sides
+        left, right = self.model.sides
         squares = [np.square(slab.matrix) for slab in right.slabs]
         means = np.maximum(rows.mean(axis=2), np.finfo(np.float64).tiny)
         total = np.zeros_like(self.gain)
@@ -179,7 +171,7 @@ class Propagation:
             (m,) and (m',) mean variance of its pixels by sensor row, and by sensor column.
         """
         products = []
-        for side, own, variance in zip(self._sides, self.terms, (rows, columns), strict=True):
+        for side, own, variance in zip(self.model.sides, self.terms, (rows, columns), strict=True):
             common = _common(side) * np.sqrt(variance)[:, None]
             taken = np.stack([(side.basis * term) @ common.T for term in own.T], axis=1)
             products.append(taken @ taken.transpose(0, 2, 1))
@@ -187,8 +179,7 @@ class Propagation:
 
     def of_light(self, variance: float) -> FloatArray:
         """(n, n') variance of the image by an independent error of this ``variance`` in every scene pixel's light."""
-        sigma = np.outer(self.prepared.left.singular, self.prepared.right.singular)
-        return self._spread(variance * np.square(sigma))
+        return self._spread(variance * np.square(self._sigma))
 
     def of_regularisation(self, problem: DiagonalProblem, variance: float) -> FloatArray:
         """(n, n') mean square of what lambda takes away of the image of a ``problem``, whose data have the stated
@@ -199,24 +190,26 @@ class Propagation:
         """
         lost = 1 - problem.kept(self.lam)
         everywhere = self._seen(np.square(lost) * scene_energy(problem, variance))
-        seen = np.square(self.prepared.image(lost * self.gain * problem.projected))
+        seen = np.square(self.model.prepared.image(lost * self.gain * problem.projected))
         near = gaussian_filter(seen, _NEAR, mode="nearest")
         return everywhere * near / near.mean() if near.any() else everywhere
 
     def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, n') variances of an ``image`` by ``noise`` of the left factor, and of the right one."""
-        left, right = self._sides
-        rows = _of_factor(left, right, self.patterns[0], self.terms, image)
-        columns = _of_factor(right, left, self.patterns[1], self.terms[::-1], image.T).T
+        left, right = self.model.sides
+        rows = _of_factor(left, right, self.model.patterns[0], self.terms, image)
+        columns = _of_factor(right, left, self.model.patterns[1], self.terms[::-1], image.T).T
         return noise.left**2 * rows, noise.right**2 * columns
 
     def of_print(self, image: FloatArray) -> FloatArray:
         """(n, n') mean square of what an ``image`` is off by when its print changes within every projector pixel."""
-        left, right = self._sides
+        left, right = self.model.sides
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
-        moved = [each.sum(axis=0) for each in self._moved]
+        moved = [each.sum(axis=0) for each in self.model.moved]
         seen = moved[0].T @ rows @ (right.basis * right.singular), (left.basis * left.singular).T @ columns @ moved[1]
-        return PRINT * sum((np.square(self.prepared.image(self.gain * each)) for each in seen), np.zeros_like(image))
+        return PRINT * sum(
+            (np.square(self.model.prepared.image(self.gain * each)) for each in seen), np.zeros_like(image)
+        )
 
     def of_disagreement(self, halves: Halves, rows: FloatArray, columns: FloatArray) -> FloatArray:
         """(n, n') variance of the image by what ``halves`` of the sensor disagree on beyond chance.
@@ -228,7 +221,7 @@ class Propagation:
         rows, columns
             (n, n') variances of the image by known errors that change from sensor row to row, and column to column.
         """
-        return disagreement(self.prepared, self.gain, halves, self._moved, (rows, columns))
+        return disagreement(self.model, self.gain, halves, (rows, columns))
 
     def _spread(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
@@ -236,17 +229,13 @@ class Propagation:
 
     def _seen(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each of its coefficients being ``variances`` (r, r')."""
-        left, right = (np.square(side.basis) for side in self._sides)
+        left, right = (np.square(side.basis) for side in self.model.sides)
         return np.asarray(left @ variances @ right.T)
 
     @cached_property
-    def _moved(self) -> tuple[FloatArray, FloatArray]:
-        left, right = zip(self._sides, self.factors, self.patterns, strict=True)
-        return moved_responses(*left), moved_responses(*right)
-
-    @property
-    def _sides(self) -> tuple[Side, Side]:
-        return self.prepared.left, self.prepared.right
+    def _sigma(self) -> FloatArray:
+        """(r, r') singular values of the whole model."""
+        return np.outer(*(side.singular for side in self.model.sides))
 
 
 def uncertainty(
@@ -336,26 +325,29 @@ def _of_factor(
 ) -> FloatArray:
     """(n, n') variance of an ``image`` by independent numbers of variance 1 in the factor of its ``own`` side."""
     seen = image @ (other.basis * other.singular)
-    # Coefficients of one block answer alike: each kind of answer is summed once.
-    responses, kind = np.unique(np.round(_responses(own, patterns), _DIGITS), axis=0, return_inverse=True)
+    # Pixels that the same patterns light are seen alike: coefficients answer to each kind of them once.
+    kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
+    of_kind = (kind.ravel() == np.arange(len(kinds))[:, None]).astype(np.float64)
+    responses = _responses(own, kinds)
     rows, columns = terms
-    parts = [(seen * column) @ other.basis.T for column in columns.T]
+    parts = np.stack([(seen * column) @ other.basis.T for column in columns.T])
     spread = np.zeros((len(own.singular), len(other.basis)))
-    for k, part in enumerate(parts):
-        for other_k in range(k + 1):
-            twice = 1.0 if k == other_k else 2.0
-            both = (responses @ (part * parts[other_k]))[kind]
-            spread += twice * (rows[:, k] * rows[:, other_k])[:, None] * both
+    for k in range(len(parts)):
+        twice = np.where(np.arange(k + 1) < k, 2.0, 1.0) * rows[:, : k + 1] * rows[:, k : k + 1]
+        weights = twice[:, :, None] * responses[:, None, :]
+        both = of_kind @ (parts[: k + 1] * parts[k])
+        spread += weights.reshape(len(spread), -1) @ both.reshape(-1, len(other.basis))
     return np.asarray(np.square(own.basis) @ np.maximum(spread, 0.0))
 
 
-def _responses(side: Side, patterns: FloatArray) -> FloatArray:
-    """rho (r, n): squared norm of sum_i P[p, i] U_i[:, a], of coefficient a for light of scene pixel p."""
-    stack = np.zeros((side.pattern_count, side.sensor_size, len(side.singular)))
-    for part, slab in zip(stack, side.slabs, strict=True):
-        part[:, slab.columns] = slab.matrix
-    products = np.einsum("ima,jma->aij", stack, stack, optimize=True)
-    return np.asarray(np.einsum("pi,aij,pj->ap", patterns, products, patterns, optimize=True))
+def _responses(side: Side, kinds: FloatArray) -> FloatArray:
+    """rho (r, c): squared norm of sum_i P[p, i] U_i[:, a], of coefficient a for light of a pixel of a kind, whose P[p]
+    is one of ``kinds`` (c, K)."""
+    stack = np.zeros((len(side.singular), side.pattern_count, side.sensor_size))
+    for index, slab in enumerate(side.slabs):
+        stack[slab.columns, index] = slab.matrix.T
+    products = stack @ stack.transpose(0, 2, 1)
+    return np.asarray(((kinds @ products) * kinds).sum(axis=2))
 
 
 def _together(parts: list[FloatArray]) -> FloatArray:

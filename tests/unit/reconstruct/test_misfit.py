@@ -13,7 +13,7 @@ import pytest
 from mitsim.core.manifests import Digital
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit
+from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit, shown
 from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Status, Verdict
@@ -215,3 +215,11 @@ def test_both_halves_of_a_pair_count_alike() -> None:
         positive, negative = rate[each.row, each.column, 1], rate[each.row, each.column, -1]
         assert np.array_equal(each.frame, positive - negative) and np.array_equal(each.light, positive + negative)
         assert each.shots == 2 and each.power == pytest.approx(positive**2 + negative**2, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("chi_square", "text"), [(1.0042, "1.004"), (9.5, "9.500"), (10.0, "10"), (12_345.0, "1.23e+04")]
+)
+def test_chi_square_as_people_read_it(chi_square: float, text: str) -> None:
+    """The third decimal where fitting images differ, three digits beyond. (Planted: 10 with three decimals.)"""
+    assert shown(chi_square) == text

@@ -8,6 +8,7 @@ import pytest
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
 from mitsim.reconstruct import misfit
 from mitsim.reconstruct.causes import Evidence, _beyond, _orthonormal
+from mitsim.reconstruct.detail import Model
 from mitsim.reconstruct.misfit import Residuals
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import prepare
@@ -84,7 +85,9 @@ def test_noise_of_a_measurement_is_its_shots_and_that_of_the_ambient_frame_where
     np.testing.assert_allclose(noise.of(light, 1), digital.variance(light, 1) + 50)
     np.testing.assert_allclose(noise.of(light, 2), digital.variance(light, 2))
     noise.power = 8.0
-    assert noise.rendering == pytest.approx(2.5e-5 * 8)
+    assert noise.rendering == noise.discretisation == pytest.approx(2.5e-5 * 8)
+    noise.light_error = 0.01  # then sampling is told by it
+    assert noise.discretisation == pytest.approx(1.6e-5 * 8)
 
 
 def oblong() -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -103,7 +106,7 @@ def test_an_ambient_frame_s_noise_goes_into_an_oblong_image_from_both_its_sides(
         sums = prepared.accumulator()
         sums.add(unit.reshape(5, 6), 0, 0)
         images.append(prepared.solve(sums, lam).image)
-    found = Propagation(prepared, (sides[0], sides[1]), patterns, lam).of_ambient_frame(
+    found = Propagation(Model(prepared, (sides[0], sides[1]), patterns), lam).of_ambient_frame(
         np.full(5, 3.0), np.full(6, 3.0)
     )
     np.testing.assert_allclose(found, 3.0 * np.square(images).sum(axis=0), rtol=1e-9)

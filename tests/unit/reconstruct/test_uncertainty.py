@@ -11,13 +11,13 @@ import pytest
 
 from mitsim.core.framefile import read_frame
 from mitsim.core.manifests import Digital, FactorNoise
-from mitsim.reconstruct.detail import EDGES, PRINT, print_energy
+from mitsim.reconstruct.detail import EDGES, PRINT, Model, print_energy
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation, scene_energy
 from mitsim.rig.patterns import parse_patterns
-from tests.ideal_sessions import bench, picture
+from tests.ideal_sessions import Bench, bench, picture
 
 N, PIXELS = 6, 14
 FAMILIES = "uniform", "dots:3", "hadamard:2", "random:3"
@@ -33,7 +33,7 @@ class Small:
         self.patterns = family.left.astype(float), family.right.astype(float)
         prepared = prepare(*self.factors, *self.patterns)
         lam = 1e-3 * (prepared.left.singular.max() * prepared.right.singular.max()) ** 2
-        self.propagation = Propagation(prepared, self.factors, self.patterns, lam)
+        self.propagation = Propagation(Model(prepared, self.factors, self.patterns), lam)
         self.A = self.matrix(*self.factors)
         self.solver = np.linalg.solve(self.A.T @ self.A + lam * np.eye(N * N), self.A.T)
         self.image = rng.random((N, N))
@@ -90,6 +90,17 @@ def test_noise_of_factors(patterns: str) -> None:
 
 
 @pytest.mark.parametrize("patterns", FAMILIES)
+def test_gain_is_a_sum_of_few_products(patterns: str) -> None:
+    """All but 1e-5 of its energy, with one product more than the best (an SVD's) at most. (Planted: 1e-4.)"""
+    propagation = Small(patterns).propagation
+    (rows, columns), gain = propagation.terms, propagation.gain
+    assert np.square(gain - rows @ columns.T).sum() <= 1e-5 * np.square(gain).sum()
+    values = np.square(np.linalg.svd(gain, compute_uv=False))
+    best = np.argmax(np.cumsum(values) >= (1 - 1e-5) * values.sum()) + 1
+    assert rows.shape[1] == columns.shape[1] <= best + 1
+
+
+@pytest.mark.parametrize("patterns", FAMILIES)
 def test_noise_of_an_ambient_frame(patterns: str) -> None:
     """One draw in all frames alike; pairs of signed patterns do not see it, so theirs is judged as if they did.
 
@@ -139,7 +150,7 @@ def test_energy_of_print_within_a_pixel(patterns: str) -> None:
     ):
         moved = matrix @ slope.ravel()
         exact += float(np.square(moved - basis @ (basis.T @ moved)).sum())
-    got = print_energy(small.propagation.prepared, small.factors, small.patterns, small.image)
+    got = print_energy(small.propagation.model, small.image)
     assert got == pytest.approx(EDGES * exact, rel=1e-9)
 
 
@@ -163,19 +174,45 @@ def test_energy_is_told_by_the_data_and_goes_on_beyond_them() -> None:
         assert 1 / 1.5 < found[first:last].sum() / order[first:last].sum() < 1.5, (first, last)
 
 
+def test_energy_is_that_of_the_data_in_every_octave_that_tells_it() -> None:
+    """Six octaves of 50 numbers without noise, whose energies follow no power. (Planted: the power from the second.)"""
+    rng, levels = np.random.default_rng(0), np.array([1.0, 9.0, 0.2, 5.0, 0.1, 3.0])
+    sigma = np.repeat(2.0 ** -(np.arange(6) + 0.5 * (np.arange(6) > 0)), 50).reshape(6, 50)
+    data = sigma * np.sqrt(levels)[:, None] * rng.standard_normal(sigma.shape)
+    found = scene_energy(DiagonalProblem(sigma, data, float(np.square(data).sum()), 301), 0.0)
+    assert found[:, 0] == pytest.approx(np.square(data / sigma).mean(axis=1), rel=1e-9)
+
+
 def test_what_lambda_takes_away() -> None:
     """Over all of the image, the lost part of the energy; more where the image has detail than where it is even."""
     shots, factors = bench().run("uniform", picture(), 0), bench().calibrated(0)
     sums = accumulated(shots, factors)
     problem = sums.prepared.problem(sums.frames)
     lam = 1e-6 * problem.scale
-    propagation = Propagation(sums.prepared, factors.sides, shots.patterns, lam)
+    propagation = Propagation(sums.model, lam)
     found = propagation.of_regularisation(problem, 0.0)
     lost = np.square(1 - problem.kept(lam)) * scene_energy(problem, 0.0)
     assert found.mean() == pytest.approx(lost.mean(), rel=0.3)  # exact but for the weights of both maps
     detail = np.hypot(*np.gradient(picture()))
     assert found[detail > np.quantile(detail, 0.8)].mean() > 1.5 * found[detail < np.quantile(detail, 0.2)].mean()
-    assert not Propagation(sums.prepared, factors.sides, shots.patterns, 0.0).of_regularisation(problem, 0.0).any()
+    assert not Propagation(sums.model, 0.0).of_regularisation(problem, 0.0).any()
+
+
+def test_what_lambda_takes_away_of_as_many_data_as_unknowns() -> None:
+    """8 x 8 pixels under 2 x 2 patterns leave no data to tell the noise: the mean of the frames' stated variance is
+    taken; their sum would change the answer by percents. (Planted: their sum.)"""
+    rng = np.random.default_rng(0)
+    camera = Bench(*(rng.random((8, 16)) for _ in range(2)), peak=20.0)
+    shots, factors = camera.run("dots:2", picture(), 0), camera.calibrated(0)
+    sums = accumulated(shots, factors)
+    problem, stated = sums.prepared.problem(sums.frames), float(np.mean(sums.noise.variance))
+    lam = 1e-2 * problem.scale
+    uncertainties = reconstruct(shots, factors, lam).uncertainties
+    assert uncertainties and sums.noise.variance.shape == (2, 2)
+    got = np.square(uncertainties.sources["regularisation_bias"])
+    propagation = Propagation(sums.model, lam)
+    assert got == pytest.approx(propagation.of_regularisation(problem, stated), rel=1e-9)
+    assert got.mean() > 1.01 * propagation.of_regularisation(problem, 4 * stated).mean()
 
 
 @pytest.mark.parametrize("patterns", ["dots:3", "hadamard:4"])
@@ -196,6 +233,15 @@ def test_truth_lies_within_twice_the_uncertainty(patterns: str) -> None:
         inside.append(np.abs(image.image - scene) < 1.96 * known)
         assert budget["calibration_noise"] > 0.3 * budget["frame_noise"], "it shall matter"
     assert np.mean(inside) == pytest.approx(0.95, abs=0.015)
+
+
+def test_light_that_a_run_states_to_be_off_is_off_in_the_image() -> None:
+    """Every scene pixel's light by 3 %, which next to no lambda leaves as it is."""
+    shots, factors = bench().run("dots:3", picture(), 0), bench().calibrated(0)
+    shots.manifest = shots.manifest.model_copy(update={"light_error": 0.03})
+    image = reconstruct(shots, factors, 1e-9)
+    assert image.uncertainties is not None
+    assert image.uncertainties.sources["rendering"] == pytest.approx(0.03, rel=1e-3)
 
 
 def test_exposure_scales_the_image() -> None:
