@@ -12,6 +12,7 @@ import numpy as np
 from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
+from mitsim.scene.guard.outline import Tag
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 
@@ -26,7 +27,8 @@ class LoadedScene:
     pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
     other emitters; ``mirrors`` tells whether a surface reflects or bends light into single directions, ``glossy``
     whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
-    estimators must refuse it.
+    estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
+    several.
     """
 
     path: Path
@@ -39,6 +41,7 @@ class LoadedScene:
     mirrors: bool
     glossy: bool
     unfit: Unfit
+    shapes: tuple[Tag, ...]
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -96,7 +99,8 @@ def load_scene(
         except MitsimError:
             if needs_projector:
                 raise
-    facts = *_polished(scene, checked.unfit), checked.unfit
+    shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
+    facts = *_polished(scene, checked.unfit), checked.unfit, shapes
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")

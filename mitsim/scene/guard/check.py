@@ -26,7 +26,7 @@ from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply
 from mitsim.scene.guard.limits import Range
 from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
-from mitsim.scene.guard.vocabulary import check_plugin
+from mitsim.scene.guard.vocabulary import PLUGINS, check_plugin
 
 _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")
@@ -40,7 +40,8 @@ class CheckedScene:
     """A scene that Mitsuba may make objects of.
 
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
-    the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it.
+    the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
+    ``shapes`` are the tags of what the scene lists as its shapes, in its order.
     """
 
     outline: Outline
@@ -49,6 +50,7 @@ class CheckedScene:
     files: tuple[Path, ...]
     limits: Mapping[str, Range]
     unfit: Unfit
+    shapes: tuple[Tag, ...]
 
 
 def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
@@ -79,7 +81,8 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
         mi.parser.transform_all(config, state)
     tree = _Tree(outline, files, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
-    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes))
+    unfit = Unfit.of(outline, tree.nodes)
+    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, unfit, tuple(tree.shapes()))
 
 
 @contextmanager
@@ -119,6 +122,15 @@ class _Tree:
             if plugin == "mitsim_lensless":
                 self._check_camera(node)
         self._check_sizes()
+
+    def shapes(self) -> Iterator[Tag]:
+        """Tags of the shapes that the root has, but for groups: they are in the scene by their instances alone."""
+        root = self.nodes[0]
+        for name in root.props.keys():  # noqa: SIM118 - Properties is no dict
+            if root.props.type(name) == _Type.ResolvedReference:
+                child = self._child(root, name)
+                if child.props.plugin_name() in PLUGINS["shape"].split() and child.props.plugin_name() != "shapegroup":
+                    yield self.outline.tag(child)
 
     def _check_property(self, node: mi.parser.SceneNode, name: str) -> None:
         tag, kind, plugin = self.outline.tag(node, name), node.props.type(name), node.props.plugin_name()

@@ -1,6 +1,6 @@
 """Light that no tracer finds is measured: by a plane mirror that light meets twice, in closed form; not by windows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.cells import aligned_grid
-from mitsim.transport.left_out import left_out_light
+from mitsim.transport.left_out import LeftOut, left_out_light
 from tests.unit.transport.test_panes import BALL, WALL, slab
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -20,12 +20,16 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="115" y=
     <bsdf type="conductor"><string name="material" value="none"/></bsdf></shape>"""
 
 
-def left_out(bench: Bench) -> tuple[float, float]:
-    """Mean over seeds of 2^21 paths, and its standard error."""
+def left_out_of(bench: Bench, seed: int, paths: int = 2**21) -> LeftOut:
     loaded = bench.loaded
     grid = aligned_grid(*bench.windows, 64, 1, bench.geometry.tan_half_fov + 0.01)
     parts = loaded.scene, loaded.camera, bench.projector_optics, grid, bench.geometry
-    light = [left_out_light(*parts, seed, 2**21 // (grid.shape[0] * grid.shape[1])) for seed in range(SEEDS)]
+    return left_out_light(*parts, seed, paths // (grid.shape[0] * grid.shape[1]))
+
+
+def left_out(bench: Bench) -> tuple[float, float]:
+    """Mean over seeds of 2^21 paths, and its standard error."""
+    light = [left_out_of(bench, seed).irradiance for seed in range(SEEDS)]
     return float(np.mean(light)), float(np.std(light, ddof=1) / np.sqrt(SEEDS))
 
 
@@ -85,7 +89,24 @@ def test_windows_leave_nothing_out(shared_scene: Callable[..., Path]) -> None:
 
 
 def test_a_plan_is_flagged_that_leaves_light_out(shared_scene: Callable[..., Path]) -> None:
-    """A glass ball before the wall: most of what is lit behind it is seen through it."""
+    """A glass ball before the wall: most of what is lit behind it is seen through it. The flag names its line."""
     ball = BALL.replace('value="5"', 'value="60"')
-    plan = make_plan(open_bench(shared_scene("ball_of_glass", extra=ball, sheet_z=WALL)), Lighting.uniform(16), 1e-2, 1)
-    assert any("left out" in warning for warning in plan.warnings) and plan.systematic_error > 0.05
+    path = shared_scene("ball_of_glass", extra=ball, sheet_z=WALL)
+    plan = make_plan(open_bench(path), Lighting.uniform(16), 1e-2, 1)
+    line = 1 + path.read_text(encoding="utf-8").split('<shape type="sphere"')[0].count("\n")
+    (warning,) = plan.warnings
+    assert warning.startswith(f"{path}:{line}: shape: got 'sphere' in <shape ") and "left out of the frames" in warning
+    assert plan.systematic_error > 0.05
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0)])
+def test_it_is_told_over_which_mirror(shared_scene: Callable[..., Path], order: Sequence[int]) -> None:
+    """A ball of glass, not a mirror out of the way, nor the pane that all light passes; 2^18 paths, seed 0."""
+    ball = BALL.replace('value="5"', 'value="60"')
+    shapes = [ball, MIRROR.replace('x="-40" z="315"', 'x="-300" z="315"'), slab(200, 4)]
+    path = shared_scene(f"named{order[0]}", extra="\n".join(shapes[place] for place in order), sheet_z=WALL)
+    bench = open_bench(path)
+    found = left_out_of(bench, 0, 2**18)
+    tag = bench.loaded.shapes[found.mirror]
+    assert tag.attributes["type"] == "sphere" == bench.loaded.scene.shapes()[found.mirror].class_name().lower()
+    assert tag.line == 1 + path.read_text(encoding="utf-8").split('<shape type="sphere"')[0].count("\n")
