@@ -306,8 +306,8 @@ class _Words:
         """What is lost over a ``mirror`` or curved glass."""
         rule = (
             f"{self.evidence.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a sharp "
-            "lobe, is found by no tracer, and left out of the frames; turn it away, make it rough, or give the "
-            "projector a lens (aperture_radius_mm) with the effect interreflection"
+            "lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn it "
+            "away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
         )
         return str(mirror.refusal("shape", repr(mirror.attributes.get("type", "")), rule))
 

@@ -195,7 +195,8 @@ class Look:
         if self.occluded:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
-        left_out, found = self._left_out.irradiance, self._light + sharp.irradiance + switched.received
+        left_out, mirror = self._left_out.unseen(_FEWEST_HITS / (self.samples["effects"].followed * LOOKS))
+        found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
         return Evidence(
             depth=self._base.depth,
@@ -210,7 +211,7 @@ class Look:
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
-            mirror=self._left_out.mirror,
+            mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
             sharp_light=switched.sharp_effort(),
@@ -246,10 +247,10 @@ def _sharp(simulation: Simulation, seed: int) -> SharpLight:
 
 
 def _left_out(simulation: Simulation, seed: int) -> LeftOut:
-    """Light that no tracer finds."""
+    """Light that no tracer finds, or connections may not meet."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     if not loaded.mirrors:
-        return LeftOut()
+        return LeftOut.none()
     samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
     own = integer(seed, "pilot", "caustics")
     parts = loaded.scene, loaded.camera, physics.projector, simulation.aim
