@@ -17,6 +17,8 @@ from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 
 SENSOR_PLUGIN = "mitsim_lensless"
+_SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
+"""Mitsuba's classes of the lamps that no path runs into."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class LoadedScene:
     other emitters; ``mirrors`` tells whether a surface reflects or bends light into single directions, ``glossy``
     whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
     estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
-    several.
+    several; ``small_lamps`` are lamps that no path runs into, with their tags.
     """
 
     path: Path
@@ -42,6 +44,7 @@ class LoadedScene:
     glossy: bool
     unfit: Unfit
     shapes: tuple[Tag, ...]
+    small_lamps: tuple[tuple[mi.Emitter, Tag], ...]
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -100,7 +103,9 @@ def load_scene(
             if needs_projector:
                 raise
     shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
-    facts = *_polished(scene, checked.unfit), checked.unfit, shapes
+    small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
+    lit = tuple(zip(small, checked.small_lamps, strict=True))
+    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")

@@ -10,7 +10,7 @@ numbers, ``files`` and ``headers`` the files. :func:`mitsim.scene.load.load_scen
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ import pydantic
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.scene.guard import limits
-from mitsim.scene.guard.estimators import Unfit
+from mitsim.scene.guard.estimators import SMALL_LAMPS, Unfit
 from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply
 from mitsim.scene.guard.limits import Range
@@ -41,7 +41,8 @@ class CheckedScene:
 
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
     the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
-    ``shapes`` are the tags of what the scene lists as its shapes, in its order.
+    ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
+    into.
     """
 
     outline: Outline
@@ -51,6 +52,7 @@ class CheckedScene:
     limits: Mapping[str, Range]
     unfit: Unfit
     shapes: tuple[Tag, ...]
+    small_lamps: tuple[Tag, ...]
 
 
 def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
@@ -82,7 +84,10 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
     tree = _Tree(outline, files, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
     unfit = Unfit.of(outline, tree.nodes)
-    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, unfit, tuple(tree.shapes()))
+    # Groups are in the scene by their instances alone.
+    shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
+    listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
+    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, unfit, *listed)
 
 
 @contextmanager
@@ -123,13 +128,13 @@ class _Tree:
                 self._check_camera(node)
         self._check_sizes()
 
-    def shapes(self) -> Iterator[Tag]:
-        """Tags of the shapes that the root has, but for groups: they are in the scene by their instances alone."""
+    def listed(self, plugins: Sequence[str]) -> Iterator[Tag]:
+        """Tags of the root's own objects that are one of the ``plugins``."""
         root = self.nodes[0]
         for name in root.props.keys():  # noqa: SIM118 - Properties is no dict
             if root.props.type(name) == _Type.ResolvedReference:
                 child = self._child(root, name)
-                if child.props.plugin_name() in PLUGINS["shape"].split() and child.props.plugin_name() != "shapegroup":
+                if child.props.plugin_name() in plugins:
                     yield self.outline.tag(child)
 
     def _check_property(self, node: mi.parser.SceneNode, name: str) -> None:

@@ -14,7 +14,9 @@ import pytest
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import Exposer
+from mitsim.capture.losses import known_losses
 from mitsim.capture.simulation import Simulation
+from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame
 
 N, ALBEDO, Z, HALF, SCALE = 16, 0.5, 400.0, 64.0, 111000.0
@@ -102,6 +104,55 @@ def test_a_spot_lamp_is_taken_off(bench: Callable[[str], Bench], tmp_path: Path)
     expected = (1 + 3 * light.simulation.physics.black_level) * seen("projector") * unit / captured.exposure_s
     noise = 5 * np.sqrt(2 * captured.electrons.mean() / 4 / 4096) / (captured.electrons.mean() - dark)
     assert noise < 2e-3 and sum(rates) == pytest.approx(expected, rel=manifest.total_error_of_projector + noise)
+
+
+def at(x: float, z: float) -> str:
+    return f'<emitter type="point"><point name="position" x="{x}" y="0" z="{z}"/></emitter>'
+
+
+BEHIND = '<shape type="disk"><transform name="to_world"><translate x="20" z="250"/></transform>{}</shape>'
+HOLE = '<bsdf type="mask"><float name="opacity" value="{}"/><bsdf type="diffuse"/></bsdf>'
+
+
+@pytest.mark.parametrize(
+    ("extra", "seen"),
+    [
+        (at(20, 300), True),
+        (at(0.17 * 300, 300), True),
+        (at(0.18 * 300, 300), False),
+        (at(0, -300), False),
+        (at(0, 500), False),  # behind the sheet
+        (at(24, 300) + BEHIND.format(HOLE.format(1)).replace("<translate", '<scale value="5"/><translate'), False),
+        (at(24, 300) + BEHIND.format(HOLE.format(0.5)).replace("<translate", '<scale value="5"/><translate'), True),
+        (LAMPS["spot"], False),
+        (LAMPS["directional"], False),
+        (LAMPS["directional"].replace('z="1.0"', 'z="-9"').replace('x="0.3"', 'x="0"'), False),
+        (LAMPS["constant"], False),
+    ],
+)
+def test_a_small_lamp_in_view_flags_the_plan(
+    small_scene: Callable[..., Path], variant: str, extra: str, seen: bool
+) -> None:
+    """With its line: of its light onto the sensor, twelve times what comes over the sheet, frames hold nothing.
+
+    A sun that shines into the camera comes through the sheet: it does not. (Planted: every lamp; field stop ignored.)
+    """
+    path = small_scene(n=N, extra=extra)
+    loaded = open_bench(path, variant).loaded
+    said = list(known_losses(loaded, {}))
+    assert bool(said) is seen and not list(known_losses(loaded, {"ambient": False}))
+    if seen:
+        line = 1 + path.read_text(encoding="utf-8").split('<emitter type="point"')[0].count("\n")
+        assert said[0].startswith(
+            f"{path}:{line}: light: got 'point' in <emitter type='point'>; it shines on the sensor"
+        )
+
+
+def test_a_lamp_that_cannot_be_connected_is_refused(small_scene: Callable[..., Path], variant: str) -> None:
+    """No tracer finds a surface's light in a single direction: its ambient frame was black, without a word."""
+    path = small_scene(n=N, extra='<shape type="disk"><emitter type="directionalarea"/></shape>')
+    with pytest.raises(MitsimError, match=r":\d+: type: got 'directionalarea' in .*allowed are area, "):
+        open_bench(path, variant)
 
 
 class _Unit:
