@@ -191,7 +191,8 @@ def mesh(folder: Path, rings: int, mirror: int, flat: bool) -> Surface:
     ring = [np.roll(each, -1, axis=1) for each in (first, second)]
     faces = np.concatenate([np.stack([first, second, ring[1]], -1)[:-1], np.stack([first, ring[1], ring[0]], -1)[1:]])
     faces, unit = faces.reshape(-1, 3), unit.reshape(-1, 3)
-    middle = unit[faces].mean(axis=1)[mirror]
+    corners = unit[faces[mirror]]
+    middle = np.cross(corners[1] - corners[0], corners[2] - corners[0]) if flat else corners.mean(axis=0)
     half = sum((place - BALL) / np.linalg.norm(place - BALL) for place in (np.array([PLACE, 0, 0]), np.zeros(3)))
     unit = unit @ Rotation.align_vectors([half], [middle])[0].as_matrix().T
     vertices = BALL + RADIUS * unit
