@@ -326,7 +326,8 @@ class Bench:
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
-        alone = replace(self.loaded, scene=scene, lamps=(), mirrors=False, glossy=False, unfit=Unfit())
+        bare = replace(self.loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False)
+        alone = replace(bare, unfit=Unfit(), shapes=())
         return replace(self, loaded=alone)
 
 

@@ -288,7 +288,9 @@ class Evidence:
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
     left_out
-        light that no tracer finds, over that and direct light (:mod:`mitsim.transport.left_out`).
+        light that no tracer finds, over that and what is found (:mod:`mitsim.transport.left_out`).
+    mirror
+        place, among the scene's shapes, of what most of that comes over.
     reach, sharp, occluded
         as in :class:`Settings`.
     sharp_light, occluded_light
@@ -309,6 +311,7 @@ class Evidence:
     apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
     left_out: float = 0.0
+    mirror: int | None = None
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())

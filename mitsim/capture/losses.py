@@ -19,6 +19,15 @@ def known_losses(loaded: LoadedScene, effects: Mapping[str, bool]) -> Iterator[s
     effects
         switched on or off by the user.
     """
+    from mitsim.transport.shining import shines_in
+
+    for lamp, tag in loaded.small_lamps if effects.get("ambient", True) else ():
+        if shines_in(loaded.scene, loaded.camera, lamp):
+            rule = (
+                "it shines on the sensor itself, and the factored estimator has no light of a lamp but over surfaces, "
+                "so that is missing; keep it out of the view, or use a light that has a surface (area)"
+            )
+            yield str(tag.refusal("light", repr(tag.attributes.get("type", "")), rule))
     if effects.get("mirrors", True):
         if loaded.unfit.lamps and effects.get("ambient", True):
             yield loaded.unfit.lamps

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
     from mitsim.capture.request import Request
     from mitsim.core.resources import Cost
+    from mitsim.scene.guard.outline import Tag
 
 State = Literal["exact", "approximate", "off"]
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
@@ -174,11 +175,14 @@ class SceneFacts:
         how far the projector's window is off a square [projector pixels].
     warnings
         what the model of the devices does not cover, and which of the scene's light frames are known to lack.
+    shapes
+        where the scene's shapes are written, if that is known.
     """
 
     notes: Mapping[str, str]
     keystone: float
     warnings: tuple[str, ...] = ()
+    shapes: tuple[Tag, ...] = ()
 
     @classmethod
     def of(cls, bench: Bench, switches: Mapping[str, bool] | None = None) -> SceneFacts:
@@ -201,7 +205,7 @@ class SceneFacts:
                 "of masks needs features above it, so the shadow is a guess"
             )
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings))
+        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes)
 
 
 def check_accuracy(accuracy: float) -> float:
@@ -283,17 +287,29 @@ class _Words:
         chosen, accuracy, missing = self.chosen, self.accuracy, self.evidence.unresolved
         if chosen.total.bound <= accuracy:
             return ()
+        said, parts = [], self._left()
         if missing > accuracy:
-            return (
+            said.append(
                 f"{missing:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
-                "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)",
+                "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)"
             )
-        parts = self._left()
         largest = max(parts, key=lambda name: parts[name])
-        return (
+        shapes, mirror = self.facts.shapes, self.evidence.mirror
+        if mirror is not None and shapes and self.evidence.left_out >= min(accuracy, parts[largest]):
+            said.append(self._left_out(shapes[mirror]))
+        return tuple(said) or (
             f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
             f"largest: {largest}, {parts[largest]:.1e}",
         )
+
+    def _left_out(self, mirror: Tag) -> str:
+        """What is lost over a ``mirror`` or curved glass."""
+        rule = (
+            f"{self.evidence.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a sharp "
+            "lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn it "
+            "away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
+        )
+        return str(mirror.refusal("shape", repr(mirror.attributes.get("type", "")), rule))
 
     def _left(self) -> dict[str, float]:
         """By what leaves it, the bound on each part of the systematic error."""

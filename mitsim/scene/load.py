@@ -12,10 +12,13 @@ import numpy as np
 from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
+from mitsim.scene.guard.outline import Tag
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 
 SENSOR_PLUGIN = "mitsim_lensless"
+_SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
+"""Mitsuba's classes of the lamps that no path runs into."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class LoadedScene:
     pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
     other emitters; ``mirrors`` tells whether a surface reflects or bends light into single directions, ``glossy``
     whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
-    estimators must refuse it.
+    estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
+    several; ``small_lamps`` are lamps that no path runs into, with their tags.
     """
 
     path: Path
@@ -39,6 +43,8 @@ class LoadedScene:
     mirrors: bool
     glossy: bool
     unfit: Unfit
+    shapes: tuple[Tag, ...]
+    small_lamps: tuple[tuple[mi.Emitter, Tag], ...]
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -96,7 +102,10 @@ def load_scene(
         except MitsimError:
             if needs_projector:
                 raise
-    facts = *_polished(scene, checked.unfit), checked.unfit
+    shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
+    small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
+    lit = tuple(zip(small, checked.small_lamps, strict=True))
+    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")

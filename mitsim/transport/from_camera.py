@@ -21,6 +21,7 @@ keeps the estimate unbiased; there is no last bounce.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -37,9 +38,6 @@ from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 
-_SELDOM_MET = 1e3
-"""Density [1/sr] of a turn above which connections seldom meet its lobe, a thousandth of a steradian, as of a GGX lobe
-of roughness 0.009: direct light over such lobes is traced apart, light over a mirror besides is not."""
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
 
@@ -49,15 +47,12 @@ class Paths:
     """Which light is followed besides projector - surface - camera.
 
     ``mirrors``: over delta reflections and transmissions on the camera's side; ``interreflection``: any number of
-    bounces; ``emitters``: other lights of the scene, all of them one class of ambient light. ``caustics_alone``: of all
-    this, only what mirrors bring from the projector's lens to the last surface, which no connection finds, and light
-    over a mirror and a sharp lobe, which few do.
+    bounces; ``emitters``: other lights of the scene, all of them one class of ambient light.
     """
 
     mirrors: bool = False
     interreflection: bool = False
     emitters: tuple[mi.Emitter, ...] = ()
-    caustics_alone: bool = False
 
 
 class FromCameraTracer(Tracer):
@@ -100,18 +95,27 @@ class FromCameraTracer(Tracer):
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         further = self.paths.mirrors or self.paths.interreflection or self.passage.open
-        return _Walk(self, seed, sample, lane).deposits(further)
+        return CameraWalk(self, seed, sample, lane).deposits(further)
 
 
-class _Walk(Walk):
+class CameraWalk(Walk):
     """Paths from the camera, with light of the projector, direct or indirect, and of lamps."""
 
-    STATE = (
+    STATE: ClassVar[tuple[str, ...]] = (
         *("active", "ray", "strength", "part", "bounce", "surfaces", "in_mirror", "mirrored", "by_delta", "travelled"),
         *("straight", "since", "behind_glass", "rng", "inverse_depth", "came_from", "came_pdf", "kept"),
     )
 
     def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
+        """Paths before their first surface.
+
+        Parameters
+        ----------
+        tracer
+            the scene, and what is followed.
+        seed, sample, lane
+            of the random numbers, and of every path.
+        """
         super().__init__(tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection)
         cell, row, column = tracer.points.of(lane, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
@@ -155,7 +159,7 @@ class _Walk(Walk):
     # ---- one vertex -------------------------------------------------------------------------------------------------
 
     def vertex(self, first: bool) -> None:
-        """Find the next vertex of every path, connect it to the lights, and leave it."""
+        """Find the next vertex of every path, the ``first`` or a later one, connect it to the lights, and leave it."""
         si = self.scene.ray_intersect(mi.RayDifferential3f(self.ray), mi.RayFlags.All, first, self.active)
         if first or self.paths.mirrors or self.passage.open:
             # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
@@ -170,7 +174,7 @@ class _Walk(Walk):
             self._emitter_hit(si)
         self.active &= si.is_valid()
         bsdf = si.bsdf()
-        if not (first or self.paths.caustics_alone):
+        if not first:
             self._connect(si, bsdf)
         for emitter in self.paths.emitters:
             self._light(si, bsdf, emitter)
@@ -247,23 +251,17 @@ class _Walk(Walk):
         Over mirrors alone it is the beams' (:mod:`mitsim.transport.glint`); over one other surface, unless that is
         seen in a mirror, it is the projector's side's.
         """
-        active = self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
-        if self.paths.caustics_alone:
-            active = (active & self.by_delta) | self._over_mirror_and_lobe()
-        hit = self.connector.hit(self.ray, si.t, self.rng, active, self.since)
-        found = self.by_delta | self.paths.caustics_alone
-        share = dr.select(found, 1, self._share(self.came_pdf, hit.pdf))
+        hit = self.connector.hit(self.ray, si.t, self.rng, self._foreign, self.since)
+        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, hit.pdf))
         self._keep_of_projector(hit.met, self._radiance(hit.radiance) * share, hit.pixel, self.surfaces - 1)
 
-    def _over_mirror_and_lobe(self) -> mi.Bool:
-        """Paths over one sharp lobe that was seen in a mirror, or whose light came over one: connections of either side
-        would have to meet the lobe by chance."""
-        seen = self.in_mirror & ~self.by_delta & (self.came_pdf > _SELDOM_MET)
-        lit = ~self.in_mirror & self.by_delta & (self.part > camera_part(mi.Float(_SELDOM_MET)))
-        return self.active & (self.surfaces == 2) & (seen | lit)
+    @property
+    def _foreign(self) -> mi.Bool:
+        """Paths that would bring light of the projector's lens which neither beams nor the projector's side bring."""
+        return self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
 
-    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Sample where each path goes on, and end some of them."""
+    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> mi.Bool:
+        """Sample where each path goes on, and end some of them; tells which only pass."""
         sample, value, going = self._sampled(si, mi.TransportMode.Radiance)
         passing = self.passage.passes(si, sample)
         delta = is_delta(sample) & ~passing
@@ -285,6 +283,7 @@ class _Walk(Walk):
         self.came_pdf = dr.select(passing, self.came_pdf, sample.pdf)
         self.by_delta = dr.select(passing, self.by_delta, delta)
         self.ray = self._onward(si, si.to_world(sample.wo), passing)
+        return passing
 
     # ---- light that is kept -----------------------------------------------------------------------------------------
 

@@ -1,24 +1,71 @@
-"""Light that no tracer finds: a scene and its pinhole projector in, how much of it there is out.
+"""Light that no tracer finds: a scene and its pinhole projector in, how much of it there is and over which shape out.
 
 Light that mirrors or curved glass bring both from the projector to a surface and from there to the camera (a print in a
-bottle), or that comes over a mirror and a lobe too sharp for connections, and the part of indirect light that is
-followed from the camera to a caustic: a path from the camera meets no pinhole, and none from the projector the sensor's
-centre. A small lens in the pinhole's place casts the same light, and paths run into it.
+bottle), and the part of indirect light that is followed from the camera to a caustic: a path from the camera meets no
+pinhole, and none from the projector the sensor's centre. A small lens in the pinhole's place casts the same light, and
+paths run into it. A lens of the projector's own they run into as well, but seldom where it is smaller.
+
+So do paths over one mirror and one sharp lobe. Connections may meet such a lobe by chance: of the projector's side from
+the lobe to the sensor, of the camera's side from the lobe, seen in a mirror, to the projector. With x the light of a
+path that runs into the lens and I that of the connection along the same way, E[x I] is a connection's second moment, so
+a sample of connections sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would
+(:mod:`mitsim.transport.lobes`). Whether that is enough, whoever asks knows: lobes of curved surfaces are met seldom
+however broad they are.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.cells import CellGrid
-from mitsim.transport.from_camera import FromCameraTracer, Paths
-from mitsim.transport.projector import ProjectorOptics
+from mitsim.transport.connection import LensHit
+from mitsim.transport.from_camera import CameraWalk, FromCameraTracer, Paths
+from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits, Sightings
+from mitsim.transport.paths import camera_part
+from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 
 _LENS = 0.02
 """Radius of the lens over the scene's distance: 8 mm at 400, which one path in 3000 meets from a matt surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Light that is left out, by the place among the scene's shapes of what it comes over, (k,) each.
+
+    Attributes
+    ----------
+    mirrors, lens_hits
+        irradiance at the sensor's centre [W m^-2] that no connection finds, by the last mirror or glass, seen from the
+        camera; equal hits of the projector's own lens that a sample of paths makes.
+    lobes, hits
+        irradiance over a mirror and one sharp lobe, by the shape that has the lobe; equal hits that a sample of
+        connections makes.
+    """
+
+    mirrors: FloatArray
+    lens_hits: FloatArray
+    lobes: FloatArray
+    hits: FloatArray
+
+    @classmethod
+    def none(cls) -> LeftOut:
+        """Nothing."""
+        return cls(*np.zeros((4, 0)))
+
+    def unseen(self, fewest: float) -> tuple[float, int | None]:
+        """Irradiance that nothing tells of, and over which shape most of it comes.
+
+        ``fewest``: hits of a sample that tell of light.
+        """
+        light = np.where(self.lens_hits < fewest, self.mirrors, 0) + np.where(self.hits < fewest, self.lobes, 0)
+        return float(light.sum()), int(np.argmax(light)) if light.any() else None
 
 
 def left_out_light(
@@ -29,8 +76,8 @@ def left_out_light(
     geometry: CameraGeometry,
     seed: int,
     samples: int,
-) -> float:
-    """Irradiance at the sensor's centre [W m^-2] of light that is left out; 0 where a lens of its own lets it be found.
+) -> LeftOut:
+    """Light that is left out, or may be.
 
     Parameters
     ----------
@@ -46,11 +93,78 @@ def left_out_light(
     MitsimError
         when the scene sends NaN or infinite light to the camera.
     """
-    if projector.aperture > 0:
-        return 0.0
     lens = replace(projector, aperture=_LENS * geometry.scene_distance, focus=geometry.scene_distance)
-    paths = Paths(mirrors=True, interreflection=True, caustics_alone=True)
-    return (
-        float(FromCameraTracer(scene, camera, lens, grid, paths, geometry).trace(seed, 0, samples).value.sum())
-        / samples
-    )
+    paths = Paths(mirrors=True, interreflection=True)
+    found = _LeftOutTracer(scene, camera, lens, grid, paths, geometry).trace(seed, 0, samples)
+    # Deposits name shapes by their number in Dr.Jit's registry.
+    numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).astype(np.int64)
+
+    def by_shape(light: Deposits, values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(light.pixel, values, int(numbers.max()) + 1)[numbers] / samples)
+
+    lost, met = (found.where(found.kind == kind) for kind in (INDIRECT, DIRECT))
+    mirrors, hits = _seen(by_shape(lost, lost.value), by_shape(lost, np.square(lost.value)))
+    # A lens of half the radius is met a quarter as often, and four times as bright.
+    seldom = np.square(projector.aperture / lens.aperture)
+    return LeftOut(mirrors, hits * seldom, *_seen(by_shape(met, met.value), by_shape(met, met.value * met.row)))
+
+
+def _seen(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``light`` (k,) by shape, and from the second ``moments`` of a sample how many equal hits it is."""
+    return light, np.divide(np.square(light), moments, out=np.zeros(len(light)), where=light > 0)
+
+
+class _LeftOutTracer(FromCameraTracer):
+    """Light that a lens would bring, filed under shapes: that which no connection finds as indirect light, that over a
+    mirror and a lobe as direct light, with what a connection brings in the row's stead."""
+
+    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        return _LeftOutWalk(self, seed, sample, lane).deposits(further=True)
+
+
+class _LeftOutWalk(CameraWalk):
+    """Paths from the camera that only running into the lens can end.
+
+    ``mirror`` and ``lobe`` are the last shape of either kind that a path met, ``density`` that of the turn there.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = (*CameraWalk.STATE, "mirror", "lobe", "density")
+
+    def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
+        super().__init__(tracer, seed, sample, lane)
+        self.mirror, self.lobe, self.density = mi.UInt32(0), mi.UInt32(0), mi.Float(0)
+        self.rays = ProjectorRays(tracer.projector)
+
+    def _connect(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
+        """Nothing: what connections find is not left out."""
+
+    def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
+        """Light that mirrors bring from the lens to the last surface, or over a mirror and a sharp lobe."""
+        lost = self._foreign & self.by_delta
+        once = self.active & (self.surfaces == 2) & (self.in_mirror != self.by_delta)
+        met = once & (camera_part(self.density) > 0)
+        hit = self.connector.hit(self.ray, si.t, self.rng, lost | met, self.since)
+        light, none = self._radiance(hit.radiance), mi.Float(0)
+        self._keep(
+            "indirect", Sightings(dr.select(hit.met & lost, light * self.part, 0), self.mirror, none, none, none)
+        )
+        met &= hit.met
+        connected = dr.select(met, dr.select(self.in_mirror, light * self.density / hit.pdf, self._lit(hit)), 0)
+        self._keep("direct", Sightings(dr.select(met, light, 0), self.lobe, connected, none, none))
+
+    def _lit(self, hit: LensHit) -> mi.Float:
+        """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
+        grid = self.tracer.grid
+        flux = self.rays.flux(hit.pixel, self.ray.wavelengths)
+        # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
+        view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
+        return self._radiance(flux) / view * self.density * self.slope * dr.square(self.inverse_depth * self.slope)
+
+    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> mi.Bool:
+        passing = super()._leave(si, first)
+        shape = dr.reinterpret_array(mi.UInt32, dr.select(si.instance != None, si.instance, si.shape))  # noqa: E711
+        turned = ~passing & ~self.by_delta
+        self.mirror = dr.select(~passing & self.by_delta, shape, self.mirror)
+        self.lobe = dr.select(turned, shape, self.lobe)
+        self.density = dr.select(turned, self.came_pdf, self.density)
+        return passing

@@ -179,27 +179,27 @@ def cylinder(alpha: float, sensor: np.ndarray) -> Surface:
     return axis + RADIUS * normal, normal, normal, area
 
 
-FACE = 600
-"""Number of the triangle that mirrors the projector into the sensor."""
+def mesh(folder: Path, rings: int, mirror: int, flat: bool) -> Surface:
+    """A ball of 4 rings (rings - 1) triangles, written to ``folder``, each in 60^2 parts.
 
-
-def mesh(folder: Path) -> Surface:
-    """A ball of 1224 triangles, written to ``folder``, each in 60^2 parts; one of them mirrors the projector."""
-
-    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, 19), np.arange(36) * np.pi / 18, indexing="ij")
+    ``mirror``: number of that which mirrors the projector into the sensor; ``flat``: without vertex normals.
+    """
+    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.arange(2 * rings) * np.pi / rings, indexing="ij")
     unit = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-    number = np.arange(19 * 36).reshape(19, 36)
+    number = np.arange(unit[..., 0].size).reshape(rings + 1, 2 * rings)
     first, second = number[:-1], number[1:]
     ring = [np.roll(each, -1, axis=1) for each in (first, second)]
     faces = np.concatenate([np.stack([first, second, ring[1]], -1)[:-1], np.stack([first, ring[1], ring[0]], -1)[1:]])
     faces, unit = faces.reshape(-1, 3), unit.reshape(-1, 3)
-    middle = unit[faces].mean(axis=1)[FACE]
+    corners = unit[faces[mirror]]
+    middle = np.cross(corners[1] - corners[0], corners[2] - corners[0]) if flat else corners.mean(axis=0)
     half = sum((place - BALL) / np.linalg.norm(place - BALL) for place in (np.array([PLACE, 0, 0]), np.zeros(3)))
     unit = unit @ Rotation.align_vectors([half], [middle])[0].as_matrix().T
     vertices = BALL + RADIUS * unit
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
-    lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in unit]
-    lines += ["f " + " ".join(f"{corner}//{corner}" for corner in face + 1) for face in faces]
+    if not flat:
+        lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in unit]
+    lines += ["f " + " ".join(f"{corner}" if flat else f"{corner}//{corner}" for corner in face + 1) for face in faces]
     folder.mkdir(exist_ok=True)
     (folder / "ball.obj").write_text("\n".join(lines) + "\n")
     # Lobes end long before the others: the rest of the ball would add 1e-8 of their light.
@@ -212,10 +212,10 @@ def mesh(folder: Path) -> Surface:
     two = np.concatenate(corners)
     weights = np.concatenate([1 - two.sum(axis=1, keepdims=True), two], axis=1)
     across = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
-    flat = np.repeat(across / np.linalg.norm(across, axis=1)[:, None], len(weights), axis=0)
+    normal = np.repeat(across / np.linalg.norm(across, axis=1)[:, None], len(weights), axis=0)
     area = np.repeat(np.linalg.norm(across, axis=1) / 2 / len(weights), len(weights))
     point, shading = (np.einsum("kc,fcx->fkx", weights, each[faces]).reshape(-1, 3) for each in (vertices, unit))
-    return point, shading / np.linalg.norm(shading, axis=1)[:, None], flat, area
+    return point, normal if flat else shading / np.linalg.norm(shading, axis=1)[:, None], normal, area
 
 
 def check_against(traced: Callable[..., Light], shape: str, judge: Callable[[np.ndarray], float]) -> Light:
@@ -243,16 +243,19 @@ def test_a_cylinder(traced: Callable[..., Light], alpha: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_small_mesh(traced: Callable[..., Light], tmp_path: Path) -> None:
-    """With vertex normals. A highlight near a projector pixel's edge sends its tails from the next one:
+@pytest.mark.parametrize(("rings", "mirror", "flat"), [(18, 600, False), (5, 40, True)])
+def test_a_small_mesh(traced: Callable[..., Light], tmp_path: Path, rings: int, mirror: int, flat: bool) -> None:
+    """1224 faces with vertex normals, and 80 flat ones, each of them a mirror for a part of the sensor or none.
 
-    seen from one anchor they left 8.7e-3 where 5e-3 was asked (an icosphere of 1280 faces).
+    A highlight near a projector pixel's edge sends its tails from the next one: seen from one anchor they left 8.7e-3
+    where 5e-3 was asked (an icosphere of 1280 faces).
     """
     alpha = 5e-3
-    surface = mesh(tmp_path / "scenes")
+    surface = mesh(tmp_path / "scenes", rings, mirror, flat)
     rough = f'<string name="distribution" value="ggx"/><float name="alpha" value="{alpha}"/>'
     metal = f'<bsdf type="roughconductor"><string name="material" value="none"/>{rough}</bsdf>'
-    shape = f'<shape type="obj"><string name="filename" value="ball.obj"/>{metal}</shape>'
+    faces = f'<boolean name="face_normals" value="{str(flat).lower()}"/>'
+    shape = f'<shape type="obj"><string name="filename" value="ball.obj"/>{faces}{metal}</shape>'
     light = check_against(traced, shape, lambda sensor: cast(alpha, sensor, surface))
     assert light.plan.settings.sharp is not None
 

@@ -27,7 +27,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
 from mitsim.scene.darkness import why_dark
-from mitsim.transport.left_out import left_out_light
+from mitsim.transport.left_out import LeftOut, left_out_light
 from mitsim.transport.lobes import SharpLight, sharp_light
 
 STAGES = ("cells", "effects", "anchors", "followed", "occluded")
@@ -184,8 +184,8 @@ class Look:
         return self.fine.forming(self.lighting)
 
     @cached_property
-    def _left_out(self) -> float:
-        return _left_out(self.switched.simulation, self.seed, self._light)
+    def _left_out(self) -> LeftOut:
+        return _left_out(self.switched.simulation, self.seed)
 
     @property
     def evidence(self) -> Evidence:
@@ -195,6 +195,8 @@ class Look:
         if self.occluded:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
+        left_out, mirror = self._left_out.unseen(_FEWEST_HITS / (self.samples["effects"].followed * LOOKS))
+        found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
         return Evidence(
             depth=self._base.depth,
@@ -208,7 +210,8 @@ class Look:
             forming=self.forming,
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
-            left_out=self._left_out,
+            left_out=left_out / (left_out + found) if left_out else 0.0,
+            mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
             sharp_light=switched.sharp_effort(),
@@ -243,16 +246,15 @@ def _sharp(simulation: Simulation, seed: int) -> SharpLight:
     return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
 
 
-def _left_out(simulation: Simulation, seed: int, direct: float) -> float:
-    """Light that no tracer finds, over that and ``direct`` light."""
+def _left_out(simulation: Simulation, seed: int) -> LeftOut:
+    """Light that no tracer finds, or connections may not meet."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     if not loaded.mirrors:
-        return 0.0
+        return LeftOut.none()
     samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
     own = integer(seed, "pilot", "caustics")
     parts = loaded.scene, loaded.camera, physics.projector, simulation.aim
-    light = left_out_light(*parts, physics.geometry, own, samples)
-    return light / (light + direct) if light else 0.0
+    return left_out_light(*parts, physics.geometry, own, samples)
 
 
 def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float]:

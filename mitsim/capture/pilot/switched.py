@@ -64,6 +64,12 @@ class SwitchedEffects:
         return self._form(Simulation(self.bench, coarse), [Deposits.none()] * LOOKS, indirect)
 
     @property
+    def received(self) -> float:
+        """Light that is followed, as irradiance at the sensor's centre [W m^-2]."""
+        light = sum(float(look.value.sum()) for looks in self.followed.values() for look in looks)
+        return light / (LOOKS * self.sample.followed)
+
+    @property
     def apart(self) -> dict[str, float]:
         """Error of leaving out each effect that is drawn with the sensor's noise: speckle's contrast."""
         effects = self.everything.effects

@@ -10,7 +10,7 @@ numbers, ``files`` and ``headers`` the files. :func:`mitsim.scene.load.load_scen
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,12 +21,12 @@ import pydantic
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.scene.guard import limits
-from mitsim.scene.guard.estimators import Unfit
+from mitsim.scene.guard.estimators import SMALL_LAMPS, Unfit
 from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply
 from mitsim.scene.guard.limits import Range
 from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
-from mitsim.scene.guard.vocabulary import check_plugin
+from mitsim.scene.guard.vocabulary import PLUGINS, check_plugin
 
 _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")
@@ -40,7 +40,9 @@ class CheckedScene:
     """A scene that Mitsuba may make objects of.
 
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
-    the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it.
+    the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
+    ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
+    into.
     """
 
     outline: Outline
@@ -49,6 +51,8 @@ class CheckedScene:
     files: tuple[Path, ...]
     limits: Mapping[str, Range]
     unfit: Unfit
+    shapes: tuple[Tag, ...]
+    small_lamps: tuple[Tag, ...]
 
 
 def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
@@ -79,7 +83,11 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
         mi.parser.transform_all(config, state)
     tree = _Tree(outline, files, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
-    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes))
+    unfit = Unfit.of(outline, tree.nodes)
+    # Groups are in the scene by their instances alone.
+    shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
+    listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
+    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, unfit, *listed)
 
 
 @contextmanager
@@ -119,6 +127,15 @@ class _Tree:
             if plugin == "mitsim_lensless":
                 self._check_camera(node)
         self._check_sizes()
+
+    def listed(self, plugins: Sequence[str]) -> Iterator[Tag]:
+        """Tags of the root's own objects that are one of the ``plugins``."""
+        root = self.nodes[0]
+        for name in root.props.keys():  # noqa: SIM118 - Properties is no dict
+            if root.props.type(name) == _Type.ResolvedReference:
+                child = self._child(root, name)
+                if child.props.plugin_name() in plugins:
+                    yield self.outline.tag(child)
 
     def _check_property(self, node: mi.parser.SceneNode, name: str) -> None:
         tag, kind, plugin = self.outline.tag(node, name), node.props.type(name), node.props.plugin_name()

@@ -24,7 +24,7 @@ STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric
 """Materials that let light straight on."""
 _MIRRORS = ("conductor", "dielectric", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
-_SMALL_LAMPS = ("directional", "point", "spot")
+SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path runs into."""
 _VOLUMETRIC = ("volpath", "volpathmis")
 
@@ -66,8 +66,8 @@ class Unfit:
         return cls(
             factored,
             _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)),
-            _caustics(outline, tree, ("projector", *_SMALL_LAMPS), "the reference"),
-            _caustics(outline, tree, _SMALL_LAMPS, "the factored estimator"),
+            _caustics(outline, tree, ("projector", *SMALL_LAMPS), "the reference"),
+            _caustics(outline, tree, SMALL_LAMPS, "the factored estimator"),
             _in_instances(outline, tree),
         )
 

@@ -16,7 +16,7 @@ PLUGINS = {
     "bsdf": "blendbsdf bumpmap conductor dielectric diffuse hair mask mitsim_grating normalmap null plastic "
     "polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic thindielectric "
     "twosided circular",
-    "emitter": "area constant directional directionalarea envmap mitsim_projector point projector spot",
+    "emitter": "area constant directional envmap mitsim_projector point projector spot",
     "film": "hdrfilm specfilm",
     "integrator": "direct path ptracer volpath volpathmis",
     "medium": "homogeneous",

@@ -1,16 +1,19 @@
 """What a plan says: of devices that the model does not cover, of effects, and as JSON; benches are plain numbers."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Evidence, Part, Settings
-from mitsim.capture.plan import SceneFacts
+from mitsim.capture.plan import SceneFacts, decide
 from mitsim.capture.prices import paces_of
 from mitsim.scene.guard.estimators import Unfit
+from mitsim.scene.guard.outline import Tag
 from tests.unit.capture.invented_evidence import EVIDENCE, SIZES, changes, plan, rows, stages, with_occluded
 
 
@@ -20,7 +23,7 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         field_stop_cuts=cuts,
         geometry=geometry,
         spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
-        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5), unfit=Unfit()),
+        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5), unfit=Unfit(), shapes=(), small_lamps=()),
     )
 
 
@@ -44,6 +47,27 @@ def test_devices_are_flagged_where_their_model_ends(
     assert facts.keystone == 2.5 and len(facts.warnings) == len(words)
     for warning, part in zip(facts.warnings, words, strict=True):
         assert part in warning
+
+
+def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:
+    """Where it breaks the accuracy: by itself, as the largest part, beside sharp lobes; else it is a part of all."""
+    shapes = tuple(Tag(Path("a.xml"), line, "shape", {"type": "sphere"}) for line in (3, 7))
+    place = "a.xml:7: shape: got 'sphere' in <shape type='sphere'>; "
+
+    def said(shapes: tuple[Tag, ...] = shapes, **lacking: float) -> tuple[str, ...]:
+        facts = SceneFacts(dict.fromkeys(EFFECTS, ""), 0.0, shapes=shapes)
+        return decide(1e-2, replace(EVIDENCE, mirror=1, **lacking), facts).warnings
+
+    assert said(left_out=1e-4) == ()
+    for part in (9.9e-3, 0.1):
+        (warning,) = said(left_out=part)
+        assert warning.startswith(f"{place}{part:.2g} of the light") and "left out of the frames" in warning
+    lobes, mirror = said(left_out=0.1, unresolved=0.2)
+    assert "lobes too sharp" in lobes and mirror.startswith(place)
+    (lobes,) = said(left_out=5e-3, unresolved=0.2)
+    assert "lobes too sharp" in lobes
+    (unknown,) = said((), left_out=0.1)
+    assert "largest: light over mirrors or curved glass both ways" in unknown
 
 
 def test_a_plan_as_json_leaves_out_what_it_was_decided_without() -> None:

@@ -46,6 +46,24 @@ def test_other_emitters_are_lamps(small_scene: Write) -> None:
     assert lamp.class_name() == "ConstantBackgroundEmitter" and loaded.projector.class_name() == "Projector"
 
 
+def test_shapes_are_known_by_their_lines(small_scene: Write) -> None:
+    """Named and unnamed ones in the order of the file; groups by their instances; none where one tag gave several."""
+    kinds = ("sphere", "disk", 'rectangle" id="last', "cube", 'sphere" id="first')
+    extra = "\n".join(f'<shape type="{kind}"/>' for kind in kinds)
+    group = '\n<shape type="shapegroup" id="group"><shape type="disk"/></shape>\n'
+    instance = '<shape type="instance"><ref id="group"/></shape>'
+    path = small_scene(extra=extra + group + instance)
+    loaded, lines = load_scene(path), path.read_text(encoding="utf-8").splitlines()
+    assert len(loaded.shapes) == len(kinds) + 2
+    for tag, shape in zip(loaded.shapes, loaded.scene.shapes(), strict=True):
+        assert (
+            tag.attributes["type"] == shape.class_name().lower()
+            and f'type="{tag.attributes["type"]}"' in lines[tag.line - 1]
+        )
+    merged = '<shape type="merge"><shape type="sphere"/><shape type="disk"/></shape>'
+    assert load_scene(small_scene(extra=merged)).shapes == ()
+
+
 @pytest.mark.parametrize(
     ("bsdf", "mirrors"),
     [
