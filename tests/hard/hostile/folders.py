@@ -21,6 +21,7 @@ from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruction import reconstruct
 
 LONGEST = 5.0
+"""Seconds of processor time, so that a busy machine makes no verdict; the slowest takes 1 s here."""
 PIXELS, SIDE = 8, 4
 Damage = Callable[[Path], object]
 
@@ -60,10 +61,10 @@ def solved(run: Path, calibration: Path) -> None:
 
 
 def refusal(work: Callable[[], object]) -> str:
-    started = time.perf_counter()
+    started = time.process_time()
     with pytest.raises(MitsimError) as caught:
         work()
-    assert time.perf_counter() - started < LONGEST
+    assert time.process_time() - started < LONGEST
     message = str(caught.value)
     assert message.isprintable() and len(message) <= 1500
     return message
