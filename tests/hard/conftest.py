@@ -1,11 +1,12 @@
-"""Shared by the hard tests: a bound on memory, and good folders to be damaged."""
+"""Shared by the hard tests: a bound on memory, good folders to be damaged, and a white sheet."""
 
 from __future__ import annotations
 
 import os
 import resource
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,3 +29,10 @@ def bounded() -> Iterator[None]:
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:
     return make(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def white(shared_scene: Callable[..., Path], variant: str) -> Any:
+    from mitsim.capture.bench import open_bench  # here: most hard tests do without the renderer
+
+    return open_bench(shared_scene("white_hard"), variant)
