@@ -99,30 +99,6 @@ def test_disagreement_is_the_energy_of_the_image_error(patterns: str) -> None:
     assert told == pytest.approx(struck, rel=0.1 if patterns == "uniform" else 0.06)
 
 
-def test_light_of_one_side_weighs_the_dipoles_of_the_other() -> None:
-    """Sides as unlike as a mask lets them be: singular values of columns fall over two decades, those of rows over one.
-
-    Dipoles along columns alone, uniform light, lambda in the midst of the values; 200 draws, 10 % as for uniform light
-    above. (Planted: the sides' light exchanged, 28 % less; where both fall alike that changes nothing.)
-    """
-    rng, P = np.random.default_rng(6), np.ones((N, 1))
-    u, _, v = np.linalg.svd(shadow(0.37), full_matrices=False)
-    factors = shadow(), (u * np.geomspace(1, 1e-2, N)) @ v
-    prepared = prepare(*factors, P, P)
-    sigma = np.outer(prepared.left.singular, prepared.right.singular)
-    gain = sigma / (sigma**2 + 1e-4 * sigma.max() ** 2)
-    sides = zip((prepared.left, prepared.right), factors, strict=True)
-    moved = tuple(moved_responses(side, factor, P) for side, factor in sides)
-    slope, zero, struck, told = slope_of(factors[1]), np.zeros((N, N)), 0.0, 0.0
-    for _ in range(200):
-        sums = prepared.accumulator()
-        sums.add(factors[0] @ rng.standard_normal((N, N)) @ slope.T, 0, 0)
-        problem = prepared.problem(sums)
-        struck += np.square(prepared.image(gain * problem.projected)).mean()
-        told += disagreement(prepared, gain, problem.halves, moved, (zero, zero)).mean()
-    assert told == pytest.approx(struck, rel=0.1)
-
-
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])
 def test_noise_alone_is_no_disagreement(patterns: str) -> None:
     """20 sessions of an even scene with noise in frames and factors, two sides: above 3 standard deviations are 2 and 0
@@ -160,3 +136,27 @@ def test_print_within_pixels_is_covered(patterns: str) -> None:
         assert image.uncertainty is not None
         inside.append(np.mean(np.abs(image.image - truth) < 1.96 * image.uncertainty))
     assert np.mean(inside) == pytest.approx(0.95, abs=0.025)
+
+
+def test_light_of_one_side_weighs_the_dipoles_of_the_other() -> None:
+    """Sides as unlike as a mask lets them be: singular values of columns fall over two decades, those of rows over one.
+
+    Dipoles along columns alone, uniform light, lambda in the midst of the values; 200 draws, 10 % as for uniform light
+    above. (Planted: the sides' light exchanged, 28 % less; where both fall alike that changes nothing.)
+    """
+    rng, P = np.random.default_rng(6), np.ones((N, 1))
+    u, _, v = np.linalg.svd(shadow(0.37), full_matrices=False)
+    factors = shadow(), (u * np.geomspace(1, 1e-2, N)) @ v
+    prepared = prepare(*factors, P, P)
+    sigma = np.outer(prepared.left.singular, prepared.right.singular)
+    gain = sigma / (sigma**2 + 1e-4 * sigma.max() ** 2)
+    sides = zip((prepared.left, prepared.right), factors, strict=True)
+    moved = tuple(moved_responses(side, factor, P) for side, factor in sides)
+    slope, zero, struck, told = slope_of(factors[1]), np.zeros((N, N)), 0.0, 0.0
+    for _ in range(200):
+        sums = prepared.accumulator()
+        sums.add(factors[0] @ rng.standard_normal((N, N)) @ slope.T, 0, 0)
+        problem = prepared.problem(sums)
+        struck += np.square(prepared.image(gain * problem.projected)).mean()
+        told += disagreement(prepared, gain, problem.halves, moved, (zero, zero)).mean()
+    assert told == pytest.approx(struck, rel=0.1)
