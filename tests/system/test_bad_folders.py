@@ -11,15 +11,9 @@ import numpy as np
 import pytest
 
 from mitsim.core.framefile import read_frame, write_frame
+from tests.system.refusals import Refused, mentions
 
-Refused = Callable[..., str]
 Edit = Callable[[dict[str, Any]], object]
-
-
-def mentions(line: str, *fragments: str) -> None:
-    """Every fragment stands in the line."""
-    for fragment in fragments:
-        assert fragment in line, (fragment, line)
 
 
 @pytest.fixture
