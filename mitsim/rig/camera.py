@@ -26,7 +26,7 @@ class CameraGeometry(BaseModel):
     pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side (square sensor)")
     """More than the largest square sensors, 10 560; a frame of it has 2 GiB."""
     pixel_pitch: float = Field(0.01172, ge=1e-6, le=1e3, description="sensor pixel pitch [mm]")
-    """A nanometre to a metre: shadows keep at least eight digits there (tests/hard/test_hard_optics.py)."""
+    """A nanometre to a metre: shadows keep at least eight digits there (tests/hard/test_hard_shadows.py)."""
     mask: MaskKind = Field("separable", description="mask construction")
     mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
     """The orders of :func:`mitsim.rig.mask.mls_code`: 3 to 65 535 features a side."""

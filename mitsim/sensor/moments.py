@@ -1,7 +1,7 @@
 """Mean and variance of what the sensor makes of light, in closed form: beside every draw of `chain` stands its law.
 
 After EMVA 1288 release 4.0. Tails of the Poisson law and of the ADC's codes are sums and expansions that keep their
-digits from 1e-6 to 1e15 electrons (`tests/hard/test_hard_sensor.py`).
+digits from 1e-6 to 1e15 electrons (`tests/hard/test_hard_moments.py`).
 """
 
 import math
@@ -18,7 +18,7 @@ _FEW = 64.0
 """Electrons below which moments behind the ADC are summed count by count; chosen: some 150 counts hold all."""
 _SOME = 1e4
 """Electrons below which they are summed over the counts that occur, on a grid of expected counts; chosen: above, 129
-counts stand for all to 1 % of the variance (tests/hard/test_hard_sensor.py)."""
+counts stand for all to 1 % of the variance (tests/hard/test_hard_moments.py)."""
 _DITHERED = 0.8
 """Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
 _SMOOTH = 2.0

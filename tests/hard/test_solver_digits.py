@@ -12,25 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Solution, prepare
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
 from mitsim.study.solver_cost import Judge, dots, make_problem
+from tests.hard.hard_models import EPS, Frames, frames_of, shadow
 from tests.robustness import Recorder
 
 pytestmark = pytest.mark.robustness("Solver")
-EPS = float(np.finfo(np.float64).eps)
 LAMBDAS = tuple(10.0**-power for power in range(2, 17, 2))
 DISTANCES_MM = (2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
-Frames = dict[tuple[int, int], np.ndarray]
-
-
-def shadow(distance_mm: float, pixels: int = 512, n: int = 128) -> np.ndarray:
-    """(pixels, n) geometric shadow of the anchor geometry; fewer pixels are larger, on the same sensor and scene."""
-    profile = mls_mask().terms[0][1]
-    sensor, scene = centred_edges(pixels, 512 * 0.01172 / pixels), centred_edges(n, 120 / n)
-    return scene_factor(profile, 0.06, sensor, scene, distance_mm, 400.0)
 
 
 def with_spectrum(singular: np.ndarray, rows: int, seed: int) -> np.ndarray:
@@ -38,10 +27,6 @@ def with_spectrum(singular: np.ndarray, rows: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     u, v = (np.linalg.qr(rng.normal(size=(size, len(singular))))[0] for size in (rows, len(singular)))
     return (u * singular) @ v.T
-
-
-def frames_of(left: np.ndarray, right: np.ndarray, P_L: np.ndarray, P_R: np.ndarray, image: np.ndarray) -> Frames:
-    return {(i, j): left @ (np.outer(p, q) * image) @ right.T for i, p in enumerate(P_L.T) for j, q in enumerate(P_R.T)}
 
 
 def solved(left, right, P_L, P_R, frames: Frames, relative: float, **options: str) -> Solution:

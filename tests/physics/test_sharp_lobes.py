@@ -17,7 +17,7 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.planning import make_plan
 from mitsim.rig.patterns import Lighting
-from tests.hard.test_hard_transport import GLINT, PLACE, SCALE, gauss, glossy, lobe
+from tests.hard.hard_light import GLINT, PLACE, SCALE, gauss, glossy, lobe
 
 N, PIXELS, SIGMAS = 32, 64, 5.0
 ALONE = {"interreflection": False, "diffraction": False}

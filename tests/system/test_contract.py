@@ -156,6 +156,8 @@ def test_study_diffraction(call: Callable[..., Any], lab: Any, tmp_path: Path) -
     options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
     study = call("study", "diffraction", lab.scene, *options).payload
     assert {"shadows", "quality", "scene", "patterns", "output"} <= study.keys()
+    assert {row["mask"] for row in study["shadows"]} == {"separable", "flatcam"}
+    assert {row["frames"] for row in study["quality"]} == {"idealised", "rendered"}
     for row in study["shadows"]:
         assert row["mask"] in ("separable", "flatcam") and isinstance(row["light"], str)
         assert number(row["wavelengths"], 0) and number(row["terms"], 1)
@@ -171,7 +173,7 @@ def test_study_diffraction(call: Callable[..., Any], lab: Any, tmp_path: Path) -
 
 def test_doctor(call: Callable[..., Any]) -> None:
     found = call("doctor", "--json", "--quiet", "--variant", "llvm_ad_mono").payload
-    assert found["ok"] is True, found
+    assert found["ok"] is True and len(found["checks"]) == 9, found
     assert all({"name", "ok", "detail", "remedy"} <= check.keys() for check in found["checks"])
 
 
@@ -235,13 +237,22 @@ def test_version_and_help(shell: Callable[..., Any]) -> None:
 
 
 def test_help_of_every_verb_names_every_option(call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """And says of each what it is. (Planted: an option without a word; a hidden one.)"""
+    from typer.main import get_command
+
+    from mitsim.cli import app
+
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("TERM", "dumb")
+    commands = get_command(app).commands
+    assert {*commands} == {*VERBS}
     for verb in VERBS:
         text = call(verb, "--help")
         assert text.code == 0 and text.err == ""
-        # Every verb takes the three common options, and every option says what it is.
-        assert all(option in text.out for option in ("--json", "--variant", "--quiet")), verb
+        options = [option for option in commands[verb].params if option.param_type_name == "option"]
+        assert {"--json", "--variant", "--quiet"} <= {name for option in options for name in option.opts}, verb
+        for option in options:
+            assert all(name in text.out for name in option.opts) and option.help, (verb, option.opts)
         assert max(map(len, text.out.splitlines())) <= 100
     text = " ".join(call("capture", "--help").out.replace("│", " ").split())
     for fragment in ("SCENE", "dots:K", "hadamard:K", "--accuracy", "0.001", "--resume", "NAME=VALUE", "auto|SECONDS"):

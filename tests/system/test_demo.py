@@ -60,6 +60,7 @@ def test_demo_compares_all_families(done: tuple[Path, dict[str, Any]]) -> None:
     assert all(15 < value < 100 for value in [*report["psnr"].values(), *report["psnr_ideal"].values()])
     assert report["gain_db"] == pytest.approx(report["psnr"]["dots:7"] - report["psnr"]["uniform"])
     assert report["gain_db"] > 8
+    assert tuple(report["exposure"]) == FAMILIES
     for rows in report["exposure"].values():
         assert set(rows) == {"equal peak", "equal frame", "equal total"}
     assert report["report"] == str(folder / "report.html")

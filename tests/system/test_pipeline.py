@@ -90,11 +90,6 @@ def test_the_image_stands_upright(lab: Any, recover: Callable[..., Any]) -> None
         assert np.sqrt(np.mean((image - other / 0.99) ** 2)) > 0.05
 
 
-def test_dots_beat_uniform_light(recover: Callable[..., Any]) -> None:
-    # Seeds 0 and 1 gave 15.5 and 15.2 dB at equal peak.
-    assert recover("dots:4")["psnr"] > recover("uniform")["psnr"] + 10
-
-
 def test_the_brightest_pixel_is_at_the_fraction_of_full_well(
     call: Callable[..., Any], lab: Any, runs: Callable[[str], tuple[Path, Any]], tmp_path: Path
 ) -> None:

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 from mitsim.core.framefile import read_frame
+from tests.system.conftest import ACCURACY
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_spectral")
 
 
 def channels(path: Path) -> list[np.ndarray]:
-    """The colour channels of a rendered frame."""
+    """The colour channels of a rendered frame: one of luminance, or three."""
     found = read_frame(path)[0]
-    return [found[name].astype(float) for name in ("Y", "R", "G", "B") if name in found]
+    colours = [found[name].astype(float) for name in ("Y", "R", "G", "B") if name in found]
+    assert len(colours) in (1, 3), found.keys()
+    return colours
 
 
 @pytest.mark.parametrize("colour", VARIANTS)
@@ -37,9 +40,17 @@ def test_the_reference_sees_a_grey_scene_alike_in_every_variant(
         assert abs(frame.mean() - mono["mean"]) < 5 * error / np.sqrt(frame.size)
 
 
-@pytest.mark.parametrize("colour", [VARIANTS[0], pytest.param(VARIANTS[1], marks=pytest.mark.slow)])
-def test_capture_in_every_variant(shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str) -> None:
-    """The same frames as in mono within the accuracy asked for, and the same truth within its noise."""
+@pytest.mark.parametrize(
+    ("colour", "gate"), [(VARIANTS[0], 1e-6), pytest.param(VARIANTS[1], 2 * float(ACCURACY), marks=pytest.mark.slow)]
+)
+def test_capture_in_every_variant(
+    shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str, gate: float
+) -> None:
+    """The same frames as in mono, and the same truth.
+
+    Three channels take mono's paths: the same to float32's rounding. Wavelengths are sampled, so that both estimates
+    have the error asked for; seed 0 leaves 3.4e-3 of the frames and 1.6e-3 of the truth.
+    """
     options = "-o", tmp_path / "run", "--patterns", "dots:4", "--json", "--variant", colour
     outcome = shell("capture", *lab.rig, *options)
     assert outcome.err == "" and outcome.payload["variant"] == colour
@@ -47,13 +58,12 @@ def test_capture_in_every_variant(shell: Callable[..., Any], lab: Any, tmp_path:
         np.stack([read_frame(path)[0]["electrons"].astype(float) for path in sorted(run.glob("frame_*.exr"))])
         for run in (tmp_path / "run", lab.run)
     ]
-    # The exposures of the two runs differ, each fills the well by its own light; both estimates have an error of 2 %.
+    # The exposures of the two runs differ, each fills the well by its own light.
     ours, theirs = (values / np.linalg.norm(values) for values in frames)
-    assert np.linalg.norm(ours - theirs) < 2 * 0.02
-    assert outcome.payload["exposure_s"] == pytest.approx(lab.captured.payload["exposure_s"], rel=0.04)
+    assert np.linalg.norm(ours - theirs) < gate
+    assert outcome.payload["exposure_s"] == pytest.approx(lab.captured.payload["exposure_s"], rel=gate)
     truths = [read_frame(run / "truth.exr")[0]["reflectance"] for run in (tmp_path / "run", lab.run)]
-    # Sampled wavelengths make the spectral truth noisier, 0.023 at this accuracy; another place or scale gives 0.1.
-    assert np.sqrt(np.mean((truths[0] - truths[1]) ** 2)) < 0.05
+    assert np.sqrt(np.mean((truths[0] - truths[1]) ** 2)) < gate
 
 
 def test_a_variant_that_is_not_on_this_machine(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:

@@ -98,12 +98,6 @@ def test_a_plan_is_json_with_the_promised_keys() -> None:
     assert all(set(effect) == {"name", "state", "reason", "error_if_off", "seconds"} for effect in block["effects"])
 
 
-def test_a_keystone_is_told() -> None:
-    keystone = rows(plan(facts=replace(FACTS, keystone=2.5)))["keystone"]
-    assert "2.5" in keystone.reason and "separable" in keystone.reason
-    assert "squarely" in rows(plan())["keystone"].reason
-
-
 @pytest.mark.parametrize(
     ("keystone", "state", "words"), [(0.0, "off", "squarely"), (2.5, "exact", "2.5 of its pixels")]
 )

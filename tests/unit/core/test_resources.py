@@ -1,6 +1,7 @@
 """Work that would take more than there is, or than is allowed, is refused in one line that says how much."""
 
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -72,5 +73,10 @@ def test_limits_that_are_no_limits(wrong: dict[str, float]) -> None:
         Limits(**wrong)
 
 
-def test_the_disk_of_a_place_that_is_not_there_yet(tmp_path: Path) -> None:
-    assert free_disk(tmp_path / "a" / "b") == pytest.approx(free_disk(tmp_path), rel=0.1)
+def test_the_disk_of_a_place_that_is_not_there_yet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of the nearest folder that is there; two folders of one disk say the same, so the disk is played."""
+    disks = {tmp_path: 3e9, tmp_path / "mounted": 7e9}
+    (tmp_path / "mounted").mkdir()
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=disks[place]))
+    assert free_disk(tmp_path / "a" / "b") == free_disk(tmp_path) == 3e9
+    assert free_disk(tmp_path / "mounted" / "a" / "b") == 7e9

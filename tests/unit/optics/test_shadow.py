@@ -120,6 +120,7 @@ def test_bad_arguments_are_refused_in_one_line(change):
         "mask_distance_mm": 2.0,
         "depth_mm": 10.0,
     }
+    assert shadow_factor(**good).shape == (1, 1)
     with pytest.raises(MitsimError, match=r"^[^\n]+$"):
         shadow_factor(**(good | change))
 

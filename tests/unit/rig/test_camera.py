@@ -1,13 +1,10 @@
-"""The camera model: numbers in, pixel grid, mask and anchors out; interpolation exact where it must be."""
+"""The camera model: numbers in, pixel grid, mask and the shadow's terms out."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions, shadow_factor
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
@@ -149,23 +146,3 @@ def test_rows_and_columns_each_take_their_own_directions() -> None:
             assert left.shape == (8, 2) and right.shape == (8, 3)
             assert np.array_equal(left, swapped_right) and np.array_equal(right, swapped_left)
             assert not np.allclose(left[:, 0], left[:, 1])
-
-
-def test_anchors_are_chebyshev_nodes() -> None:
-    assert anchor_positions(1, 3.0) == pytest.approx([0.0], abs=1e-15)
-    assert anchor_positions(2, 3.0) == pytest.approx([-3 / np.sqrt(2), 3 / np.sqrt(2)])
-    for count in (3, 5):
-        x = anchor_positions(count, 1.0)
-        assert np.allclose(np.cos(count * np.arccos(x)), 0, atol=1e-12) and (np.diff(x) > 0).all()
-    with pytest.raises(MitsimError, match="is 0"):
-        anchor_positions(0, 1.0)
-
-
-@settings(max_examples=30, deadline=None)
-@given(count=st.integers(1, 6), seed=st.integers(0, 100))
-def test_interpolation_is_exact_for_polynomials_below_the_number_of_anchors(count: int, seed: int) -> None:
-    polynomial = np.polynomial.Polynomial(np.random.default_rng(seed).standard_normal(count))
-    nodes, at = anchor_positions(count, 3.0), np.linspace(-3, 3, 41)
-    weights = anchor_weights(nodes, at)
-    assert np.allclose(weights.sum(axis=1), 1)
-    assert np.allclose(weights @ polynomial(nodes), polynomial(at), atol=1e-9 * 3**count)

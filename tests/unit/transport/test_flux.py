@@ -14,7 +14,7 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.truth import trace_truth
 from mitsim.transport.flux import FluxTracer
-from tests.hard.test_hard_transport import gauss, glossy, lobe
+from tests.hard.hard_light import gauss, glossy, lobe
 
 N, SEEDS, SEVEN, HALF_SENSOR = 16, 8, 7.0, 3.2
 HOLE = """<shape type="rectangle"><transform name="to_world"><scale x="80" y="80"/><rotate y="1" angle="180"/>

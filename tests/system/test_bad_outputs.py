@@ -1,0 +1,63 @@
+"""Outputs that cannot be written (issue 2, item 10): exit 2, one line that names the place, and nothing written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.system.refusals import Refused, mentions
+
+
+@pytest.fixture(params=["capture", "calibrate", "reconstruct", "render", "study", "demo"])
+def to(request: pytest.FixtureRequest, lab: Any) -> Callable[[str], tuple[object, ...]]:
+    """Arguments of each verb that writes, with the output given."""
+    verb = {
+        "capture": ("capture", *lab.rig, "--patterns", "dots:4"),
+        "calibrate": ("calibrate", *lab.rig),
+        "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration),
+        "render": ("render", lab.scene, "--spp", "4"),
+        "study": ("study", "accuracy", lab.scene),
+        "demo": ("demo", lab.scene),
+    }[request.param]
+    return lambda output: (*verb, "-o", output)
+
+
+def test_an_output_below_a_file(refused: Refused, tmp_path: Path, to: Callable[[str], tuple[object, ...]]) -> None:
+    (tmp_path / "file").write_text("mine")
+    mentions(refused(*to("file/new.exr")), "file/new")
+
+
+def test_an_output_where_nothing_can_be_written(refused: Refused, to: Callable[[str], tuple[object, ...]]) -> None:
+    # Tests may run as root, whom permission bits do not stop; in /proc nobody can make files.
+    mentions(refused(*to("/proc/new.exr")), "/proc/new")
+    mentions(refused(*to("nowhere/new.exr")), "nowhere/new")
+
+
+def test_an_output_of_the_other_kind(refused: Refused, tmp_path: Path, to: Callable[[str], tuple[object, ...]]) -> None:
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "folder.exr").mkdir()
+    mentions(refused(*to("folder.exr" if "render" in to("") else "file")), "is a f")
+
+
+def test_a_frame_that_is_no_exr(refused: Refused, lab: Any) -> None:
+    mentions(refused("render", lab.scene, "-o", lab.scene), str(lab.scene), ".exr")
+
+
+def test_a_name_that_no_file_can_have(refused: Refused, to: Callable[[str], tuple[object, ...]]) -> None:
+    mentions(refused(*to("n" * 300 + ".exr")), "nnn", "name too long")
+
+
+@pytest.mark.parametrize("verb", ["capture", "calibrate", "demo", "reconstruct"])
+def test_a_folder_that_holds_something(refused: Refused, lab: Any, tmp_path: Path, verb: str) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("keep me")
+    arguments = {
+        "capture": ("capture", *lab.rig, "--patterns", "dots:4"),
+        "calibrate": ("calibrate", *lab.rig),
+        "demo": ("demo", lab.scene),
+        "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration),
+    }[verb]
+    mentions(refused(*arguments, "-o", "mine"), "mine", "holds files")

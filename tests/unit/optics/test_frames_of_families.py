@@ -1,0 +1,184 @@
+"""Frames of all shots of a family: mixed from classes or formed one by one, with ambient, further and exact light."""
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics, _product, formed_frames
+from tests.unit.optics.small_camera import (
+    BESIDE,
+    CAMERA,
+    CELLS,
+    FAMILIES,
+    LABELS,
+    PIXELS,
+    SPLIT,
+    WINDOW,
+    ambient_groups,
+    cell_optics,
+    expected_frames,
+    random_groups,
+    small_optics,
+)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_mixing_classes_equals_weighing_every_pixel(family: str) -> None:
+    weights, groups = FAMILIES[family], random_groups(3, 7, spread=0.1)
+    optics = small_optics()
+    mixed = list(expected_frames(optics, groups, LABELS, weights, 5))
+    # Sixteen classes are more than the captures, so these frames are formed one by one.
+    direct = list(expected_frames(optics, groups, np.arange(PIXELS), weights[:, LABELS], 5))
+    assert len(mixed) == len(direct) == len(weights)
+    mean = sum(groups[1:], groups[0]) / 3
+    for one, other, row in zip(mixed, direct, weights, strict=True):
+        plain = optics.frame(np.arange(CELLS**2), np.asarray(row[LABELS] @ mean.toarray()))
+        scale = np.abs(plain).max()
+        assert np.abs(one.irradiance - plain).max() < 1e-12 * scale
+        assert np.abs(other.irradiance - plain).max() < 1e-12 * scale
+        assert one.variance == pytest.approx(other.variance, rel=1e-9)
+
+
+def test_more_frames_than_one_block() -> None:
+    weights = np.random.default_rng(2).random((70, 4))
+    expected = expected_frames(small_optics(8), random_groups(2, 3, 0.1), LABELS, weights, 0)
+    frames = [frame.irradiance for frame in expected]
+    assert len(frames) == len(expected) == 70
+    again = [frame.irradiance for frame in expected]
+    assert all(np.array_equal(a, b) for a, b in zip(frames, again, strict=True)), "iterable as often as needed"
+    # Linear: frame 69 is the same mix of the first four as its weights are.
+    mix = np.linalg.solve(weights[:4].T, weights[69])
+    assert np.allclose(frames[69], np.tensordot(mix, np.stack(frames[:4]), axes=1), rtol=1e-9)
+
+
+def test_what_interpolation_leaves_below_zero_is_reported() -> None:
+    """As a part of the light that is left. Half of the cells are darker than nothing here."""
+    light = sparse.csr_array(np.where(np.arange(CELLS**2) % CELLS < CELLS // 2, -1.0, 1.5)[None, :].repeat(PIXELS, 0))
+    weights = np.array([[1.0, 0, 0, 0]])
+    optics = small_optics()
+    (frame,) = expected_frames(optics, [light, light], LABELS, weights, 0)
+    raw = optics.frame(np.arange(CELLS**2), 4 * light.toarray()[0])
+    below = raw < 0
+    assert 0.1 < below.mean() < 0.9
+    assert frame.removed == pytest.approx(-raw[below].sum() / raw[~below].sum(), rel=1e-12)
+    assert np.array_equal(frame.irradiance, np.maximum(raw, 0))
+    dark = sparse.csr_array(-abs(light))
+    (frame,) = expected_frames(optics, [dark, dark], LABELS, weights, 0)
+    assert not frame.irradiance.any() and frame.removed == 0.0
+
+
+@pytest.mark.parametrize(("family", "formed"), [("mixed", 4), ("by capture", 6)])
+def test_frames_are_formed_as_often_as_is_promised(family: str, formed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every frame is asked for twice: to find the brightest pixel, and to expose it."""
+    labels, weights = BESIDE[family]
+    count, frame = [], FrameOptics.frame
+    monkeypatch.setattr(FrameOptics, "frame", lambda *arguments: count.append(0) or frame(*arguments))
+    frames = expected_frames(small_optics(8), random_groups(1, 7), labels, weights, 0)
+    for _ in range(2):
+        assert len(list(frames)) == len(weights)
+    assert len(count) == formed == formed_frames(labels.max() + 1, len(weights))
+
+
+def test_light_in_very_many_places_is_mixed_where_it_is() -> None:
+    """Places beyond 2^22 take a product of their own, which never makes a line for each of them."""
+    rng = np.random.default_rng(6)
+    rows, places = rng.integers(0, PIXELS, 300), rng.integers(0, 2**23, 300)
+    light = sparse.csr_array((rng.random(300), (rows, places)), shape=(PIXELS, 2**23))
+    basis = sparse.csr_array(rng.random((3, PIXELS)))
+    found = _product(basis, light)
+    assert found.shape == (3, 2**23) and abs(found - basis @ light).max() < 1e-15
+    assert (np.diff(found.indices) < 0).sum() == 2, "in each of three rows in order, or a sum takes 20 bytes a place"
+    dark = _product(basis, sparse.csr_array((PIXELS, 2**23)))
+    assert dark.shape == (3, 2**23) and dark.nnz == 0
+
+
+# ---- ambient light, light in other cells, and exact light beside the groups'
+
+
+def alike(found: ExpectedFrames, other: ExpectedFrames) -> None:
+    """Same frames and same variances."""
+    for one, two in zip(found, other, strict=True):
+        assert np.allclose(one.irradiance, two.irradiance, rtol=1e-10, atol=1e-12 * two.irradiance.max())
+        assert one.variance == pytest.approx(two.variance, rel=1e-9)
+
+
+@pytest.mark.parametrize("family", BESIDE)
+def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
+    """Weight 1 even where the projector is dark; its estimates deviate together with their groups'."""
+    labels, weights = BESIDE[family]
+    weights = weights.copy()
+    weights[1] = 0
+    optics, groups, lamps = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3)
+    plain = list(expected_frames(optics, groups, labels, weights, 5))
+    lit = expected_frames(optics, groups, labels, weights, 5, ambient=[Filed(optics, lamps)])
+    mean = np.asarray(sum(lamps[1:], lamps[0]).todense()).ravel() / 3
+    expected = optics.frame(np.arange(CELLS**2), mean)
+    for with_lamps, without in zip(lit, plain, strict=True):
+        assert np.allclose(with_lamps.irradiance, without.irradiance + expected, rtol=1e-10)
+    # The same as a projector pixel of its own that always shines.
+    more = [sparse.vstack([group, lamp], format="csr") for group, lamp in zip(groups, lamps, strict=True)]
+    always = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
+    alike(lit, expected_frames(optics, more, np.append(labels, weights.shape[1]), always, 5))
+    assert next(iter(lit)).variance > 0 and plain[1].variance == 0
+    assert np.allclose(lit.projector_off.irradiance, expected, rtol=1e-10) and lit.projector_off.variance == 0
+    dark = expected_frames(optics, groups, labels, weights, 5).projector_off
+    assert dark.irradiance.shape == expected.shape and not dark.irradiance.any()
+
+
+def test_ambient_light_of_two_kinds() -> None:
+    """Fine and coarse cells: their frames add, and so do the deviations of paired groups, before they are squared."""
+    optics, groups, lamps, others = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3), ambient_groups(3, 32)
+    apart = expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, lamps), Filed(optics, others)])
+    summed = tuple(a + b for a, b in zip(lamps, others, strict=True))
+    alike(apart, expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, summed)]))
+
+
+def test_ambient_light_has_a_shadow_of_its_own() -> None:
+    optics, other, lamps = small_optics(), small_optics(), ambient_groups(2)
+    edges = np.linspace(*WINDOW, CELLS + 1)
+    other = cell_optics(CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15, "mask": "open"}), edges, edges)
+    groups = random_groups(2, 7, 0.2)
+    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, ambient=[Filed(other, lamps)])
+    plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
+    mean = np.asarray((lamps[0] + lamps[1]).todense()).ravel() / 2
+    expected = other.frame(np.arange(CELLS**2), mean)
+    assert np.allclose(next(iter(frames)).irradiance - next(iter(plain)).irradiance, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("family", BESIDE)
+def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
+    """Filed in the same cells it is as if it had been added; errors of one path go together, so they add first."""
+    labels, weights = BESIDE[family]
+    optics, groups, more = small_optics(), random_groups(3, 7, 0.2), random_groups(3, 8, 0.2)
+    apart = expected_frames(optics, groups, labels, weights, 5, more=[Filed(optics, tuple(more))])
+    alike(apart, expected_frames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
+
+
+def test_more_light_in_cells_of_its_own() -> None:
+    edges = np.linspace(*WINDOW, 4)
+    camera = CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15})
+    coarse, optics = cell_optics(camera, edges, edges), small_optics()
+    groups = random_groups(2, 7, 0.2)
+    more = tuple(sparse.csr_array(np.random.default_rng(seed).random((PIXELS, 9))) for seed in (1, 2))
+    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, more=[Filed(coarse, more)])
+    plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
+    light = np.asarray((more[0] + more[1]).todense())[LABELS == 2].sum(axis=0) / 2
+    difference = list(frames)[2].irradiance - list(plain)[2].irradiance
+    assert np.allclose(difference, coarse.frame(np.arange(9), light), rtol=1e-9)
+
+
+@pytest.mark.parametrize("family", [*BESIDE, "identity", "many"])
+def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
+    """Classes 1 and 3 bring frames of their own, without error, in families of either kind and over several blocks."""
+    families = {**BESIDE, "identity": (LABELS, np.eye(4)), "many": (SPLIT, np.random.default_rng(2).random((70, 80)))}
+    labels, weights = families[family]
+    optics, groups = small_optics(8), random_groups(2, 7, 0.2)
+    brought = np.random.default_rng(3).random((2, 8, 8))
+    exact = ClassFrames(np.array([1, 3]), brought)
+    with_it = list(expected_frames(optics, groups, labels, weights, 0, glint=exact))
+    without = list(expected_frames(optics, groups, labels, weights, 0))
+    assert len(with_it) == len(weights)
+    for found, plain, row in zip(with_it, without, weights, strict=True):
+        expected = plain.irradiance + row[1] * brought[0] + row[3] * brought[1]
+        assert np.allclose(found.irradiance, expected, rtol=1e-10)
+        assert found.variance == pytest.approx(plain.variance, rel=1e-12)
