@@ -37,6 +37,7 @@ from mitsim.cli.options import (
     job_of,
     number_of,
     request_of,
+    scope_of,
     spoken,
 )
 from mitsim.cli.screen import finish, print_plan
@@ -338,8 +339,11 @@ def render(
 
 @app.command()
 def study(
-    name: Annotated[str, typer.Argument(help="accuracy or diffraction", metavar="NAME")],
-    scene: Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene")] = "photograph",
+    name: Annotated[str, typer.Argument(help="of the study, or merge", metavar="NAME")],
+    scenes: Annotated[
+        list[str] | None,
+        typer.Argument(help="scene XML, or the name of a shipped scene; of merge, folders", metavar="[SCENE]"),
+    ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of the study")] = Path("study-output"),
     patterns: Patterns = "dots:7",
     seed: Seed = 0,
@@ -347,19 +351,44 @@ def study(
     projector: Projector = None,
     define: Defines = None,
     outside: Outside = False,
+    quick: Annotated[bool, typer.Option("--quick", help="a few points, for a first look")] = False,
+    shard: Annotated[str, typer.Option(help="measure part I of N of the points", metavar="I/N")] = "1/1",
+    jobs: Annotated[int | None, typer.Option(help="processes; one a processor if not given")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Dask scheduler that measures the points")] = None,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """An experiment with plots and JSON: what `accuracy` costs in time, what `diffraction` at the mask does."""
-    from mitsim.study import find_study
+    """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance); what `accuracy`
+    costs in time, what `diffraction` at the mask does; `merge` joins the parts of --shard.
+    """
+    from mitsim.study import find_study, is_experiment
 
-    run_study = find_study(name)
-    request = mitsim.Request.of(patterns=patterns, seed=seed)
     with job_of(quiet or as_json) as job:
-        bench = bench_of(scene, variant, camera, projector, define, outside)
-        result = run_study(bench, output, request, job)
+        if name == "merge":
+            from mitsim.study.campaign import merge
+
+            result: Any = merge(scenes or (), output)
+        elif is_experiment(name):
+            from mitsim.study.campaign import Where, run_experiment
+            from mitsim.study.points import Shard
+
+            where = Where(Shard.of(shard), jobs, scheduler)
+            scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
+            result = run_experiment(name, scope, output, job, where)
+        else:
+            run_study = find_study(name)
+            request = mitsim.Request.of(patterns=patterns, seed=seed)
+            bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
+            result = run_study(bench, output, request, job)
     return finish(as_json, result.payload(), result.lines(), ())
+
+
+def _only(scenes: list[str] | None) -> str | None:
+    """The scene that is studied, where one is given; MitsimError for several."""
+    if scenes and len(scenes) > 1:
+        raise MitsimError(f"{' '.join(scenes)}: give one scene")
+    return scenes[0] if scenes else None
 
 
 @app.command()

@@ -16,6 +16,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
     from mitsim.core.job import Job
+    from mitsim.study.experiment import Scope
 
 _OPTIONS = {"lam": "lambda"}
 """Options that are not called like the argument."""
@@ -68,6 +69,38 @@ def request_of(**values: object) -> dict[str, Any]:
     return {name: request[name] for name in values}
 
 
+def scope_of(
+    scene: str | None,
+    variant: str,
+    camera: str | None,
+    projector: str | None,
+    define: Sequence[str] | None,
+    outside: bool,
+    quick: bool,
+) -> Scope:
+    """How much of a study a command line asks for: eight test images on the photograph's sheet, or one ``scene``.
+
+    Parameters
+    ----------
+    scene, variant, camera, projector, define, outside
+        as for :func:`bench_of`; no scene: the test images.
+    quick
+        a few points and two images.
+
+    Raises
+    ------
+    MitsimError
+        for a define that is none.
+    """
+    from mitsim.study.experiment import Scope, Setup
+    from mitsim.study.pictures import QUICK_IMAGES, TEST_IMAGES
+
+    parameters = tuple(sorted(defines_of(define).items()))
+    setup = Setup(scene or "photograph", None, parameters, camera, projector, variant, outside)
+    pictures: tuple[str | None, ...] = (None,) if scene else QUICK_IMAGES if quick else TEST_IMAGES
+    return Scope(setup, pictures, quick=quick)
+
+
 def bench_of(
     scene: str,
     variant: str,
@@ -91,6 +124,12 @@ def bench_of(
     MitsimError
         as there, and for a parameter that is not written so.
     """
+    parameters: dict[str, Any] = defines_of(define)
+    return mitsim.open_bench(scene, variant, camera, projector, outside, for_render, **parameters)
+
+
+def defines_of(define: Sequence[str] | None) -> dict[str, str]:
+    """The scene's parameters in ``define``, NAME=VALUE each; MitsimError for what is not written so."""
     parameters = {}
     for text in define or ():
         name, equals, value = text.partition("=")
@@ -99,7 +138,7 @@ def bench_of(
         if name in _BENCH_ARGUMENTS:
             raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
         parameters[name] = value
-    return mitsim.open_bench(scene, variant, camera, projector, outside, for_render, **parameters)
+    return parameters
 
 
 def number_of(argument: str, text: str) -> float | Literal["auto"]:

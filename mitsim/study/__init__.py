@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING
 from mitsim.core.errors import MitsimError
 
 if TYPE_CHECKING:
+    from mitsim.study.experiment import Experiment
     from mitsim.study.runner import Study
 
 STUDIES: Mapping[str, str] = MappingProxyType({"accuracy": "accuracy:measure", "diffraction": "diffraction:measure"})
-"""Studies by name, as ``module:function``; the function takes (bench, request, job) and gives
+"""Studies of one bench by name, as ``module:function``; the function takes (bench, request, job) and gives
 :class:`mitsim.study.runner.Findings`."""
+EXPERIMENTS = ("patterns", "distance")
+"""Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
 
 
 def find_study(name: str) -> Study:
@@ -25,8 +28,30 @@ def find_study(name: str) -> Study:
     MitsimError for another name, with those that there are.
     """
     if name not in STUDIES:
-        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join(STUDIES)}")
+        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
     from mitsim.study.runner import run_study
 
     module, function = STUDIES[name].split(":")
     return partial(run_study, name, getattr(importlib.import_module(f"mitsim.study.{module}"), function))
+
+
+def find_experiment(name: str) -> Experiment:
+    """The experiment ``name``, a shipped one or a module of the user's with a dot in its name.
+
+    MitsimError for another name, with those that there are, and for a module without an ``EXPERIMENT``.
+    """
+    if not is_experiment(name):
+        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+    module = name if "." in name else f"mitsim.study.paper.{name}"
+    try:
+        found: Experiment = importlib.import_module(module).EXPERIMENT
+    except (ImportError, AttributeError) as error:
+        raise MitsimError(
+            f"study {name}: the module {module} cannot be used ({error}); it needs an EXPERIMENT"
+        ) from error
+    return found
+
+
+def is_experiment(name: str) -> bool:
+    """Whether ``name`` is that of a study of many points."""
+    return name in EXPERIMENTS or "." in name

@@ -30,9 +30,9 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 """Seven of each, so that as many curves can be told apart."""
 _GRID, _LINK, _GREY = "#e5e7eb", "#d1d5db", "#6b7280"
 """Lines behind the data, between them, and beside them: lighter than any curve."""
-_FONT = 11.0
+FONT = 11.0
 """Points: as large as the text of a page of 8.6 inches."""
-_WIDTH, _FRAME_WIDTH = 8.6, 3.6
+WIDTH, _FRAME_WIDTH = 8.6, 3.6
 """Inches: a page of text, and three frames side by side with room for their labels."""
 _SHORT_AXIS = 30.0
 """Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
@@ -46,33 +46,33 @@ Point = tuple[float, float]
 def frame(values: npt.ArrayLike) -> Figure:
     """A sensor frame ``values`` (m, m) [DN] with its colour bar; pixel (0, 0) is top left."""
     # "compressed" makes room around an image of fixed aspect; "constrained" lets the row label run off the figure.
-    figure, axes = _figure(0.75 * _FRAME_WIDTH, _FRAME_WIDTH, layout="compressed")
+    figure, axes = figure_of(0.75 * _FRAME_WIDTH, _FRAME_WIDTH, layout="compressed")
     drawn = axes.imshow(np.asarray(values, dtype=np.float64), cmap="viridis", interpolation="none")
     bar = figure.colorbar(drawn, ax=axes)
-    bar.set_label("signal [DN]", fontsize=_FONT - 1)
-    bar.ax.tick_params(labelsize=_FONT - 2)
-    axes.set_xlabel("sensor column [pixel]", fontsize=_FONT - 1)
-    axes.set_ylabel("sensor row [pixel]", fontsize=_FONT - 1)
-    axes.tick_params(labelsize=_FONT - 2)
+    bar.set_label("signal [DN]", fontsize=FONT - 1)
+    bar.ax.tick_params(labelsize=FONT - 2)
+    axes.set_xlabel("sensor column [pixel]", fontsize=FONT - 1)
+    axes.set_ylabel("sensor row [pixel]", fontsize=FONT - 1)
+    axes.tick_params(labelsize=FONT - 2)
     return figure
 
 
 def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
     """An image's standard ``uncertainty`` beside its actual ``error``, both (n, n') [reflectance], on one scale."""
-    figure, _ = _figure(0.46 * _WIDTH, layout="compressed")
+    figure, _ = figure_of(0.46 * WIDTH, layout="compressed")
     figure.clear()
     panels: Any = figure.subplots(1, 2, sharex=True, sharey=True)
     largest = max(float(uncertainty.max()), float(np.percentile(error, _SHOWN_PERCENT)))
     titled = {"stated: standard uncertainty": uncertainty, "actual: |image - truth|": error}
     for axes, (title, values) in zip(panels, titled.items(), strict=True):
         drawn = axes.imshow(values, vmin=0, vmax=largest, cmap="viridis", interpolation="none")
-        axes.set_title(f"{title}\nrms {np.sqrt(np.mean(np.square(values))):.1e}", fontsize=_FONT)
-        axes.set_xlabel("column [projector pixel]", fontsize=_FONT - 1)
-        axes.tick_params(labelsize=_FONT - 2)
-    panels[0].set_ylabel("row [projector pixel]", fontsize=_FONT - 1)
+        axes.set_title(f"{title}\nrms {np.sqrt(np.mean(np.square(values))):.1e}", fontsize=FONT)
+        axes.set_xlabel("column [projector pixel]", fontsize=FONT - 1)
+        axes.tick_params(labelsize=FONT - 2)
+    panels[0].set_ylabel("row [projector pixel]", fontsize=FONT - 1)
     bar = figure.colorbar(drawn, ax=panels, extend="max")
-    bar.set_label("reflectance, 1 = board", fontsize=_FONT - 1)
-    bar.ax.tick_params(labelsize=_FONT - 2)
+    bar.set_label("reflectance, 1 = board", fontsize=FONT - 1)
+    bar.ax.tick_params(labelsize=FONT - 2)
     return figure
 
 
@@ -81,29 +81,29 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
 
     Each of the ``curves`` is divided by its own largest value: what remains is the conditioning.
     """
-    figure, axes = _figure(0.42 * _WIDTH)
+    figure, axes = figure_of(0.42 * WIDTH)
     for index, (name, values) in enumerate(curves.items()):
         ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
         share = 100.0 * np.arange(1, ordered.size + 1) / ordered.size
-        axes.semilogy(share, ordered / ordered[0], lw=2.0, label=name, **_line(index))
+        axes.semilogy(share, ordered / ordered[0], lw=2.0, label=name, **line_style(index))
     axes.set_xlim(0, 100)
-    _label(axes, "singular value's rank [% of all]", "relative to the largest [1]")
-    axes.legend(fontsize=_FONT - 1, frameon=False, loc="lower left")
+    label_axes(axes, "singular value's rank [% of all]", "relative to the largest [1]")
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="lower left")
     return figure
 
 
 def quality_bars(quality: Mapping[str, tuple[float, float]]) -> Figure:
     """PSNR [dB] by family, a pair of bars each: ``quality`` of the idealised model, and of the rendered light."""
-    figure, axes = _figure(0.36 * _WIDTH)
+    figure, axes = figure_of(0.36 * WIDTH)
     place = np.arange(len(quality), dtype=np.float64)
     looks = (-0.2, "#c7d2de", "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
     for values, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
         bars = axes.bar(place + shift, values, 0.38, color=colour, label=label)
-        axes.bar_label(bars, fmt="%.1f", fontsize=_FONT - 1, padding=2)
-    axes.set_xticks(place, list(quality), fontsize=_FONT)
+        axes.bar_label(bars, fmt="%.1f", fontsize=FONT - 1, padding=2)
+    axes.set_xticks(place, list(quality), fontsize=FONT)
     axes.margins(y=0.14)
-    _label(axes, "", "PSNR [dB]", grid="y")
-    axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", ncols=2, bbox_to_anchor=(0, 1.16))
+    label_axes(axes, "", "PSNR [dB]", grid="y")
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", ncols=2, bbox_to_anchor=(0, 1.16))
     return figure
 
 
@@ -120,7 +120,7 @@ def error_bars(
         what each takes, a second column; the errors are then those of leaving it out.
     """
     ordered = sorted(errors.items(), key=lambda item: item[1])
-    figure, axes = _figure(0.7 + 0.36 * len(ordered))
+    figure, axes = figure_of(0.7 + 0.36 * len(ordered))
     values = np.array([value for _, value in ordered], dtype=np.float64)
     shown = np.append(values[values > 0], [] if limit is None else limit)
     low, high = (shown.min(), shown.max()) if shown.size else (1e-3, 1e-3)
@@ -138,13 +138,13 @@ def error_bars(
     if limit is not None:
         axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
         where: Any = axes.get_xaxis_transform()
-        style = {"color": VERMILION, "fontsize": _FONT - 1, "xycoords": where, "textcoords": "offset points"}
+        style = {"color": VERMILION, "fontsize": FONT - 1, "xycoords": where, "textcoords": "offset points"}
         axes.annotate(f"accuracy asked for: {limit:g}", (limit, 1.0), (4, 3), **style)
     axes.set_xscale("log")
     axes.set_xlim(left, 3.0 * high)
-    axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=_FONT)
+    axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=FONT)
     axes.set_ylim(-0.6, len(values) - 0.4)
-    _label(axes, f"relative error{'' if seconds is None else ' of the frames if left out'} [1]", "", grid="x")
+    label_axes(axes, f"relative error{'' if seconds is None else ' of the frames if left out'} [1]", "", grid="x")
     return figure
 
 
@@ -168,7 +168,7 @@ def pareto(series: Mapping[str, Sequence[Point]], noise: float | None = None, ap
         points (seconds, error) by name; the sensor's relative noise, a horizontal line; names of series that are no
         steps of one thing, and are not joined.
     """
-    figure, axes = _figure(0.55 * _WIDTH)
+    figure, axes = figure_of(0.55 * WIDTH)
     for index, (name, points) in enumerate(series.items()):
         seconds, error = zip(*sorted(points), strict=True)
         colour, marker = _PALETTE[index % len(_PALETTE)], _MARKERS[index % len(_MARKERS)]
@@ -178,15 +178,15 @@ def pareto(series: Mapping[str, Sequence[Point]], noise: float | None = None, ap
     if noise is not None:
         axes.axhline(noise, color=_GREY, lw=1.8, ls="--", label=f"sensor noise, {noise:.1e}")
     _log_log(axes)
-    _label(axes, "wall time for all frames [s]", "relative error of the frames [1]")
-    axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    label_axes(axes, "wall time for all frames [s]", "relative error of the frames [1]")
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     return figure
 
 
 def solver_costs(rows: Sequence[SolverRow]) -> Figure:
     """Error of the image against seconds of the solver in ``rows``, a panel for each lambda, the best ringed."""
     lambdas = sorted({row.lambda_rel for row in rows}, reverse=True)
-    figure, _ = _figure(0.55 * _WIDTH)
+    figure, _ = figure_of(0.55 * WIDTH)
     figure.clear()
     panels: Any = figure.subplots(1, len(lambdas), sharex=True, sharey=True, squeeze=False)[0]
     colours = (BLUE, ORANGE, VERMILION, GREEN)
@@ -201,10 +201,10 @@ def solver_costs(rows: Sequence[SolverRow]) -> Figure:
         _draw_front(axes, [(row.seconds, row.error) for row in panel])
         _log_log(axes)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=_FONT - 1)
-        axes.set_title(rf"relative $\lambda$ {lam:.0e}", fontsize=_FONT)
-        _label(axes, "wall time [s]", "")
-    panels[0].set_ylabel("relative error of the image [1]", fontsize=_FONT)
+        axes.tick_params(labelsize=FONT - 1)
+        axes.set_title(rf"relative $\lambda$ {lam:.0e}", fontsize=FONT)
+        label_axes(axes, "wall time [s]", "")
+    panels[0].set_ylabel("relative error of the image [1]", fontsize=FONT)
     grey: dict[str, Any] = {"ls": "", "ms": 8, "color": "#9ca3af"}
     entries = [(Line2D([], [], ls="", ms=8, color=colours[i], marker="o"), name) for i, name in enumerate(precisions)]
     entries.append((panels[0].lines[-1], _BEST))
@@ -215,13 +215,13 @@ def solver_costs(rows: Sequence[SolverRow]) -> Figure:
 
 def seconds_by_stage(seconds: Mapping[str, float]) -> Figure:
     """Wall time {stage: ``seconds``} as horizontal bars in the order given."""
-    figure, axes = _figure(0.7 + 0.34 * len(seconds))
+    figure, axes = figure_of(0.7 + 0.34 * len(seconds))
     place = np.arange(len(seconds))[::-1]
     bars = axes.barh(place, list(seconds.values()), 0.62, color=BLUE)
-    axes.bar_label(bars, fmt="%.2g s", fontsize=_FONT - 1, padding=4)
-    axes.set_yticks(place, list(seconds), fontsize=_FONT)
+    axes.bar_label(bars, fmt="%.2g s", fontsize=FONT - 1, padding=4)
+    axes.set_yticks(place, list(seconds), fontsize=FONT)
     axes.margins(x=0.12)
-    _label(axes, "wall time [s]", "", grid="x")
+    label_axes(axes, "wall time [s]", "", grid="x")
     return figure
 
 
@@ -230,7 +230,7 @@ def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> 
     ``message`` above."""
     systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
     factors = list(dict.fromkeys(name for _, name, _ in rows))
-    figure, axes = _figure(1.3 + 0.46 * len(systems))
+    figure, axes = figure_of(1.3 + 0.46 * len(systems))
     for place, system in enumerate(systems):
         values = [value for name, _, value in rows if name == system]
         axes.plot([min(values), max(values)], [place, place], color=_LINK, lw=2, zorder=1)
@@ -238,9 +238,9 @@ def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> 
         points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
         style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
         axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
-    axes.set_yticks(range(len(systems)), systems, fontsize=_FONT - 2)
-    _label(axes, "PSNR of the image [dB]", "", grid="x")
-    figure.suptitle(message, fontsize=_FONT)
+    axes.set_yticks(range(len(systems)), systems, fontsize=FONT - 2)
+    label_axes(axes, "PSNR of the image [dB]", "", grid="x")
+    figure.suptitle(message, fontsize=FONT)
     _legend_below(figure, len(factors), *axes.get_legend_handles_labels())
     return figure
 
@@ -257,14 +257,14 @@ def shadow_profiles(
     reach_mm, message
         how far from the middle is shown, and what is said above.
     """
-    figure, axes = _figure(0.4 * _WIDTH)
+    figure, axes = figure_of(0.4 * WIDTH)
     position = np.asarray(position_mm, dtype=np.float64)
     inside = np.abs(position) <= reach_mm
     for index, (name, values) in enumerate(profiles.items()):
-        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **_line(index))
-    axes.set_title(message, fontsize=_FONT)
-    _label(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
-    axes.legend(fontsize=_FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **line_style(index))
+    axes.set_title(message, fontsize=FONT)
+    label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     return figure
 
 
@@ -275,7 +275,7 @@ def _beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> N
     """Text at a row, some points to the right of the axes."""
     where: Any = axes.get_yaxis_transform()
     axes.annotate(
-        text, (1.0, row), (points, 0), xycoords=where, textcoords="offset points", va="center", fontsize=_FONT, **style
+        text, (1.0, row), (points, 0), xycoords=where, textcoords="offset points", va="center", fontsize=FONT, **style
     )
 
 
@@ -296,32 +296,51 @@ def _log_log(axes: Axes) -> None:
         axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _line(index: int) -> dict[str, Any]:
+def line_style(index: int) -> dict[str, Any]:
+    """Colour and dashes of the curve number ``index``."""
     return {"color": _PALETTE[index % len(_PALETTE)], "ls": _STYLES[index % len(_STYLES)]}
 
 
-def _label(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
-    """Names of the axes, where given, and a grid behind the data."""
+def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
+    """Names of the axes, where given, and a grid behind the data.
+
+    Parameters
+    ----------
+    axes
+        that are drawn on.
+    x, y
+        names, with units; empty for none.
+    grid
+        lines of which axis.
+    """
     if x:
-        axes.set_xlabel(x, fontsize=_FONT)
+        axes.set_xlabel(x, fontsize=FONT)
     if y:
-        axes.set_ylabel(y, fontsize=_FONT)
+        axes.set_ylabel(y, fontsize=FONT)
     axes.grid(True, which="major", axis=grid, color=_GRID)
     axes.set_axisbelow(True)
 
 
 def _legend_below(figure: Figure, columns: int, handles: Any, labels: Any) -> None:
-    figure.legend(handles, labels, fontsize=_FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
+    figure.legend(handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
 
 
-def _figure(
-    height: float, width: float = _WIDTH, layout: Literal["constrained", "compressed"] = "constrained"
+def figure_of(
+    height: float, width: float = WIDTH, layout: Literal["constrained", "compressed"] = "constrained"
 ) -> tuple[Figure, Axes]:
-    """An empty figure of that many inches, with its own Agg canvas and one open axes."""
+    """An empty figure with its own Agg canvas and one open axes.
+
+    Parameters
+    ----------
+    height, width
+        inches.
+    layout
+        matplotlib's engine.
+    """
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot()
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    axes.tick_params(labelsize=_FONT - 1)
+    axes.tick_params(labelsize=FONT - 1)
     return figure, axes

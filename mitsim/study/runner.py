@@ -18,7 +18,7 @@ from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, sweep, whole_file
 from mitsim.core.versions import versions
 
-_DPI = 150
+DPI = 150
 """Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
 
 
@@ -87,7 +87,7 @@ def run_study(
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         for file, figure in findings.figures().items():
             with whole_file(folder / file) as part:
-                figure.savefig(part, dpi=_DPI, format="png")
+                figure.savefig(part, dpi=DPI, format="png")
         return result
 
 

@@ -1,0 +1,218 @@
+"""A study of many points, from its name and scope to a folder with its points, table, claims, figures and page."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.core.jsonfile import read_json, write_json
+from mitsim.core.output import whole_file
+from mitsim.core.parallel import workers
+from mitsim.core.versions import versions
+from mitsim.study import find_experiment
+from mitsim.study.experiment import Claim, Experiment, Found, Point, Scope
+from mitsim.study.page import Section, build_page
+from mitsim.study.points import FOLDER, Shard, Store, batches
+from mitsim.study.runner import DPI, study_folder
+from mitsim.study.workers import in_processes, on_cluster
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where points are measured: which part of them, by how many processes here, or by a Dask scheduler."""
+
+    shard: Shard = field(default_factory=Shard)
+    jobs: int | None = None
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None and self.jobs < 1:
+            raise MitsimError(f"--jobs {self.jobs}: give 1 or more processes")
+
+    def measure(self, name: str, points: Sequence[Point]) -> Iterable[tuple[Point, Found]]:
+        """What the experiment ``name`` finds at ``points``, in any order."""
+        if self.scheduler is not None:
+            return on_cluster(name, batches(points), self.scheduler)
+        return in_processes(name, batches(points), self.jobs or workers())
+
+
+@dataclass(frozen=True)
+class CampaignResult:
+    """A study, or the part of it whose points are measured: what the command line reports.
+
+    Attributes
+    ----------
+    study, output
+        its name, and the folder that holds it.
+    points, missing, seconds
+        points that are measured, those of other parts that are not, and what measuring took.
+    rows, claims, figures
+        of a whole study: all that was measured, what becomes of the paper's claims, and files of figures.
+    section
+        of a whole study: how a page shows it.
+    """
+
+    study: str
+    output: str
+    points: int
+    missing: int
+    seconds: float
+    rows: tuple[Any, ...] = ()
+    claims: tuple[Claim, ...] = ()
+    figures: tuple[str, ...] = ()
+    section: Section | None = None
+
+    def payload(self) -> dict[str, Any]:
+        """As JSON."""
+        return {name: value for name, value in asdict(replace(self, section=None)).items() if name != "section"}
+
+    def lines(self) -> list[str]:
+        """For people."""
+        if self.missing:
+            return [
+                f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
+                "Join all parts with: mitsim study merge PART... -o FOLDER",
+            ]
+        said = [
+            f"{claim.verdict}: {claim.claim} ({claim.paper} in the paper; {claim.idealised} idealised, "
+            f"{claim.rendered} rendered)"
+            for claim in self.claims
+        ]
+        return [*said, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
+
+
+def run_experiment(
+    study: str, scope: Scope, output: Path | str, job: Job | None = None, where: Where | None = None
+) -> CampaignResult:
+    """Measure what is not measured yet, and put everything together.
+
+    Parameters
+    ----------
+    study
+        name of an experiment.
+    scope
+        of which scene, and how much.
+    output
+        new or empty folder, or that of an earlier run of the same study, which goes on.
+    job
+        progress.
+    where
+        the points are measured; None: all of them here.
+
+    Raises
+    ------
+    MitsimError
+        for another name, an output that holds something else, and whatever a point refuses.
+    """
+    campaign, job, where = _Campaign(study, scope), job or Job(), where or Where()
+    own, started = where.shard.part(campaign.points), time.perf_counter()
+    with campaign.folder(output) as (folder, store):
+        todo = [point for point in own if not store.has(point)]
+        for done, (point, found) in enumerate(where.measure(study, todo) if todo else (), start=1):
+            store.save(point, found)
+            left = (time.perf_counter() - started) / done * (len(todo) - done)
+            job.progress(f"{study}: {done} of {len(todo)} points, {_spoken(left)} left", done / len(todo))
+        return campaign.finished(folder, store, time.perf_counter() - started)
+
+
+def merge(parts: Sequence[Path | str], output: Path | str) -> CampaignResult:
+    """One study of the points of several ``parts``, folders of the same study, in the folder ``output``.
+
+    MitsimError for parts of different studies, parts that hold none, and an output that holds something else.
+    """
+    started, heads = time.perf_counter(), [_head(Path(part)) for part in parts]
+    if not heads:
+        raise MitsimError("study merge: give the folders of the parts")
+    for part, head in zip(parts, heads, strict=True):
+        if any(head[key] != heads[0][key] for key in ("study", "scope", "versions")):
+            raise MitsimError(
+                f"study merge: {part} is of another study, scope or version than {parts[0]}; run it again"
+            )
+    campaign = _Campaign(heads[0]["study"], _scope(heads[0]["scope"], parts[0]))
+    with campaign.folder(output) as (folder, store):
+        for part in parts:
+            store.take(Store(Path(part) / FOLDER))
+        return campaign.finished(folder, store, time.perf_counter() - started)
+
+
+@dataclass(frozen=True)
+class _Campaign:
+    """A study by its name, and its scope."""
+
+    study: str
+    scope: Scope
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        return find_experiment(self.study)
+
+    @cached_property
+    def points(self) -> Sequence[Point]:
+        return self.experiment.points(self.scope)
+
+    @contextmanager
+    def folder(self, output: Path | str) -> Iterator[tuple[Path, Store]]:
+        """The folder ``output`` and its store, held; an earlier run of the same code goes on."""
+        name = self.experiment.name
+        with study_folder(output, name, ("*.png", "*.csv", "*.html", FOLDER)) as folder:
+            head = folder / f"{name}.json"
+            if head.exists() and (made := read_json(head).get("versions")) != versions():
+                raise MitsimError(
+                    f"output {folder}: its points were measured by other versions ({made}); choose another folder"
+                )
+            (folder / FOLDER).mkdir(exist_ok=True)
+            store = Store(folder / FOLDER)
+            store.tidy()
+            self._write(folder, status="incomplete")
+            yield folder, store
+
+    def finished(self, folder: Path, store: Store, seconds: float) -> CampaignResult:
+        """Table, claims, figures and page, where all points are there; measuring them took so many ``seconds``."""
+        there, experiment = sum(store.has(point) for point in self.points), self.experiment
+        if missing := len(self.points) - there:
+            return CampaignResult(self.study, str(folder), there, missing, seconds)
+        results = store.results(self.points)
+        claims, figures = tuple(experiment.claims(results)), experiment.figures(results)
+        results.table.write(folder / f"{experiment.name}.csv")
+        for file, figure in figures.items():
+            with whole_file(folder / file) as part:
+                figure.savefig(part, dpi=DPI, format="png")
+        section = Section.of(experiment, self.study, self.scope, claims, figures, results)
+        build_page([section], folder / f"{experiment.name}.html", experiment.title)
+        rows = tuple(dict(row) for row in results.table.rows)
+        found = CampaignResult(self.study, str(folder), there, 0, seconds, rows, claims, tuple(figures), section)
+        self._write(folder, status="complete", **found.payload())
+        return found
+
+    def _write(self, folder: Path, **more: Any) -> None:
+        head = {"kind": self.experiment.name, "study": self.study, "scope": asdict(self.scope), "versions": versions()}
+        write_json(folder / f"{self.experiment.name}.json", {**head, **more})
+
+
+def _head(folder: Path) -> dict[str, Any]:
+    """What the study in a ``folder`` says of itself."""
+    for file in sorted(folder.glob("*.json")):
+        head = read_json(file)
+        if isinstance(head, dict) and {"study", "scope", "versions"} <= head.keys() and (folder / FOLDER).is_dir():
+            return head
+    raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
+
+
+def _scope(found: Any, part: Path | str) -> Scope:
+    try:
+        return TypeAdapter(Scope).validate_python(found)
+    except ValidationError as error:
+        raise MitsimError(f"study merge: {part}: its scope cannot be read ({error.errors()[0]['msg']})") from error
+
+
+def _spoken(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

@@ -1,0 +1,172 @@
+"""What a study declares: what varies, what is measured at each point, which claims and figures come of all points."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.study.table import Table, Value
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from mitsim.study.studio import Studio
+
+_KEY_DIGITS = 16
+"""Of a point's name: two of 10^4 points have the same with a chance of 10^-11."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What light is traced for and a camera calibrated: points that share one share its light.
+
+    Attributes
+    ----------
+    scene
+        scene XML, or the name of a shipped scene.
+    picture
+        print that the scene's own is replaced with (:mod:`mitsim.study.pictures`); None: its own.
+    parameters
+        (name, value) of the scene's parameters.
+    camera, projector, variant, outside
+        as for :func:`mitsim.open_bench`; ``outside`` is its ``allow_outside_files``.
+    accuracy
+        of the light.
+    """
+
+    scene: str = "photograph"
+    picture: str | None = None
+    parameters: tuple[tuple[str, str], ...] = ()
+    camera: str | None = None
+    projector: str | None = None
+    variant: str = "llvm_ad_mono"
+    outside: bool = False
+    accuracy: float = 1e-3
+
+    def changed(self, **parameters: object) -> Setup:
+        """The same with other ``parameters`` of the scene."""
+        new = {**dict(self.parameters), **{name: f"{value}" for name, value in parameters.items()}}
+        return replace(self, parameters=tuple(sorted(new.items())))
+
+    def printed(self, picture: str | None) -> Setup:
+        """The same with another ``picture`` on its print."""
+        return replace(self, picture=picture)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement of a study: its ``setup``, and the ``values`` of all else that varies, by name."""
+
+    setup: Setup
+    values: tuple[tuple[str, Value], ...]
+
+    @classmethod
+    def of(cls, setup: Setup, **values: Value) -> Point:
+        """Of a ``setup``, with these ``values``."""
+        return cls(setup, tuple(values.items()))
+
+    def __getitem__(self, name: str) -> Any:
+        return dict(self.values)[name]
+
+    @property
+    def key(self) -> str:
+        """Name of the file that keeps its findings."""
+        text = json.dumps(asdict(self), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:_KEY_DIGITS]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What one point came to: ``rows`` of the table, and pictures (n, n) [reflectance] by name."""
+
+    rows: tuple[Mapping[str, Value], ...]
+    images: Mapping[str, FloatArray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of the paper, its number there, in the idealised model and rendered, and what becomes of it.
+
+    ``verdict`` is "confirmed", "confirmed only if ...", or "not confirmed".
+    """
+
+    claim: str
+    paper: str
+    idealised: str
+    rendered: str
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Scope:
+    """How much of a study is wanted, and of what.
+
+    Attributes
+    ----------
+    setup
+        what is studied where nothing varies.
+    pictures
+        prints that means are taken over; (None,) where the scene keeps its own.
+    seeds
+        of the noise that means are taken over.
+    quick
+        a few points, for a first look.
+    sweep
+        what `mitsim study sweep` varies and measures; empty for other studies.
+    """
+
+    setup: Setup
+    pictures: tuple[str | None, ...]
+    seeds: tuple[int, ...] = (0,)
+    quick: bool = False
+    sweep: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    def chosen(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
+        """``few`` where the study is quick, otherwise ``everything``."""
+        return tuple(few if self.quick else everything)
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """All findings of a study: a table of all points' rows, and their pictures by (name, picture shown)."""
+
+    table: Table
+    images: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A study of many points.
+
+    Attributes
+    ----------
+    name, title, question
+        on the command line, at the head of its page, and what it is to answer, a sentence.
+    points
+        from a scope to all points; those of one setup should follow each other.
+    measure
+        one point, in a studio that keeps what neighbours share.
+    claims
+        from all results.
+    figures
+        from all results, by file name; each has one message.
+    """
+
+    name: str
+    title: str
+    question: str
+    points: Callable[[Scope], Sequence[Point]]
+    measure: Callable[[Studio, Point], Found]
+    claims: Callable[[Results], Sequence[Claim]]
+    figures: Callable[[Results], Mapping[str, Figure]]
+
+
+def thumbnail(image: FloatArray) -> FloatArray:
+    """An ``image`` as findings keep it: single precision shows all that a page can."""
+    return np.asarray(image, dtype=np.float32)

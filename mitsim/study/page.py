@@ -1,0 +1,102 @@
+"""Finished studies in, one self-contained HTML page out: claims, figures, and the commands that repeat them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.figure import Figure
+
+from mitsim.core.output import whole_file
+from mitsim.core.pictures import data_uri
+from mitsim.core.versions import versions
+from mitsim.study.experiment import Claim, Experiment, Results, Scope
+
+_DPI = 160
+"""Figures are 8.6 inches wide: 1376 pixels, what the page's width shows on a screen of two dots a pixel."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One study on a page; ``pictures`` are addresses of its figures that hold them, by file name."""
+
+    name: str
+    title: str
+    question: str
+    claims: tuple[Claim, ...]
+    pictures: Mapping[str, str]
+    count: str
+    command: str
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        study: str,
+        scope: Scope,
+        claims: Sequence[Claim],
+        figures: Mapping[str, Figure],
+        results: Results,
+    ) -> Section:
+        """The section of an experiment.
+
+        Parameters
+        ----------
+        experiment, study, scope
+            what was studied, and what the command line calls it.
+        claims, figures, results
+            what it came to.
+        """
+        prints = [name for name in scope.pictures if name]
+        means = f", over {len(prints)} test images" if prints else ""
+        setup = scope.setup
+        command = ["mitsim study", study, *([] if prints else [setup.scene]), *_options(scope)]
+        return cls(
+            name=experiment.name,
+            title=experiment.title,
+            question=experiment.question,
+            claims=tuple(claims),
+            pictures={name: _address(figure) for name, figure in figures.items()},
+            count=f"{len(results.table)} measurements{means}, light to {setup.accuracy:g}",
+            command=" ".join(command),
+        )
+
+
+def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
+    """Write a page, all or nothing, and return its path.
+
+    MitsimError when it cannot be written.
+
+    Parameters
+    ----------
+    sections, title
+        what it shows, and its head.
+    path
+        where.
+    """
+    loader = PackageLoader("mitsim.study")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    claims = [claim for section in sections for claim in section.claims]
+    text = environment.get_template("study.html").render(
+        title=title, sections=sections, claims=claims, versions=versions()
+    )
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return path
+
+
+def _options(scope: Scope) -> list[str]:
+    setup = scope.setup
+    named = {"--camera": setup.camera, "--projector": setup.projector}
+    given = [f"{option} {value}" for option, value in named.items() if value]
+    given += [f"-D {name}={value}" for name, value in setup.parameters]
+    given += [f"--over {name}={':'.join(values)}" for name, values in scope.sweep]
+    return [*given, *(["--quick"] if scope.quick else [])]
+
+
+def _address(figure: Figure) -> str:
+    figure.savefig(buffer := BytesIO(), format="png", dpi=_DPI)
+    return data_uri(buffer.getvalue())

@@ -1,0 +1,225 @@
+"""Where points of a study are measured: setups in; light, factors and images out, kept while neighbours share them."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+from skimage import io
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.exposer import Exposer
+from mitsim.capture.light import Light
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import locate
+from mitsim.core.errors import MitsimError
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.solver import prepare
+from mitsim.study.compare import CONVENTIONS, accumulate, peak_time
+from mitsim.study.experiment import Setup
+from mitsim.study.ideal import IdealCamera
+from mitsim.study.metrics import Quality
+from mitsim.study.pictures import picture
+from mitsim.study.table import Value
+
+Kept = TypeVar("Kept")
+EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS
+IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
+"""The paper's model of a scene, with its own exact factors; and light that is rendered, with calibrated factors."""
+_PRINT = "reflectance.png"
+"""What a scene with a print of its own has beside it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One reconstruction and how good it is; ``flagged`` says that its run or the solver warned."""
+
+    image: FloatArray
+    quality: Quality
+    lam: float
+    shots: int
+    exposure_s: float
+    flagged: bool
+
+    def row(self) -> dict[str, Value]:
+        """As a table has it."""
+        return {
+            "psnr_db": self.quality.psnr_db,
+            "ssim": self.quality.ssim,
+            "lambda": self.lam,
+            "shots": self.shots,
+            "exposure_s": self.exposure_s,
+            "flagged": self.flagged,
+        }
+
+
+class Studio:
+    """Benches, their light and their factors, the last few of each; a temporary folder holds scenes with other prints.
+
+    To be used as a context, which removes that folder.
+    """
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="mitsim-study-")
+        self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._kept.clear()
+        self._folder.cleanup()
+
+    def bench(self, setup: Setup) -> Bench:
+        """The bench of a ``setup``.
+
+        MitsimError as :func:`mitsim.open_bench`, and for another print on a scene that has none.
+        """
+        return self._once("bench", 3, setup, lambda: self._opened(setup))
+
+    def scene(self, setup: Setup) -> Scene:
+        """Light and truth of a ``setup``."""
+        return self._once("scene", 1, setup, lambda: Scene(self.bench(setup), setup.accuracy))
+
+    def factors(self, setup: Setup, seed: int) -> Factors:
+        """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
+        blank = setup.printed(None)
+        return self._once("factors", 4, (blank, seed), lambda: self.bench(blank).calibrate(seed))
+
+    def image(self, setup: Setup, model: str, patterns: str, seed: int = 0, exposure: str = EQUAL_PEAK) -> Image:
+        """A scene as it comes out.
+
+        Parameters
+        ----------
+        setup
+            the scene.
+        model
+            one of :data:`MODELS`.
+        patterns
+            the family.
+        seed
+            of the frames' noise, and of the calibration's.
+        exposure
+            one of :data:`mitsim.study.compare.CONVENTIONS`.
+        """
+        scene = self.scene(setup)
+        if model == RENDERED:
+            return scene.rendered(self.factors(setup, seed), patterns, seed, exposure)
+        return scene.idealised(patterns, seed, exposure)
+
+    def _opened(self, setup: Setup) -> Bench:
+        path = setup.scene if setup.picture is None else self._printed(setup.scene, setup.picture)
+        parameters: dict[str, Any] = dict(setup.parameters)
+        return open_bench(path, setup.variant, setup.camera, setup.projector, setup.outside, **parameters)
+
+    def _printed(self, scene: str, name: str) -> Path:
+        """A copy of a ``scene`` with the picture ``name`` for its print."""
+        own = locate(scene, "scenes", "scene.xml")
+        if not (own.parent / _PRINT).is_file():
+            raise MitsimError(
+                f"scene {scene}: has no {_PRINT} beside it, so there is no print to replace; keep its own"
+            )
+        place = Path(self._folder.name) / own.parent.name / name
+        if not place.exists():
+            shutil.copytree(own.parent, place)
+            io.imsave(place / _PRINT, picture(name), check_contrast=False)
+        return place / own.name
+
+    def _once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
+        kept = self._kept.setdefault(kind, OrderedDict())
+        if key not in kept:
+            while len(kept) >= most:
+                kept.popitem(last=False)  # before the new one is made: two lights need not fit
+            kept[key] = make()
+        kept.move_to_end(key)
+        found: Kept = kept[key]
+        return found
+
+
+class Scene:
+    """A bench in its light: images of any family, at any exposure.
+
+    Parameters
+    ----------
+    bench, accuracy
+        what is lit, and how well its light is known.
+    """
+
+    def __init__(self, bench: Bench, accuracy: float) -> None:
+        self.bench, self.accuracy = bench, accuracy
+
+    @cached_property
+    def light(self) -> Light:
+        """By projector pixel."""
+        return self.bench.light(accuracy=self.accuracy)
+
+    @property
+    def truth(self) -> FloatArray:
+        """(n, n) apparent reflectance."""
+        return self.light.truth
+
+    def rendered(self, factors: Factors, patterns: str, seed: int, exposure: str) -> Image:
+        """As a user's own frames are exposed and reconstructed.
+
+        Parameters
+        ----------
+        factors
+            of the camera.
+        patterns, seed, exposure
+            as for :meth:`Studio.image`.
+        """
+        seconds = "auto" if exposure == EQUAL_PEAK else self._seconds(patterns, exposure)
+        shots = self.light.expose(patterns, seed=seed, exposure=seconds)
+        found = reconstruct(shots, factors)
+        quality = Quality.of(found.image, self.truth, self.light.apparent.error)
+        count, flagged = len(shots.manifest.patterns.captures), not found.ok
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, flagged)
+
+    def idealised(self, patterns: str, seed: int, exposure: str) -> Image:
+        """The paper's model, with its own factors and the same sensor.
+
+        Parameters
+        ----------
+        patterns, seed, exposure
+            as for :meth:`Studio.image`.
+        """
+        family, camera = self.bench.family(patterns, seed), self._ideal
+        expected = self._ideal_frames(patterns, seed)
+        seconds = peak_time(camera.bench, expected if exposure == EQUAL_PEAK else self._ideal_frames("uniform", seed))
+        seconds /= len(family.shots) if exposure == EQUAL_TOTAL else 1
+        model = prepare(*camera.calibrated(self._flux), family.left, family.right, centre=camera.centre)
+        # Its noise is not that of the rendered frames.
+        (sums,) = accumulate(Exposer(camera.bench.rig, seconds, seed + 1), family, expected, [model])
+        solution = model.solve(sums, "auto")
+        quality = Quality.of(solution.image, self.truth, self.light.apparent.error)
+        return Image(
+            solution.image, quality, solution.lam, len(family.shots), seconds, not solution.status.verdict.good
+        )
+
+    def _seconds(self, patterns: str, exposure: str) -> float:
+        """Exposure time [s] of each shot where uniform light fills the full well as far as it may."""
+        return self._uniform_s / (len(self.bench.family(patterns).shots) if exposure == EQUAL_TOTAL else 1)
+
+    @cached_property
+    def _uniform_s(self) -> float:
+        frames = self.light.merged().frames(self.bench.family("uniform").lighting, self.light.seed)
+        return peak_time(self.bench, frames)
+
+    @cached_property
+    def _ideal(self) -> IdealCamera:
+        return IdealCamera(self.bench, self.bench.geometry.mask)
+
+    @property
+    def _flux(self) -> float:
+        return float(self.light.apparent.board_flux.mean())
+
+    def _ideal_frames(self, patterns: str, seed: int) -> ExpectedFrames:
+        return self._ideal.frames(self.bench.family(patterns, seed), self.truth * self._flux)

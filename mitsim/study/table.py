@@ -1,0 +1,98 @@
+"""Rows of a study in; means with standard errors, and a tidy CSV file, out."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.output import whole_file
+
+Value = str | int | float | bool | None
+
+
+class Mean(NamedTuple):
+    """A mean, its standard error (NaN of a single value), and how many values it is of."""
+
+    value: float
+    error: float
+    of: int
+
+    def __str__(self) -> str:
+        return (
+            f"{self.value:.1f}" if math.isnan(self.error) else f"{self.value:.1f} \N{PLUS-MINUS SIGN} {self.error:.1f}"
+        )
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of named values, one for each thing measured; a value that a row does not have is None."""
+
+    rows: tuple[Mapping[str, Value], ...]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of all values, in the order of first use."""
+        return tuple(dict.fromkeys(name for row in self.rows for name in row))
+
+    def where(self, **values: Value) -> Table:
+        """Rows that have these ``values``."""
+        return Table(tuple(row for row in self.rows if all(row.get(name) == value for name, value in values.items())))
+
+    def distinct(self, name: str) -> list[Any]:
+        """Different values of the column ``name``, in the order of first use."""
+        return list(dict.fromkeys(row[name] for row in self.rows if row.get(name) is not None))
+
+    def mean(self, name: str, **values: Value) -> Mean:
+        """Mean of the column ``name`` over rows with these ``values``.
+
+        MitsimError where there is none.
+        """
+        numbers = self.numbers(name, **values)
+        if not numbers:
+            wanted = ", ".join(f"{key} = {value}" for key, value in values.items())
+            raise MitsimError(f"study: nothing was measured of {name} with {wanted}")
+        array = np.array(numbers)
+        spread = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
+        return Mean(float(array.mean()), spread, len(array))
+
+    def numbers(self, name: str, **values: Value) -> list[float]:
+        """Column ``name`` of the rows with these ``values``, where it has a number."""
+        chosen = self.where(**values).rows
+        return [float(value) for row in chosen if isinstance(value := row.get(name), (int, float))]
+
+    def means(self, name: str, by: str, **values: Value) -> dict[Any, Mean]:
+        """:meth:`mean` for each value of a column.
+
+        Parameters
+        ----------
+        name
+            of the column whose means are taken.
+        by
+            name of the column whose values tell rows apart.
+        **values
+            that rows have.
+        """
+        chosen = self.where(**values)
+        return {value: chosen.mean(name, **{by: value}) for value in chosen.distinct(by)}
+
+    def write(self, path: Path) -> None:
+        """To the CSV file ``path``, a header line first, all or nothing; MitsimError when it cannot be written."""
+        with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self.columns)
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+
+def joined(tables: Iterable[Sequence[Mapping[str, Value]]]) -> Table:
+    """One table of the rows of all ``tables``."""
+    return Table(tuple(row for rows in tables for row in rows))

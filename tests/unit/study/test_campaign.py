@@ -1,0 +1,176 @@
+"""Studies of many points: every point once, resumed, sharded and merged to the same bytes, a killed worker's loss."""
+
+import csv
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.study.campaign import CampaignResult, Where, merge, run_experiment
+from mitsim.study.experiment import Scope, Setup
+from mitsim.study.points import Shard
+
+TOY = "tests.unit.study.toy_study"
+ROOT = Path(__file__).parents[3]
+SCOPE = Scope(Setup("nowhere"), (None,))
+ALL = {f"{place}{number}" for place in "abcd" for number in (1, 2, 3)}
+Run = Callable[..., CampaignResult]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    """Runs the toy study into a folder of that name; ``run.begun()`` are the points that were begun since."""
+    monkeypatch.setenv("TOY_FOLDER", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    monkeypatch.syspath_prepend(str(ROOT))
+
+    def call(name: str = "out", scope: Scope = SCOPE, **where: object) -> CampaignResult:
+        return run_experiment(TOY, scope, tmp_path / name, where=Where(**{"jobs": 2, **where}))  # type: ignore[arg-type]
+
+    yield call
+    sys.modules.pop(TOY, None)
+
+
+def begun(folder: Path) -> list[str]:
+    """Points that were begun since the last call."""
+    file = folder / "begun"
+    names = file.read_text().split() if file.exists() else []
+    file.unlink(missing_ok=True)
+    return sorted(names)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All that tells of results: time and place apart."""
+    kept = {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix in (".csv", ".png", ".html")}
+    told = json.loads((folder / "toy.json").read_text())
+    return kept | {"rows": json.dumps([told["rows"], told["claims"], told["figures"]]).encode()}
+
+
+def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path) -> None:
+    result = run()
+    assert begun(tmp_path) == sorted(ALL) and result.points == 12 and not result.missing
+    assert [claim.verdict for claim in result.claims] == ["confirmed"]
+    folder = tmp_path / "out"
+    assert {file.name for file in folder.iterdir()} == {"toy.json", "toy.csv", "toy.html", "squares.png", "points"}
+    rows = list(csv.DictReader((folder / "toy.csv").open()))
+    assert [row["place"] + row["number"] for row in rows] == sorted(ALL), "in the order of the points"
+    told = json.loads((folder / "toy.json").read_text())
+    assert told["rows"][4]["square"] == float(rows[4]["square"]) == pytest.approx(4, abs=0.1)
+    assert told["status"] == "complete" and told["kind"] == "toy" and told["figures"] == ["squares.png"]
+    page = (folder / "toy.html").read_text()
+    assert "Two squared is four" in page and "data:image/png;base64," in page and "<script" not in page
+
+
+def test_what_is_there_is_not_measured_again(run: Run, tmp_path: Path) -> None:
+    """Quick points first, then all; results equal those of one go. (Planted: points named by their place.)"""
+    run("one go")
+    begun(tmp_path)
+    run("two", Scope(SCOPE.setup, (None,), quick=True))
+    assert begun(tmp_path) == sorted(point for point in ALL if point[1] != "3")
+    run("two")
+    assert begun(tmp_path) == sorted(point for point in ALL if point[1] == "3")
+    assert contents(tmp_path / "two") == contents(tmp_path / "one go")
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path, count: int) -> None:
+    run("whole")
+    begun(tmp_path)
+    parts = [tmp_path / f"part{number}" for number in range(count)]
+    for number, part in enumerate(parts, start=1):
+        found = run(part.name, shard=Shard(number, count))
+        assert found.missing == 12 - found.points and not found.claims and "merge" in found.lines()[1]
+    assert begun(tmp_path) == sorted(ALL), "each point in one part"
+    joined = merge(parts, tmp_path / "joined")
+    assert begun(tmp_path) == [] and not joined.missing
+    assert contents(tmp_path / "joined") == contents(tmp_path / "whole")
+    assert merge(parts[1:], tmp_path / "half").missing == len(list((parts[0] / "points").iterdir()))
+
+
+def test_a_killed_worker_loses_its_point_only(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "fatal b2").write_text("once")
+    assert not run().missing
+    assert begun(tmp_path) == sorted([*ALL, "b2"])
+    run("whole")
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_a_point_that_kills_again_ends_the_study_and_keeps_the_rest(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "fatal d1").write_text("always")
+    with pytest.raises(MitsimError, match=r"2 processes ended at one point \(place = d, number = 1\).*exit code -9"):
+        run(jobs=1)
+    assert begun(tmp_path) == sorted([*(point for point in ALL if point[0] != "d"), "d1", "d1"])
+    (tmp_path / "fatal d1").unlink()
+    assert not run().missing
+    assert begun(tmp_path) == ["d1", "d2", "d3"]
+
+
+def test_what_a_point_refuses_is_one_line_and_the_rest_is_kept(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "refuse c3").touch()
+    with pytest.raises(MitsimError, match="number 3: is not wanted; give another"):
+        run(jobs=1)
+    (tmp_path / "refuse c3").unlink()
+    begun(tmp_path)
+    assert not run().missing
+    assert begun(tmp_path) == ["c3", "d1", "d2", "d3"]
+
+
+def test_a_damaged_point_is_named(run: Run, tmp_path: Path) -> None:
+    run()
+    file = sorted((tmp_path / "out" / "points").iterdir())[0]
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(MitsimError, match=f"{file.name}: cannot be read as a point of a study .* remove it"):
+        run()
+
+
+def test_bad_folders_are_refused(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "letter.txt").touch()
+    with pytest.raises(MitsimError, match="holds files already"):
+        run("other")
+    with pytest.raises(MitsimError, match="holds no part of a study"):
+        merge([tmp_path / "other"], tmp_path / "joined")
+    run("new")
+    head = tmp_path / "new" / "toy.json"
+    told = json.loads(head.read_text())
+    head.write_text(json.dumps({**told, "versions": {**told["versions"], "mitsim": "0.1"}}))
+    with pytest.raises(MitsimError, match="measured by other versions"):
+        run("new")
+    run("fresh")
+    with pytest.raises(MitsimError, match="is of another study, scope or version"):
+        merge([tmp_path / "fresh", tmp_path / "new"], tmp_path / "joined")
+    assert not (tmp_path / "joined").exists()
+
+
+@pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "a/b", "1/2/3", "-1/2", "1/0"])
+def test_a_shard_is_part_i_of_n(text: str) -> None:
+    with pytest.raises(MitsimError, match="give I/N"):
+        Shard.of(text)
+    assert Shard.of("2/4") == Shard(2, 4)
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same(run: Run, tmp_path: Path) -> None:
+    """A real scheduler and two workers of Dask."""
+    distributed = pytest.importorskip("distributed")
+    run("here")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        run("there", scheduler=cluster.scheduler_address)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+    with pytest.raises(MitsimError, match="no Dask scheduler answers there"):
+        run("nobody", scheduler="tcp://127.0.0.1:9")
+
+
+def test_images_survive(run: Run, tmp_path: Path) -> None:
+    from mitsim.study.experiment import Point
+    from mitsim.study.points import FOLDER, Store
+
+    run()
+    point = Point.of(SCOPE.setup.changed(place="a"), number=2)
+    found = Store(tmp_path / "out" / FOLDER).load(point)
+    assert np.array_equal(found.images["a2"], np.full((2, 2), found.rows[0]["square"]))
