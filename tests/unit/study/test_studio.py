@@ -1,0 +1,79 @@
+"""A studio: the same images as a user gets step by step, the paper's test images on a scene's print, light kept."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.core.errors import MitsimError
+from mitsim.study.experiment import Setup
+from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
+from mitsim.study.studio import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED, Studio
+
+
+@pytest.fixture(scope="module")
+def setup(shared_scene: Callable[..., Path], variant: str) -> Setup:
+    print_ = np.random.default_rng(2).integers(20, 230, (48, 48))
+    return Setup(str(shared_scene("studio", reflectance=print_)), variant=variant, accuracy=1e-2)
+
+
+@pytest.fixture(scope="module")
+def studio() -> Iterator[Studio]:
+    with Studio() as kept:
+        yield kept
+
+
+@pytest.mark.parametrize("name", TEST_IMAGES)
+def test_test_images_are_prints(name: str) -> None:
+    values = picture(name)
+    assert values.shape == (SIDE, SIDE) and values.dtype == np.uint8
+    assert values.min() == round(0.05 * 255) and values.max() == round(0.90 * 255)
+    assert values.std() > 15, "a picture"
+
+
+def test_a_rendered_image_is_what_a_user_gets(studio: Studio, setup: Setup) -> None:
+    """Bit-equal to open_bench, light, expose, calibrate and reconstruct."""
+    found = studio.image(setup, RENDERED, "dots:4", 3)
+    bench = ms.open_bench(setup.scene, variant=setup.variant)
+    shots = bench.light(accuracy=1e-2).expose("dots:4", seed=3)
+    own = ms.reconstruct(shots, bench.calibrate(3))
+    assert np.array_equal(found.image, own.image) and found.lam == own.lam
+    assert found.shots == 16 and found.exposure_s == shots.exposure_s and found.flagged == (not own.ok)
+    assert found.quality.psnr_db == pytest.approx(ms.psnr(own.image, shots.truth))
+
+
+@pytest.mark.parametrize("model", [IDEALISED, RENDERED])
+def test_exposures_follow_their_conventions(studio: Studio, setup: Setup, model: str) -> None:
+    """One frame of uniform light is the measure: each of 16 dots as long, or a sixteenth. (Planted: frames counted as
+    patterns, which signed pairs are not.)"""
+    uniform = studio.image(setup, model, "uniform").exposure_s
+    assert studio.image(setup, model, "dots:4", exposure=EQUAL_FRAME).exposure_s == pytest.approx(uniform)
+    assert studio.image(setup, model, "dots:4", exposure=EQUAL_TOTAL).exposure_s == pytest.approx(uniform / 16)
+    assert studio.image(setup, model, "hadamard:2", exposure=EQUAL_TOTAL).exposure_s == pytest.approx(uniform / 8)
+    assert studio.image(setup, model, "dots:4", exposure=EQUAL_PEAK).exposure_s > 5 * uniform
+
+
+def test_light_and_factors_are_made_once(studio: Studio, setup: Setup) -> None:
+    assert studio.scene(setup).light is studio.scene(setup).light
+    assert studio.factors(setup, 3) is studio.factors(setup, 3)
+    assert studio.factors(setup, 3) is not studio.factors(setup, 4)
+
+
+def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[..., Path], variant: str) -> None:
+    """Its truth is the picture, averaged over pixels; the scene's own files are as they were."""
+    path = shared_scene("printed", reflectance=np.full((48, 48), 100))
+    setup = Setup(str(path), "coins", variant=variant, accuracy=1e-2)
+    with pytest.raises(MitsimError, match=r"has no reflectance\.png beside it, so there is no print to replace"):
+        studio.bench(setup)
+    path.write_text(path.read_text().replace("printed_reflectance.png", "reflectance.png"))
+    own = path.parent / "printed_reflectance.png"
+    before = own.rename(path.parent / "reflectance.png").read_bytes()
+    truth = studio.scene(setup).truth
+    # The sheet is 128 mm wide, of which the projector's 16 pixels light 120.
+    seen = picture("coins")[16:-16, 16:-16].reshape(16, 30, 16, 30).mean(axis=(1, 3)) / 255 / 0.99
+    assert np.abs(truth - seen).max() < 0.03 and truth.std() > 0.1
+    assert (path.parent / "reflectance.png").read_bytes() == before
+    blank = studio.scene(Setup(str(path), variant=variant, accuracy=1e-2)).truth
+    assert np.abs(blank - 100 / 255 / 0.99).max() < 0.01
