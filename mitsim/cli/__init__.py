@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import math
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,6 +39,7 @@ from mitsim.cli.options import (
     request_of,
     scope_of,
     spoken,
+    swept,
 )
 from mitsim.cli.screen import finish, print_plan
 from mitsim.core.environment import DEFAULT_VARIANT
@@ -355,12 +356,16 @@ def study(
     shard: Annotated[str, typer.Option(help="measure part I of N of the points", metavar="I/N")] = "1/1",
     jobs: Annotated[int | None, typer.Option(help="processes; one a processor if not given")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler that measures the points")] = None,
+    over: Annotated[
+        list[str] | None, typer.Option(help="what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT")
+    ] = None,
+    measure: Annotated[str, typer.Option(help="what sweep shows: psnr, ssim, misfit, ...")] = "psnr",
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance); what `accuracy`
-    costs in time, what `diffraction` at the mask does; `merge` joins the parts of --shard.
+    """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `sweep`
+    of any knob; what `accuracy` costs in time, what `diffraction` at the mask does; `merge` joins the parts of --shard.
     """
     from mitsim.study import find_study, is_experiment
 
@@ -373,9 +378,9 @@ def study(
             from mitsim.study.campaign import Where, run_experiment
             from mitsim.study.points import Shard
 
-            where = Where(Shard.of(shard), jobs, scheduler)
             scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
-            result = run_experiment(name, scope, output, job, where)
+            scope = swept(name, replace(scope, seeds=(seed,)), patterns, over or (), measure)
+            result = run_experiment(name, scope, output, job, Where(Shard.of(shard), jobs, scheduler))
         else:
             run_study = find_study(name)
             request = mitsim.Request.of(patterns=patterns, seed=seed)

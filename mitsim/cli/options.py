@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -47,6 +48,8 @@ MaxMemory = Annotated[
         "--max-memory", help="refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
     ),
 ]
+_MAIN_PATTERNS, _MAIN_MEASURE = "dots:7", "psnr"
+"""What `mitsim study` takes where nothing is said."""
 DAY = 86400.0
 """Work that would take longer is a mistake, unless it is asked for."""
 
@@ -99,6 +102,31 @@ def scope_of(
     setup = Setup(scene or "photograph", None, parameters, camera, projector, variant, outside)
     pictures: tuple[str | None, ...] = (None,) if scene else QUICK_IMAGES if quick else TEST_IMAGES
     return Scope(setup, pictures, quick=quick)
+
+
+def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: str) -> Scope:
+    """The ``scope`` of a study with what a sweep varies and shows; other studies take nothing of it.
+
+    Parameters
+    ----------
+    name, scope
+        of the study.
+    patterns, over, measure
+        as the options say.
+
+    Raises
+    ------
+    MitsimError
+        for options that the study does not have, or that cannot be read.
+    """
+    from mitsim.study.paper.sweep import measures_of, values_of
+
+    if name == "sweep":
+        varied = tuple(values_of(text) for text in over)
+        return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
+    if over or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
+        raise MitsimError(f"study {name}: has its own points and measures; --over, --measure, --patterns are for sweep")
+    return scope
 
 
 def bench_of(

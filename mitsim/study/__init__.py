@@ -17,8 +17,12 @@ if TYPE_CHECKING:
 STUDIES: Mapping[str, str] = MappingProxyType({"accuracy": "accuracy:measure", "diffraction": "diffraction:measure"})
 """Studies of one bench by name, as ``module:function``; the function takes (bench, request, job) and gives
 :class:`mitsim.study.runner.Findings`."""
-EXPERIMENTS = ("patterns", "distance")
+EXPERIMENTS = ("patterns", "distance", "sweep")
 """Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
+ALL = "all"
+"""What the study of all experiments of the paper is called."""
+PAPER = ("patterns", "distance")
+"""Those that `mitsim study all` puts on one page, in its order."""
 
 
 def find_study(name: str) -> Study:
@@ -40,7 +44,7 @@ def find_experiment(name: str) -> Experiment:
 
     MitsimError for another name, with those that there are, and for a module without an ``EXPERIMENT``.
     """
-    if not is_experiment(name):
+    if not is_experiment(name) or name == ALL:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
     module = name if "." in name else f"mitsim.study.paper.{name}"
     try:
@@ -54,4 +58,4 @@ def find_experiment(name: str) -> Experiment:
 
 def is_experiment(name: str) -> bool:
     """Whether ``name`` is that of a study of many points."""
-    return name in EXPERIMENTS or "." in name
+    return name in (*EXPERIMENTS, ALL) or "." in name

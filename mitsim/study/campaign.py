@@ -18,7 +18,7 @@ from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import whole_file
 from mitsim.core.parallel import workers
 from mitsim.core.versions import versions
-from mitsim.study import find_experiment
+from mitsim.study import ALL, PAPER, find_experiment
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Scope
 from mitsim.study.page import Section, build_page
 from mitsim.study.points import FOLDER, Shard, Store, batches
@@ -98,7 +98,7 @@ def run_experiment(
     Parameters
     ----------
     study
-        name of an experiment.
+        name of an experiment; ``all`` for those of the paper, each in a folder of its own, on one page.
     scope
         of which scene, and how much.
     output
@@ -113,6 +113,8 @@ def run_experiment(
     MitsimError
         for another name, an output that holds something else, and whatever a point refuses.
     """
+    if study == ALL:
+        return _all(scope, output, job, where)
     campaign, job, where = _Campaign(study, scope), job or Job(), where or Where()
     own, started = where.shard.part(campaign.points), time.perf_counter()
     with campaign.folder(output) as (folder, store):
@@ -142,6 +144,27 @@ def merge(parts: Sequence[Path | str], output: Path | str) -> CampaignResult:
         for part in parts:
             store.take(Store(Path(part) / FOLDER))
         return campaign.finished(folder, store, time.perf_counter() - started)
+
+
+def _all(scope: Scope, output: Path | str, job: Job | None, where: Where | None) -> CampaignResult:
+    """Every experiment of the paper, each in a folder of its own, and one page of all claims."""
+    with study_folder(output, ALL, (*PAPER, "*.html")) as folder:
+        write_json(folder / f"{ALL}.json", {"kind": ALL, "status": "incomplete"})
+        found = [run_experiment(name, scope, folder / name, job, where) for name in PAPER]
+        sections = [each.section for each in found if each.section]
+        if len(sections) == len(found):
+            build_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
+        result = CampaignResult(
+            ALL,
+            str(folder),
+            sum(each.points for each in found),
+            sum(each.missing for each in found),
+            sum(each.seconds for each in found),
+            claims=tuple(claim for each in found for claim in each.claims),
+            figures=tuple(f"{each.study}/{name}" for each in found for name in each.figures),
+        )
+        write_json(folder / f"{ALL}.json", {"kind": ALL, "status": "complete", **result.payload()})
+        return result
 
 
 @dataclass(frozen=True)
@@ -180,7 +203,7 @@ class _Campaign:
         there, experiment = sum(store.has(point) for point in self.points), self.experiment
         if missing := len(self.points) - there:
             return CampaignResult(self.study, str(folder), there, missing, seconds)
-        results = store.results(self.points)
+        results = replace(store.results(self.points), measures=self.scope.measures)
         claims, figures = tuple(experiment.claims(results)), experiment.figures(results)
         results.table.write(folder / f"{experiment.name}.csv")
         for file, figure in figures.items():

@@ -117,8 +117,10 @@ class Scope:
         of the noise that means are taken over.
     quick
         a few points, for a first look.
-    sweep
-        what `mitsim study sweep` varies and measures; empty for other studies.
+    sweep, measures
+        what `mitsim study sweep` varies, values by name, and what it shows; empty for other studies.
+    patterns
+        of a sweep that does not vary them.
     """
 
     setup: Setup
@@ -126,6 +128,8 @@ class Scope:
     seeds: tuple[int, ...] = (0,)
     quick: bool = False
     sweep: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    measures: tuple[str, ...] = ()
+    patterns: str = "dots:7"
 
     def chosen(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
         """``few`` where the study is quick, otherwise ``everything``."""
@@ -134,10 +138,11 @@ class Scope:
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All findings of a study: a table of all points' rows, and their pictures by (name, picture shown)."""
+    """All findings of a study: a table of all points' rows, pictures by name, and the scope's measures."""
 
     table: Table
     images: Mapping[str, FloatArray]
+    measures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

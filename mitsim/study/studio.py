@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from skimage import io
 
 from mitsim.capture.bench import Bench, open_bench
@@ -40,7 +41,19 @@ _PRINT = "reflectance.png"
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One reconstruction and how good it is; ``flagged`` says that its run or the solver warned."""
+    """One reconstruction and how good it is.
+
+    Attributes
+    ----------
+    image, quality, lam
+        (n, n) reflectance, against the truth, and lambda.
+    shots, exposure_s
+        frames, and seconds of each.
+    flagged
+        whether its run or the solver warned.
+    trust
+        where it is known: the unexplained part of the measurements, their chi-square, the image's standard uncertainty.
+    """
 
     image: FloatArray
     quality: Quality
@@ -48,6 +61,7 @@ class Image:
     shots: int
     exposure_s: float
     flagged: bool
+    trust: Mapping[str, float | None] = field(default_factory=dict)
 
     def row(self) -> dict[str, Value]:
         """As a table has it."""
@@ -58,6 +72,7 @@ class Image:
             "shots": self.shots,
             "exposure_s": self.exposure_s,
             "flagged": self.flagged,
+            **self.trust,
         }
 
 
@@ -181,7 +196,13 @@ class Scene:
         found = reconstruct(shots, factors)
         quality = Quality.of(found.image, self.truth, self.light.apparent.error)
         count, flagged = len(shots.manifest.patterns.captures), not found.ok
-        return Image(found.image, quality, found.lam, count, shots.exposure_s, flagged)
+        misfit, told = found.misfit, found.uncertainty
+        trust = {
+            "misfit": misfit.unexplained if misfit else None,
+            "chi_square": misfit.chi_square if misfit else None,
+            "uncertainty": None if told is None else float(np.sqrt(np.square(told).mean())),
+        }
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, flagged, trust)
 
     def idealised(self, patterns: str, seed: int, exposure: str) -> Image:
         """The paper's model, with its own factors and the same sensor.

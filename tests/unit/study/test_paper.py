@@ -1,0 +1,104 @@
+"""Experiments of the paper: their points, what a sweep varies, and verdicts on invented results."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.study import EXPERIMENTS, PAPER, find_experiment
+from mitsim.study.campaign import Where, run_experiment
+from mitsim.study.experiment import Results, Scope, Setup
+from mitsim.study.paper.measure import confirmed, stated
+from mitsim.study.paper.sweep import measures_of, values_of
+from mitsim.study.points import batches
+from mitsim.study.table import Table
+
+WHOLE = Scope(Setup(), ("coins", "page"))
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_points_differ_and_share_light(name: str) -> None:
+    experiment = find_experiment(name)
+    points = experiment.points(WHOLE)
+    assert len({point.key for point in points}) == len(points)
+    groups = batches(points)
+    assert len(groups) == len({point.setup for point in points}), "points of one setup follow each other"
+    few = experiment.points(Scope(Setup(), ("coins", "page"), quick=True))
+    assert {point.key for point in few} < {point.key for point in points}, "a quick study is a start of the whole"
+    assert experiment.name == name and experiment.question.endswith("?") and name in EXPERIMENTS
+
+
+def results(**means: float) -> Results:
+    """Two prints a decibel apart of each ``model__exposure``."""
+    rows = [
+        {"model": name.split("__")[0], "exposure": name.split("__")[1], "psnr_db": mean + side, "patterns": "dots:7"}
+        for name, mean in means.items()
+        for side in (-0.5, 0.5)
+    ]
+    return Results(Table(tuple(rows)), {})
+
+
+def test_a_claim_holds_where_both_models_are_near_the_papers_figure() -> None:
+    """Two decibels beside a band count as it. (Planted: the rendered model alone.)"""
+    found = results(idealised__peak=36.9, rendered__peak=40.0, idealised__frame=32.1, rendered__frame=37.4)
+    claim = stated(found, "49 dots give 34 to 35.5 dB", (34, 35.5), patterns="dots:7")
+    assert claim.verdict == "confirmed only at frame" and claim.paper == "34 to 35.5 dB"
+    assert claim.idealised == "peak: 36.9 ± 0.5 dB; frame: 32.1 ± 0.5 dB"
+    near = results(idealised__peak=36.9, rendered__peak=33.0)
+    assert stated(near, "", (34, 35.5), patterns="dots:7").verdict == "confirmed"
+    far = results(idealised__peak=31.9, rendered__peak=33.0)
+    assert stated(far, "", (34, 35.5), patterns="dots:7").verdict == "not confirmed"
+
+
+@pytest.mark.parametrize(
+    ("holds", "verdict"),
+    [([], "not confirmed"), (["a"], "confirmed only at a"), (["a", "b"], "confirmed")],
+)
+def test_verdicts(holds: list[str], verdict: str) -> None:
+    assert confirmed(holds, ["a", "b"]) == verdict
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("roughness=0.1:0.5:5", ("0.1", "0.2", "0.3", "0.4", "0.5")),
+        ("sheet_z=390:410:2", ("390", "410")),
+        ("mask=separable,flatcam", ("separable", "flatcam")),
+        ("patterns=dots:4,dots:7", ("dots:4", "dots:7")),
+    ],
+)
+def test_what_a_sweep_varies(text: str, values: tuple[str, ...]) -> None:
+    assert values_of(text) == (text.split("=")[0], values)
+
+
+@pytest.mark.parametrize("text", ["", "roughness", "roughness=", "=1:2:3", "z=1:2:x", "z=1:2:1", "z=1:2:99999"])
+def test_a_sweep_that_cannot_be_read_is_one_line(text: str) -> None:
+    with pytest.raises(MitsimError, match=f"--over {re.escape(repr(text))}: "):
+        values_of(text)
+
+
+def test_measures_have_names() -> None:
+    assert measures_of("psnr,misfit") == ("psnr", "misfit")
+    with pytest.raises(MitsimError, match="--measure 'speed': use psnr, ssim"):
+        measures_of("psnr,speed")
+
+
+def test_a_sweep_of_a_small_scene(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
+    """A sheet at three depths under two families: six rows; misfit is least where the calibration was made. (Planted:
+    the parameter left at the scene's own.)"""
+    path = small_scene(sheet_z="$sheet_z", reflectance=np.random.default_rng(1).integers(20, 230, (48, 48)))
+    path.write_text(path.read_text().replace("<default", '<default name="sheet_z" value="400"/> <default', 1))
+    setup = Setup(str(path), variant=variant, accuracy=1e-2)
+    swept = (("patterns", ("dots:2", "dots:4")), ("sheet_z", ("380", "400", "420")))
+    scope = Scope(setup, (None,), sweep=swept, measures=("psnr", "misfit"))
+    found = run_experiment("sweep", scope, tmp_path / "out", where=Where(jobs=1))
+    assert found.figures == ("psnr.png", "misfit.png") and found.points == 6
+    for patterns in ("dots:2", "dots:4"):
+        rows = {row["sheet_z"]: row for row in found.rows if row["patterns"] == patterns}
+        assert min(rows, key=lambda depth: rows[depth]["misfit"]) == "400"
+        assert max(rows, key=lambda depth: rows[depth]["psnr_db"]) == "400"
+    with pytest.raises(MitsimError, match="nothing is varied"):
+        run_experiment("sweep", Scope(setup, (None,)), tmp_path / "none")
