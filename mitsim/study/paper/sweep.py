@@ -77,7 +77,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         setting = dict(zip(names, chosen, strict=True))
         for picture in scope.pictures:
             setup = _setup(scope.setup, setting).printed(picture)
-            fixed = {"patterns": scope.patterns, "exposure": EQUAL_PEAK, "seed": scope.seeds[0]}
+            fixed: dict[str, Value] = {"patterns": scope.patterns, "exposure": EQUAL_PEAK, "seed": scope.seeds[0]}
             knobs: dict[str, Value] = {name: setting.get(name, other) for name, other in fixed.items()}
             if knobs["exposure"] not in CONVENTIONS:
                 raise MitsimError(f"--over exposure={knobs['exposure']}: use {', '.join(CONVENTIONS)}")
