@@ -48,6 +48,7 @@ docs/notebooks/index
 docs/architecture
 docs/physics
 docs/formats
+docs/studies
 docs/extending
 docs/robustness
 ```
