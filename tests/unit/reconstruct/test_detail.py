@@ -181,13 +181,11 @@ def test_light_of_one_side_weighs_the_dipoles_of_the_other() -> None:
     prepared = prepare(*factors, P, P)
     sigma = np.outer(prepared.left.singular, prepared.right.singular)
     gain = sigma / (sigma**2 + 1e-4 * sigma.max() ** 2)
-    sides = zip((prepared.left, prepared.right), factors, strict=True)
-    moved = tuple(moved_responses(side, factor, P) for side, factor in sides)
-    slope, zero, struck, told = slope_of(factors[1]), np.zeros((N, N)), 0.0, 0.0
+    model, zero, struck, told = Model(prepared, factors, (P, P)), np.zeros((N, N)), 0.0, 0.0
     for _ in range(200):
         sums = prepared.accumulator()
-        sums.add(factors[0] @ rng.standard_normal((N, N)) @ slope.T, 0, 0)
+        sums.add(factors[0] @ rng.standard_normal((N, N)) @ model.slopes[1].T, 0, 0)
         problem = prepared.problem(sums)
         struck += np.square(prepared.image(gain * problem.projected)).mean()
-        told += disagreement(prepared, gain, problem.halves, moved, (zero, zero)).mean()
+        told += disagreement(model, gain, problem.halves, (zero, zero)).mean()
     assert told == pytest.approx(struck, rel=0.1)
