@@ -14,20 +14,23 @@ from typing import Any, TypeVar
 import numpy as np
 from skimage import io
 
+from mitsim.capture.ambient import taken_off
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import Light
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.solver import prepare
+from mitsim.rig.patterns import PatternFamily
 from mitsim.study.compare import CONVENTIONS, accumulate, peak_time
 from mitsim.study.experiment import Setup
 from mitsim.study.ideal import IdealCamera
-from mitsim.study.metrics import Quality
+from mitsim.study.metrics import Quality, psnr
 from mitsim.study.pictures import picture
 from mitsim.study.table import Value
 
@@ -35,6 +38,8 @@ Kept = TypeVar("Kept")
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS
 IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
 """The paper's model of a scene, with its own exact factors; and light that is rendered, with calibrated factors."""
+LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
+"""Of the largest sigma^2: where none can be chosen by the data, the best of these, a quarter of a decade apart."""
 _PRINT = "reflectance.png"
 """What a scene with a print of its own has beside it."""
 
@@ -108,6 +113,23 @@ class Studio:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
         blank = setup.printed(None)
         return self._once("factors", 4, (blank, seed), lambda: self.bench(blank).calibrate(seed))
+
+    def binned(self, setup: Setup, model: str, patterns: str, binning: int, seed: int = 0) -> Image:
+        """The same at equal peak, of frames whose pixels are averaged ``binning`` x ``binning``, at the best of
+        :data:`LAMBDAS`: with fewer data than unknowns, noise cannot be told.
+
+        Parameters
+        ----------
+        setup, model, patterns, seed
+            as for :meth:`image`.
+        binning
+            pixels a side.
+        """
+        scene = self.scene(setup)
+        if model == RENDERED:
+            factors = self.factors(setup, seed)
+            return scene.binned_rendered(factors, patterns, binning, seed)
+        return scene.binned_idealised(patterns, binning, seed)
 
     def image(self, setup: Setup, model: str, patterns: str, seed: int = 0, exposure: str = EQUAL_PEAK) -> Image:
         """A scene as it comes out.
@@ -224,6 +246,62 @@ class Scene:
         return Image(
             solution.image, quality, solution.lam, len(family.shots), seconds, not solution.status.verdict.good
         )
+
+    def binned_rendered(self, factors: Factors, patterns: str, binning: int, seed: int) -> Image:
+        """As :meth:`rendered` at equal peak, of binned frames.
+
+        Parameters
+        ----------
+        factors, patterns, seed
+            as there.
+        binning
+            pixels a side that are averaged.
+        """
+        family, light = self.bench.family(patterns, seed), self.light
+        expected = light.merged().frames(family.lighting, light.seed)
+        exposer = Exposer(self.bench.rig, peak_time(self.bench, expected), seed, light.simulation.physics.speckle)
+        sides = factors.left, factors.right
+        return self._best(family, expected, exposer, sides, factors.manifest.centre, binning)
+
+    def binned_idealised(self, patterns: str, binning: int, seed: int) -> Image:
+        """As :meth:`idealised` at equal peak, of binned frames.
+
+        Parameters
+        ----------
+        patterns, seed
+            as there.
+        binning
+            pixels a side that are averaged.
+        """
+        camera, expected = self._ideal, self._ideal_frames(patterns, seed)
+        exposer = Exposer(camera.bench.rig, peak_time(camera.bench, expected), seed + 1)
+        family = self.bench.family(patterns, seed)
+        return self._best(family, expected, exposer, camera.calibrated(self._flux), camera.centre, binning)
+
+    def _best(
+        self,
+        family: PatternFamily,
+        expected: ExpectedFrames,
+        exposer: Exposer,
+        sides: tuple[FloatArray, FloatArray],
+        centre: bool,
+        binning: int,
+    ) -> Image:
+        """The image of binned frames at its best lambda."""
+        left, right = (side.reshape(-1, binning, side.shape[1]).mean(axis=1) for side in sides)
+        model = prepare(left, right, family.left, family.right, centre=centre)
+        sums = model.accumulator()
+        with single_threaded_blas():
+            ambient = taken_off(exposer, family, expected)
+            for measurement, row, column in exposer.measurements(family, expected):
+                frame = measurement - ambient
+                size = len(frame) // binning
+                sums.add(frame.reshape(size, binning, size, binning).mean(axis=(1, 3)), row, column)
+        scale = model.problem(sums).scale
+        solved = [model.solve(sums, scale * relative) for relative in LAMBDAS]
+        best = max(solved, key=lambda one: psnr(one.image, self.truth))
+        quality = Quality.of(best.image, self.truth, self.light.apparent.error)
+        return Image(best.image, quality, best.lam, len(family.shots), exposer.exposure_s, False)
 
     def _seconds(self, patterns: str, exposure: str) -> float:
         """Exposure time [s] of each shot where uniform light fills the full well as far as it may."""
