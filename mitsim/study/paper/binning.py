@@ -36,7 +36,9 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, binning = point.setup, int(point["binning"])
-    found = studio.binned(setup, point["model"], point["patterns"], binning, int(point["seed"]))
+    shoot = studio.shoot(setup, point["model"], point["patterns"], int(point["seed"]))
+    # With fewer data than unknowns noise cannot be told, nor lambda chosen by it.
+    found = shoot.image(shoot.peak_s, "best", binning)
     pixels = studio.bench(setup).geometry.pixels // binning
     row = {"picture": setup.picture, **dict(setup.parameters), **dict(point.values), "pixels": pixels, **found.row()}
     shown = setup.picture in (*QUICK_IMAGES, None) and point["patterns"] != "dots:5"
