@@ -9,25 +9,29 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from skimage import io
 
+from mitsim.capture.ambient import taken_off
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import Light
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.reconstruct.solver import prepare
-from mitsim.study.compare import CONVENTIONS, accumulate, peak_time
+from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.rig.patterns import PatternFamily
+from mitsim.study.compare import CONVENTIONS, peak_time
 from mitsim.study.experiment import Setup
 from mitsim.study.ideal import IdealCamera
-from mitsim.study.metrics import Quality
+from mitsim.study.metrics import Quality, psnr
 from mitsim.study.pictures import picture
 from mitsim.study.table import Value
 
@@ -35,6 +39,8 @@ Kept = TypeVar("Kept")
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS
 IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
 """The paper's model of a scene, with its own exact factors; and light that is rendered, with calibrated factors."""
+LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
+"""Of the largest sigma^2: where none can be chosen by the data, the best of these, a quarter of a decade apart."""
 _PRINT = "reflectance.png"
 """What a scene with a print of its own has beside it."""
 
@@ -108,6 +114,22 @@ class Studio:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
         blank = setup.printed(None)
         return self._once("factors", 4, (blank, seed), lambda: self.bench(blank).calibrate(seed))
+
+    def shoot(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Shoot:
+        """Frames of a family before the sensor, with all that makes images of them.
+
+        Parameters
+        ----------
+        setup, model, seed
+            as for :meth:`image`.
+        patterns
+            the family, or its name.
+        """
+        scene = self.scene(setup)
+        family = scene.bench.family(patterns, seed) if isinstance(patterns, str) else patterns
+        if model == RENDERED:
+            return scene.rendered_shoot(self.factors(setup, seed), family, seed)
+        return scene.idealised_shoot(family, seed)
 
     def image(self, setup: Setup, model: str, patterns: str, seed: int = 0, exposure: str = EQUAL_PEAK) -> Image:
         """A scene as it comes out.
@@ -212,18 +234,37 @@ class Scene:
         patterns, seed, exposure
             as for :meth:`Studio.image`.
         """
-        family, camera = self.bench.family(patterns, seed), self._ideal
-        expected = self._ideal_frames(patterns, seed)
-        seconds = peak_time(camera.bench, expected if exposure == EQUAL_PEAK else self._ideal_frames("uniform", seed))
-        seconds /= len(family.shots) if exposure == EQUAL_TOTAL else 1
-        model = prepare(*camera.calibrated(self._flux), family.left, family.right, centre=camera.centre)
+        shoot = self.idealised_shoot(self.bench.family(patterns, seed), seed)
+        uniform = shoot if exposure == EQUAL_PEAK else self.idealised_shoot(self.bench.family("uniform"), seed)
+        return shoot.image(uniform.peak_s / (len(shoot.family.shots) if exposure == EQUAL_TOTAL else 1))
+
+    def rendered_shoot(self, factors: Factors, family: PatternFamily, seed: int) -> Shoot:
+        """As :meth:`Studio.shoot`, of rendered light.
+
+        Parameters
+        ----------
+        factors
+            of the camera.
+        family, seed
+            the patterns, and seed of the noise.
+        """
+        light = self.light
+        expected = light.merged().frames(family.lighting, light.seed)
+        sides, centre = (factors.left, factors.right), factors.manifest.centre
+        return Shoot(self, family, expected, sides, centre, seed, light.simulation.physics.speckle)
+
+    def idealised_shoot(self, family: PatternFamily, seed: int) -> Shoot:
+        """As :meth:`Studio.shoot`, of the paper's model.
+
+        Parameters
+        ----------
+        family, seed
+            the patterns, and seed of the noise.
+        """
+        camera, flux = self._ideal, float(self.light.apparent.board_flux.mean())
+        expected = camera.frames(family, self.truth * flux)
         # Its noise is not that of the rendered frames.
-        (sums,) = accumulate(Exposer(camera.bench.rig, seconds, seed + 1), family, expected, [model])
-        solution = model.solve(sums, "auto")
-        quality = Quality.of(solution.image, self.truth, self.light.apparent.error)
-        return Image(
-            solution.image, quality, solution.lam, len(family.shots), seconds, not solution.status.verdict.good
-        )
+        return Shoot(self, family, expected, camera.calibrated(flux), camera.centre, seed + 1)
 
     def _seconds(self, patterns: str, exposure: str) -> float:
         """Exposure time [s] of each shot where uniform light fills the full well as far as it may."""
@@ -238,9 +279,75 @@ class Scene:
     def _ideal(self) -> IdealCamera:
         return IdealCamera(self.bench, self.bench.geometry.mask)
 
-    @property
-    def _flux(self) -> float:
-        return float(self.light.apparent.board_flux.mean())
 
-    def _ideal_frames(self, patterns: str, seed: int) -> ExpectedFrames:
-        return self._ideal.frames(self.bench.family(patterns, seed), self.truth * self._flux)
+@dataclass(frozen=True, eq=False)
+class Shoot:
+    """Frames of a ``scene`` under a ``family`` as they are ``expected`` without noise, and what makes images of them.
+
+    Attributes
+    ----------
+    scene, family, expected
+        what is seen.
+    sides, centre
+        left and right factor that are assumed, and whether means are taken out of frames.
+    seed, speckle
+        of the noise, and contrast of laser speckle.
+    """
+
+    scene: Scene
+    family: PatternFamily
+    expected: ExpectedFrames
+    sides: tuple[FloatArray, FloatArray]
+    centre: bool
+    seed: int
+    speckle: float = 0.0
+
+    @cached_property
+    def peak_s(self) -> float:
+        """Exposure time [s] at equal peak."""
+        return peak_time(self.scene.bench, self.expected)
+
+    def model(self, binning: int = 1) -> Prepared:
+        """The factorised model of frames whose pixels are averaged ``binning`` x ``binning``."""
+        left, right = (side.reshape(-1, binning, side.shape[1]).mean(axis=1) for side in self.sides)
+        return prepare(left, right, self.family.left, self.family.right, centre=self.centre)
+
+    def noise(self, seconds: float) -> float:
+        """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
+        exposer, sensor = Exposer(self.scene.bench.rig, seconds, self.seed), self.scene.bench.sensor
+        variances = [exposer.electrons(frame).mean() + sensor.read_noise_e**2 for frame in self.expected]
+        return float(np.sqrt(np.mean(variances))) / seconds
+
+    def image(self, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1) -> Image:
+        """What one exposure of the frames comes to.
+
+        Parameters
+        ----------
+        seconds
+            exposure time of each frame.
+        lam
+            lambda; best: that of :data:`LAMBDAS` which is nearest to the truth.
+        binning
+            pixels a side that are averaged.
+        """
+        model = self.model(binning)
+        sums = self._added(model, seconds, binning)
+        scale = model.problem(sums).scale
+        tried = [scale * relative for relative in LAMBDAS] if lam == "best" else [lam]
+        truth, error = self.scene.truth, self.scene.light.apparent.error
+        solved = [model.solve(sums, each) for each in tried]
+        best = max(solved, key=lambda one: psnr(one.image, truth))
+        good = best.status.verdict.good
+        quality = Quality.of(best.image, truth, error)
+        return Image(best.image, quality, best.lam, len(self.family.shots), seconds, not good)
+
+    def _added(self, model: Prepared, seconds: float, binning: int) -> Accumulator:
+        exposer = Exposer(self.scene.bench.rig, seconds, self.seed, self.speckle)
+        sums, family, expected = model.accumulator(), self.family, self.expected
+        with single_threaded_blas():
+            ambient = taken_off(exposer, family, expected)
+            for measurement, row, column in exposer.measurements(family, expected):
+                frame = measurement - ambient
+                size = len(frame) // binning
+                sums.add(frame.reshape(size, binning, size, binning).mean(axis=(1, 3)), row, column)
+        return sums

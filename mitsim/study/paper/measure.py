@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from mitsim.core.arrays import FloatArray
 from mitsim.reconstruct.solver import prepare
@@ -11,6 +11,8 @@ from mitsim.study.pictures import QUICK_IMAGES
 from mitsim.study.studio import IDEALISED, MODELS, RENDERED, Studio
 from mitsim.study.table import Mean, Table, Value
 
+_NAMED = ("picture", "model", "patterns", "exposure", "seed", "mask_distance", "binning")
+"""Columns that tell images apart."""
 TOLERANCE_DB = 2.0
 """How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""
 _SHOWN_PRINTS = QUICK_IMAGES
@@ -38,7 +40,7 @@ def imaged(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:
     row = {"picture": setup.picture, **dict(setup.parameters), **values, "patterns_count": count, **found.row()}
     images: dict[str, FloatArray] = {}
     if patterns in shown and (setup.picture in _SHOWN_PRINTS or setup.picture is None):
-        images[_name(setup.picture, values)] = thumbnail(found.image)
+        images[image_name(row)] = thumbnail(found.image)
     if patterns in shown and model == RENDERED:
         factors = studio.factors(setup, seed)
         prepared = prepare(factors.left, factors.right, family.left, family.right, centre=factors.manifest.centre)
@@ -125,13 +127,11 @@ def _of(**values: Value) -> dict[str, Value]:
 def _cell(results: Results, rows: Table) -> tuple[FloatArray, str] | None:
     for row in rows.rows:
         for name, image in results.images.items():
-            if name == _name(row.get("picture"), row):
+            if name == image_name(row):
                 return image, f"{row['psnr_db']:.1f} dB"
     return None
 
 
-def _name(picture: Value, values: object) -> str:
-    """Of a kept image."""
-    assert hasattr(values, "get")
-    parts = ("model", "patterns", "exposure", "seed", "mask_distance", "binning")
-    return " ".join(str(each) for each in (picture, *(values.get(part) for part in parts)) if each is not None)
+def image_name(row: Mapping[str, Value]) -> str:
+    """Name of the image that a ``row`` is of."""
+    return " ".join(str(row[part]) for part in _NAMED if row.get(part) is not None)

@@ -77,3 +77,20 @@ def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[
     assert (path.parent / "reflectance.png").read_bytes() == before
     blank = studio.scene(Setup(str(path), variant=variant, accuracy=1e-2)).truth
     assert np.abs(blank - 100 / 255 / 0.99).max() < 0.01
+
+
+@pytest.mark.parametrize("model", [IDEALISED, RENDERED])
+def test_binned_frames_are_those_of_larger_pixels(studio: Studio, setup: Setup, model: str) -> None:
+    """Without binning the best lambda is no worse than the automatic one. Of 16 pixels a side, as many as unknowns,
+    16 dots lose nothing, and uniform light much. (Planted: rows of one pixel in four instead of their mean.)"""
+    best = {
+        (patterns, binning): shoot.image(shoot.peak_s, "best", binning).quality.psnr_db
+        for patterns in ("uniform", "dots:4")
+        for shoot in [studio.shoot(setup, model, patterns)]
+        for binning in (1, 4)
+    }
+    for patterns in ("uniform", "dots:4"):
+        automatic = studio.image(setup, model, patterns).quality.psnr_db
+        assert automatic - 0.05 < best[patterns, 1] < automatic + 6
+    assert best["dots:4", 4] > best["dots:4", 1] - 1
+    assert best["uniform", 4] < best["uniform", 1] - 1

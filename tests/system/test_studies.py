@@ -1,0 +1,68 @@
+"""Studies of many points on the command line: keys that other programs read, parts that merge, refusals in one line."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+TOY = "tests.unit.study.toy_study"
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def study(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """``mitsim study`` of the toy study, or of another name."""
+    monkeypatch.setenv("TOY_FOLDER", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    monkeypatch.syspath_prepend(str(ROOT))
+    return lambda *options, name=TOY: call("study", name, *options, "--quiet")
+
+
+def test_keys_of_a_study(study: Callable[..., Any], tmp_path: Path) -> None:
+    found = study("-o", tmp_path / "out", "--quick", "--json")
+    assert found.code == 0, found.err
+    payload = found.payload
+    assert {"study", "points", "missing", "seconds", "rows", "claims", "figures", "output"} == payload.keys()
+    assert payload["points"] == len(payload["rows"]) == 8 and payload["missing"] == 0
+    for claim in payload["claims"]:
+        assert {"claim", "paper", "idealised", "rendered", "verdict"} == claim.keys()
+    for name in payload["figures"]:
+        assert (tmp_path / "out" / name).is_file()
+
+
+def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Path) -> None:
+    for number in (1, 2):
+        part = study("-o", tmp_path / f"p{number}", "--quick", "--shard", f"{number}/2", "--jobs", 1)
+        assert part.code == 0 and "4 points measured, 4 of other parts are missing" in part.out
+    joined = study(tmp_path / "p1", tmp_path / "p2", "-o", tmp_path / "whole", name="merge")
+    assert joined.code == 0 and "confirmed: Two squared is four" in joined.out, joined.err
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("weather", (), "there is no such study; use accuracy, diffraction, patterns"),
+        ("no_such.module", (), "cannot be used"),
+        ("patterns", ("--shard", "3/2"), "--shard '3/2': give I/N"),
+        ("patterns", ("--jobs", 0), "--jobs 0: give 1 or more"),
+        ("patterns", ("--over", "z=1:2:3"), "has its own points and measures"),
+        ("distance", ("--patterns", "dots:3"), "has its own points and measures"),
+        ("sweep", (), "nothing is varied; give --over"),
+        ("sweep", ("--over", "z=1:2"), "has no <default name='z'>"),
+        ("sweep", ("--over", "z=a:b:c"), "is not FIRST:LAST:COUNT"),
+        ("sweep", ("--over", "exposure=long"), "use equal peak, equal frame, equal total"),
+        ("sweep", ("--over", "seed=x"), "give whole numbers"),
+        ("sweep", ("--over", "albedo=1:2:3", "--measure", "speed"), "--measure 'speed': use psnr"),
+        ("patterns", ("a.xml", "b.xml"), "give one scene"),
+        ("patterns", ("no_such_scene",), "no_such_scene"),
+        ("merge", (), "give the folders of the parts"),
+    ],
+)
+def test_refusals(study: Callable[..., Any], tmp_path: Path, name: str, options: tuple[Any, ...], words: str) -> None:
+    """Exit 2, one line, nothing left behind."""
+    found = study(*options, "-o", tmp_path / "out", name=name)
+    assert found.code == 2 and words in found.err, found.err
+    assert len(found.err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").glob("*.csv"))
