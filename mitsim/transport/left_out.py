@@ -59,12 +59,12 @@ class LeftOut:
         """Nothing."""
         return cls(*np.zeros((4, 0)))
 
-    def unseen(self, fewest: float) -> tuple[float, int | None]:
+    def unseen(self, fewest: float, of_lens: float) -> tuple[float, int | None]:
         """Irradiance that nothing tells of, and over which shape most of it comes.
 
-        ``fewest``: hits of a sample that tell of light.
+        ``fewest``: hits of a sample that tell of a lobe; ``of_lens``: of the projector's own lens, that tell of light.
         """
-        light = np.where(self.lens_hits < fewest, self.mirrors, 0) + np.where(self.hits < fewest, self.lobes, 0)
+        light = np.where(self.lens_hits < of_lens, self.mirrors, 0) + np.where(self.hits < fewest, self.lobes, 0)
         return float(light.sum()), int(np.argmax(light)) if light.any() else None
 
 

@@ -58,6 +58,9 @@ _CAUSTIC_PATHS = 2**20
 """Paths that look for light that is left out: a thousandth of the light that all curved glass sends is met 30 times."""
 _FEWEST_HITS = 30.0
 """Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""
+_FEWEST_MET = 3.0
+"""Below so many meetings of the projector's own lens the pilot may see none, one time in twenty: where it sees one, the
+run samples until it knows the light; else neither may."""
 _FAINT = 1e-3
 """Part of the mean light on the sensor below which its centre sees nothing but rounding."""
 _ALIGNED = 1e-6
@@ -195,7 +198,8 @@ class Look:
         if self.occluded:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
-        left_out, mirror = self._left_out.unseen(_FEWEST_HITS / (self.samples["effects"].followed * LOOKS))
+        samples = self.samples["effects"].followed * LOOKS
+        left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
         return Evidence(

@@ -38,7 +38,7 @@ def cells(bench: Bench) -> CellGrid:
 
 def left_out(bench: Bench, fewest: float = np.inf) -> tuple[float, float]:
     """Mean over seeds of 2^21 paths, and its standard error; ``fewest`` hits of a sample tell of a lobe."""
-    light = [left_out_of(bench, seed).unseen(fewest)[0] for seed in range(SEEDS)]
+    light = [left_out_of(bench, seed).unseen(fewest, NONE)[0] for seed in range(SEEDS)]
     return float(np.mean(light)), float(np.std(light, ddof=1) / np.sqrt(SEEDS))
 
 
@@ -125,12 +125,12 @@ def test_a_lens_finds_light_as_often_as_paths_run_into_it(shared_scene: Callable
         for lens in (bench.projector.model_copy(update={"aperture_radius_mm": radius}) for radius in (0.0, 4.0, 8.0))
     )
     ball = int(np.argmax(pinhole.mirrors))
-    assert pinhole.lens_hits[ball] == 0 and pinhole.unseen(1e-9)[0] > 0
+    assert pinhole.lens_hits[ball] == 0 and pinhole.unseen(NONE, NONE)[0] > 0
     assert small.mirrors == pytest.approx(large.mirrors) and small.lens_hits[ball] == pytest.approx(
         large.lens_hits[ball] / 4
     )
     enough = 2 * small.lens_hits[ball]
-    assert small.unseen(enough)[1] == ball and large.unseen(enough)[1] != ball
+    assert small.unseen(NONE, enough)[1] == ball and large.unseen(NONE, enough)[1] != ball
 
 
 def test_a_ball_is_seldom_met_however_broad_its_lobe(
@@ -182,7 +182,7 @@ def test_it_is_told_over_which_mirror(shared_scene: Callable[..., Path], order: 
     shapes = [ball, MIRROR.replace('x="-40" z="315"', 'x="-300" z="315"'), slab(200, 4)]
     path = shared_scene(f"named{order[0]}", extra="\n".join(shapes[place] for place in order), sheet_z=WALL)
     bench = open_bench(path)
-    _, place = left_out_of(bench, 0, 2**18).unseen(NONE)
+    _, place = left_out_of(bench, 0, 2**18).unseen(NONE, NONE)
     assert place is not None
     tag = bench.loaded.shapes[place]
     assert tag.attributes["type"] == "sphere" == bench.loaded.scene.shapes()[place].class_name().lower()
