@@ -299,6 +299,7 @@ class _Table:
         changes, apart = self.evidence.changes, self.evidence.apart
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
+        drawn += [self.evidence.sharp.left**2] if self.evidence.sharp else []
         squared, spread = changes.squared(chosen)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
 

@@ -46,11 +46,14 @@ class SharpPixels:
         points a side of the sensor that their light is connected to.
     window
         first and last tan-angle of their light along rows, then along columns.
+    left
+        error that interpolation between these points leaves, relative to all light.
     """
 
     pixels: tuple[int, ...]
     anchors: int
     window: tuple[float, float, float, float]
+    left: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -315,6 +315,7 @@ class _Words:
         """By what leaves it, the bound on each part of the systematic error."""
         evidence, settings = self.evidence, self.chosen.settings
         anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
+        sharp = settings.sharp
         followed, occluded, width = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
         return {
             f"anchors ({anchors}x{anchors})": self._number("anchors", anchors).bound,
@@ -322,6 +323,7 @@ class _Words:
             f"cells ({cells}x{cells})": self._number("cells", cells).bound,
             f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
             f"cells of their light ({width} pixels)": self._number("followed_width", width).bound,
+            **({f"anchors of sharp light ({sharp.anchors}x{sharp.anchors})": sharp.left} if sharp else {}),
             f"occluded anchors ({occluded}x{occluded})": self._number("occluded_anchors", occluded).bound,
             **self.chosen.lacking,
             **{f"{name} (off)": e.bound for name, e in evidence.effects.items() if name not in settings.effects},

@@ -79,7 +79,8 @@ def sharp_pixels(
     # One pixel at least stays with the others.
     if len(pixels) == len(order):
         pixels = np.sort(order[:count])
-    chosen = SharpPixels(tuple(pixels.tolist()), anchors, _window(simulation, pixels, seed))
+    left = math.exp(-anchors * rate) * sharp.irradiance / whole
+    chosen = SharpPixels(tuple(pixels.tolist()), anchors, _window(simulation, pixels, seed), left)
     return chosen if _connections(simulation, chosen, accuracy, seed) <= _AFFORDABLE else None
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.capture.choice import cheapest, doubt, parts_of, predicted
 from mitsim.capture.effects import parse_switches
-from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Evidence, Noise, Part, Settings
+from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Evidence, Noise, Part, Settings, SharpPixels
 from mitsim.capture.pilot import stage_of
 from mitsim.capture.prices import FIXED, Numbers, entries
 from tests.unit.capture.invented_evidence import (
@@ -250,3 +250,15 @@ def test_doubt_about_coarse_cells_names_them() -> None:
     unsure = replace(ONE_CLASS, changes=Changes(EVIDENCE.changes.parts, products))
     worth, part = doubt(1e-3, unsure, {})
     assert worth > 0 and part == Part("indirect cells", 1) and stage_of(part) == "effects"
+
+
+def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
+    """Points for sharp lobes leave 6e-4 of the light between them. (Planted: nothing left.)"""
+    sharp = SharpPixels((3, 4), 7, (-0.1, 0.1, -0.1, 0.1), 6e-4)
+    light = Effort(Noise(1e-4, 4, 0.75), 98)
+    found, exact = (replace(ONE_CLASS, sharp=each, sharp_light=light) for each in (sharp, replace(sharp, left=0.0)))
+    chosen = cheapest(1e-3, found, {})
+    without = predicted(1e-3, exact, replace(chosen.settings, sharp=exact.sharp), {})
+    assert chosen.fits and chosen.systematic.value == pytest.approx(math.hypot(without.systematic.value, 6e-4))
+    assert not cheapest(5e-4, found, {}).fits
+    assert any("anchors of sharp light (7x7), 6.0e-04" in warning for warning in plan(5e-4, found).warnings)
