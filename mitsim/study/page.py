@@ -21,7 +21,7 @@ _DPI, _SHOWN_DPI = 220, 110
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` are figures by file name: an address that holds each, and its width [pixels]."""
+    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]."""
 
     name: str
     title: str
