@@ -14,6 +14,7 @@ from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri
 from mitsim.core.versions import versions
 from mitsim.study.experiment import Claim, Experiment, Results, Scope
+from mitsim.study.pictures import TEST_IMAGES
 
 _DPI, _SHOWN_DPI = 220, 110
 """Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
@@ -50,10 +51,10 @@ class Section:
         claims, figures, results
             what it came to.
         """
-        prints = [name for name in scope.pictures if name]
+        prints = set(results.table.distinct("picture")) & set(TEST_IMAGES)
         means = f", over {len(prints)} test images" if prints else ""
         setup = scope.setup
-        command = ["mitsim study", study, *([] if prints else [setup.scene]), *_options(scope)]
+        command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
         return cls(
             name=experiment.name,
             title=experiment.title,

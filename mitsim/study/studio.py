@@ -315,7 +315,9 @@ class Shoot:
     def noise(self, seconds: float) -> float:
         """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
         exposer, sensor = Exposer(self.scene.bench.rig, seconds, self.seed), self.scene.bench.sensor
-        variances = [exposer.electrons(frame).mean() + sensor.read_noise_e**2 for frame in self.expected]
+        rounding = 0.0 if sensor.bits is None else 1 / (12 * sensor.gain_dn_per_e**2)
+        read = sensor.superpixel_read_noise_e**2 + sensor.superpixel_dark_current_e_per_s * seconds + rounding
+        variances = [exposer.electrons(frame).mean() + read for frame in self.expected]
         return float(np.sqrt(np.mean(variances))) / seconds
 
     def image(self, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1) -> Image:

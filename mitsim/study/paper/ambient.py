@@ -60,7 +60,7 @@ def _range(shoot: Shoot) -> tuple[float, float]:
     exposer = Exposer(bench.rig, shoot.peak_s, 0)
     dark = exposer.electrons(shoot.expected.projector_off)
     frames = [np.percentile(exposer.electrons(frame) - dark, _SPREAD) for frame in shoot.expected]
-    low, high = np.mean(frames, axis=0) / bench.sensor.full_well_e
+    low, high = np.mean(frames, axis=0) / bench.sensor.superpixel_full_well_e
     return float(low), float(high)
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import erf
 
 from mitsim.core.errors import MitsimError
-from mitsim.study.transfer import contrast, slanted_edge
+from mitsim.study.transfer import contrast, modulation, slanted_edge
 
 ROWS = COLUMNS = 96
 
@@ -50,3 +50,14 @@ def test_contrast_of_bars_is_the_papers() -> None:
     bars = np.where(np.arange(64) // 4 % 2, 0.6, 0.2) * np.ones((64, 1))
     assert contrast(bars, 0) == pytest.approx(0.5) and contrast(bars.T, 1) == pytest.approx(0.5)
     assert contrast(bars, 1) == pytest.approx(0)
+
+
+@pytest.mark.parametrize("frequency", [0.1, 0.2437, 0.4])
+def test_modulation_is_that_of_the_bars_and_not_of_noise(frequency: float) -> None:
+    """A sine of amplitude 0.2 about 0.5 is the fundamental of bars of contrast 0.1 pi; noise as strong as it makes no more
+    than a tenth of it. (Planted: the frequency doubled; the mean left out.)"""
+    wave = 0.5 + 0.2 * np.sin(2 * np.pi * frequency * np.arange(60) + 0.7)
+    assert modulation(np.tile(wave, (40, 1)), 0, frequency) == pytest.approx(0.1 * np.pi, rel=1e-9)
+    noise = 0.5 + 0.14 * np.random.default_rng(1).standard_normal((40, 60))
+    assert modulation(noise, 0, frequency) < 0.03
+    assert contrast(noise, 0) > 0.05
