@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.pictures import lightness
@@ -59,7 +59,7 @@ def curves(
         if ticks:
             measured = sorted({number for each in panels.values() for curve in each.values() for number in curve})
             axes.xaxis.set_major_locator(FixedLocator(measured))
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.xaxis.set_minor_locator(NullLocator())
             axes.xaxis.set_major_formatter("{x:g}")
     handles, labels = places[0][0].get_legend_handles_labels()
     figure.legend(

@@ -14,20 +14,21 @@ from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri
 from mitsim.core.versions import versions
 from mitsim.study.experiment import Claim, Experiment, Results, Scope
+from mitsim.study.pictures import TEST_IMAGES
 
-_DPI = 160
-"""Figures are 8.6 inches wide: 1376 pixels, what the page's width shows on a screen of two dots a pixel."""
+_DPI, _SHOWN_DPI = 220, 110
+"""Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` are addresses of its figures that hold them, by file name."""
+    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]."""
 
     name: str
     title: str
     question: str
     claims: tuple[Claim, ...]
-    pictures: Mapping[str, str]
+    pictures: Mapping[str, tuple[str, int]]
     count: str
     command: str
 
@@ -50,16 +51,16 @@ class Section:
         claims, figures, results
             what it came to.
         """
-        prints = [name for name in scope.pictures if name]
+        prints = set(results.table.distinct("picture")) & set(TEST_IMAGES)
         means = f", over {len(prints)} test images" if prints else ""
         setup = scope.setup
-        command = ["mitsim study", study, *([] if prints else [setup.scene]), *_options(scope)]
+        command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
         return cls(
             name=experiment.name,
             title=experiment.title,
             question=experiment.question,
             claims=tuple(claims),
-            pictures={name: _address(figure) for name, figure in figures.items()},
+            pictures={name: (_address(figure), _width(figure)) for name, figure in figures.items()},
             count=f"{len(results.table)} measurements{means}, light to {setup.accuracy:g}",
             command=" ".join(command),
         )
@@ -95,6 +96,11 @@ def _options(scope: Scope) -> list[str]:
     given += [f"-D {name}={value}" for name, value in setup.parameters]
     given += [f"--over {name}={':'.join(values)}" for name, values in scope.sweep]
     return [*given, *(["--quick"] if scope.quick else [])]
+
+
+def _width(figure: Figure) -> int:
+    """On the page: letters have one size in all figures."""
+    return round(float(figure.get_figwidth()) * _SHOWN_DPI)
 
 
 def _address(figure: Figure) -> str:

@@ -315,7 +315,9 @@ class Shoot:
     def noise(self, seconds: float) -> float:
         """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
         exposer, sensor = Exposer(self.scene.bench.rig, seconds, self.seed), self.scene.bench.sensor
-        variances = [exposer.electrons(frame).mean() + sensor.read_noise_e**2 for frame in self.expected]
+        rounding = 0.0 if sensor.bits is None else 1 / (12 * sensor.gain_dn_per_e**2)
+        read = sensor.superpixel_read_noise_e**2 + sensor.superpixel_dark_current_e_per_s * seconds + rounding
+        variances = [exposer.electrons(frame).mean() + read for frame in self.expected]
         return float(np.sqrt(np.mean(variances))) / seconds
 
     def image(self, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1) -> Image:
@@ -330,8 +332,7 @@ class Shoot:
         binning
             pixels a side that are averaged.
         """
-        model = self.model(binning)
-        sums = self._added(model, seconds, binning)
+        model, sums = self.data(seconds, binning)
         scale = model.problem(sums).scale
         tried = [scale * relative for relative in LAMBDAS] if lam == "best" else [lam]
         truth, error = self.scene.truth, self.scene.light.apparent.error
@@ -341,7 +342,15 @@ class Shoot:
         quality = Quality.of(best.image, truth, error)
         return Image(best.image, quality, best.lam, len(self.family.shots), seconds, not good)
 
-    def _added(self, model: Prepared, seconds: float, binning: int) -> Accumulator:
+    def data(self, seconds: float, binning: int = 1) -> tuple[Prepared, Accumulator]:
+        """The factorised model, and one noisy exposure of all frames added up for it.
+
+        Parameters
+        ----------
+        seconds, binning
+            as for :meth:`image`.
+        """
+        model = self.model(binning)
         exposer = Exposer(self.scene.bench.rig, seconds, self.seed, self.speckle)
         sums, family, expected = model.accumulator(), self.family, self.expected
         with single_threaded_blas():
@@ -350,4 +359,4 @@ class Shoot:
                 frame = measurement - ambient
                 size = len(frame) // binning
                 sums.add(frame.reshape(size, binning, size, binning).mean(axis=(1, 3)), row, column)
-        return sums
+        return model, sums

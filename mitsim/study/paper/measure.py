@@ -11,7 +11,7 @@ from mitsim.study.pictures import QUICK_IMAGES
 from mitsim.study.studio import IDEALISED, MODELS, RENDERED, Studio
 from mitsim.study.table import Mean, Table, Value
 
-_NAMED = ("picture", "model", "patterns", "exposure", "seed", "mask_distance", "binning")
+_NAMED = ("picture", "model", "patterns", "exposure", "seed", "mask_distance", "binning", "method", "ratio")
 """Columns that tell images apart."""
 TOLERANCE_DB = 2.0
 """How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""

@@ -25,6 +25,27 @@ def studio() -> Iterator[Studio]:
         yield kept
 
 
+def test_bars_have_their_frequency_both_ways() -> None:
+    """0.25 line pairs a mm: 32 pairs on 128 mm, of 16 texels each, half white. (Planted: bars of twice the width.)"""
+    values = picture("bars 0.25")
+    left, right = np.split(values.astype(float), 2, axis=1)
+    assert np.array_equal(left, np.tile(left[:1], (SIDE, 1))) and np.array_equal(
+        right, np.tile(right[:, :1], (1, SIDE // 2))
+    )
+    assert np.count_nonzero(np.diff(left[0]) > 0) == 16 - 1 and np.count_nonzero(np.diff(right[:, 0]) > 0) == 32 - 1
+    assert set(np.unique(values)) == {13, 230} and values.mean() == pytest.approx((13 + 230) / 2)
+    fine = picture("bars 0.7").astype(float)
+    assert fine.mean() == pytest.approx((12.75 + 229.5) / 2, rel=0.01), "texels across an edge are part black"
+
+
+def test_the_edge_leans_by_five_degrees() -> None:
+    """Black left, white right, the boundary through the middle."""
+    values = (picture("edge").astype(float) - 13) / (230 - 13)
+    place = SIDE - values.sum(axis=1)
+    assert np.polyfit(np.arange(SIDE), place, 1)[0] == pytest.approx(np.tan(np.radians(5)), rel=2e-3)
+    assert place.mean() == pytest.approx(SIDE / 2, abs=0.1)
+
+
 @pytest.mark.parametrize("name", TEST_IMAGES)
 def test_test_images_are_prints(name: str) -> None:
     values = picture(name)
