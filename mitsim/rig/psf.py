@@ -1,0 +1,75 @@
+"""A picture of a point spread function in; the light that each sensor pixel gets of one point out, its sum 1.
+
+Such as the picture that came with DiffuserCam (Antipa et al., Optica 5, 1, 2018; data of the repository
+Waller-Lab/DiffuserCam-Tutorial, BSD 3-Clause), which mitsim does not ship: give its path.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.plainfile import check_plain
+
+_MOST_PIXELS = 2**26
+"""Of a picture: four times what cameras for such measurements have; it is held as 8 bytes each."""
+_BORDER = 16
+"""Width [pixels] of the frame along the picture's edges that shows the background, where the light of a point that
+is centred does not reach."""
+
+
+def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
+    """The point spread function in a picture (PNG, TIFF).
+
+    Colours are averaged, the median of a frame along the edges is taken off as background, ``reduce`` x ``reduce``
+    pixels are averaged, what is left below zero (noise around the background) is zero, and the sum is made 1.
+
+    Parameters
+    ----------
+    path
+        of the picture; rows first, any depth.
+    reduce
+        pixels a side that become one; rows and columns that remain at the far edges are left out.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is no picture or too large, a ``reduce`` that does not fit, no light above the background.
+    """
+    values = _grey(path)
+    rows, columns = (size // reduce for size in values.shape) if reduce >= 1 else (0, 0)
+    if min(rows, columns) < 1 or min(values.shape) <= 2 * _BORDER:
+        raise MitsimError(
+            f"point spread function {path}: {values.shape[0]} x {values.shape[1]} pixels, reduce {reduce}; it needs "
+            f"more than {2 * _BORDER} pixels a side, and reduce from 1 to its shorter side"
+        )
+    inside = np.zeros(values.shape, dtype=bool)
+    inside[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
+    above = values - np.median(values[~inside])
+    means = above[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce).mean(axis=(1, 3))
+    light = np.maximum(means, 0)
+    total = float(light.sum())
+    if total <= 0:
+        raise MitsimError(f"point spread function {path}: nothing is brighter than its edges; give another picture")
+    return np.asarray(light / total)
+
+
+def _grey(path: Path | str) -> FloatArray:
+    # Imported here: most work reads no picture of this kind.
+    from PIL import Image
+
+    check_plain(path, "point spread function")
+    try:
+        with Image.open(path) as picture:
+            if picture.width * picture.height > _MOST_PIXELS:
+                raise MitsimError(
+                    f"point spread function {path}: {picture.height} x {picture.width} pixels; "
+                    f"at most {_MOST_PIXELS} in all are read"
+                )
+            values = np.asarray(picture, dtype=np.float64)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise MitsimError(f"point spread function {path}: cannot be read as a picture ({error})") from error
+    return values if values.ndim == 2 else np.asarray(values[..., :3].mean(axis=2))
