@@ -70,7 +70,7 @@ class Bench:
         Parameters
         ----------
         patterns
-            ``uniform``, ``dots:K``, ``hadamard:K`` or ``random:K``.
+            ``uniform``, ``dots:K``, ``dots:RxC``, ``hadamard:K`` or ``random:K``.
         **request
             other fields of :class:`mitsim.capture.request.Request`, such as ``accuracy`` or ``effects``.
 
