@@ -19,6 +19,7 @@ from mitsim.core.manifests import (
     CalibrationManifest,
     Digital,
     FactorNoise,
+    Parallax,
     Patterns,
     RunManifest,
     ShotFile,
@@ -31,7 +32,7 @@ from mitsim.rig.sensor import SensorModel
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
     *(CameraGeometry, SensorModel, ProjectorModel, SessionRecipe),
-    *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise),
+    *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 

@@ -14,6 +14,7 @@ from mitsim.core.configuration import load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum
+from mitsim.core.manifests import Parallax
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.rig.projector import ProjectorModel, Spectrum
@@ -70,7 +71,7 @@ class Bench:
         Parameters
         ----------
         patterns
-            ``uniform``, ``dots:K``, ``hadamard:K`` or ``random:K``.
+            ``uniform``, ``dots:K``, ``dots:RxC``, ``hadamard:K`` or ``random:K``.
         **request
             other fields of :class:`mitsim.capture.request.Request`, such as ``accuracy`` or ``effects``.
 
@@ -269,6 +270,26 @@ class Bench:
         from mitsim.scene.projector import window_at
 
         return window_at(str(self.loaded.path), self.loaded.projector, self.loaded.camera, self.loaded.pixels, depth)
+
+    @property
+    def parallax(self) -> Parallax:
+        """How a calibration's factors move with depth, as its manifest states it."""
+        depth = self.geometry.scene_distance
+        farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
+        shift = 1 / (2 * depth) - 1 / depth
+        rows, columns = (
+            ((far[0] - near[0]) / shift, (far[1] - near[1]) / shift)
+            for near, far in zip(self.windows, farther, strict=True)
+        )
+        return Parallax(
+            depth_mm=depth,
+            row_tan=self.windows[0],
+            column_tan=self.windows[1],
+            row_mm=rows,
+            column_mm=columns,
+            pixel_pitch_mm=self.geometry.pixel_pitch,
+            mask_distance_mm=self.geometry.mask_distance,
+        )
 
     @property
     def field_stop_cuts(self) -> bool:

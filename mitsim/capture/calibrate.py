@@ -94,6 +94,7 @@ def calibrate(
             centre=session.centre,
             board_reflectance=recipe.board_reflectance,
             digital=digital_scale(bench, lit.exposure_s),
+            parallax=bench.parallax,
             result=result,
             warnings=warnings,
             versions=versions(),

@@ -13,6 +13,7 @@ from mitsim.capture.plan import check_accuracy
 from mitsim.core.configuration import validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import MOST_SHOTS
+from mitsim.rig.patterns import NAMES
 from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 from mitsim.sensor.chain import exposure_for_peak
 
@@ -61,7 +62,7 @@ class Request(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
-    patterns: str = Field("dots:7", description="uniform, dots:K, hadamard:K or random:K")
+    patterns: str = Field("dots:7", description=NAMES)
     accuracy: float = Field(1e-3, description="relative rms error of the expected frames")
     seed: int = Field(0, description="root of every random stream")
     exposure: float | Literal["auto"] = Field("auto", description="seconds a frame, or auto")

@@ -278,6 +278,10 @@ def reconstruct(
     ] = None,
     lam: Annotated[str, typer.Option("--lambda", help="regularisation, or auto", metavar="auto|VALUE")] = "auto",
     method: Annotated[str, typer.Option(help="tikhonov or tv")] = "tikhonov",
+    focus: Annotated[
+        str | None,
+        typer.Option(help="depth of the scene, or auto; the calibrated depth if not given", metavar="auto|MM"),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
@@ -286,8 +290,9 @@ def reconstruct(
     """Recover the image from frames and a calibration alone."""
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
+    depth = None if focus is None else number_of("focus", focus)
     result = reconstruct_folder(
-        run, calibration, output or run / "reconstruction", number_of("lambda", lam), method, overwrite
+        run, calibration, output or run / "reconstruction", number_of("lambda", lam), method, overwrite, depth
     )
     payload = result.summary()
     lines = [payload["status"]]
@@ -297,6 +302,8 @@ def reconstruct(
         f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
         f"residual {payload['residual']:.1e}: {payload['output']}"
     )
+    if result.reconstruction.focus is not None:
+        lines.append(str(result.reconstruction.focus))
     lines += result.reconstruction.trust
     return finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
 

@@ -32,7 +32,7 @@ Variant = Annotated[
         help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral", callback=lambda name: variant_of(name)
     ),
 ]
-Patterns = Annotated[str, typer.Option(help="uniform, dots:K, hadamard:K or random:K")]
+Patterns = Annotated[str, typer.Option(help="uniform, dots:K, dots:RxC, hadamard:K or random:K")]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
 Seed = Annotated[int, typer.Option(help="root of every random stream")]
 Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]

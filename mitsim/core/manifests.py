@@ -46,6 +46,10 @@ Weight = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Row = Annotated[tuple[Weight, ...], Field(strict=False, max_length=MOST_PIXELS), FailFast()]
 Rows = Annotated[tuple[Row, ...], Field(strict=False, max_length=MOST_PIXELS), FailFast()]
 BinnedSum = Annotated[float, Field(ge=0, le=LARGEST * _MOST_BINNED, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-1e7, le=1e7, allow_inf_nan=False)]
+"""Within 10 km, and tan-angles of any lens."""
+Distance = Annotated[float, Field(gt=0, le=1e10, allow_inf_nan=False)]
+"""Up to the largest `scene_distance`."""
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
 Plain = Annotated[dict[str, Any], BeforeValidator(plain)]
 """A part that others than the solver read, as JSON holds it."""
@@ -304,6 +308,32 @@ class FactorNoise(_Part):
     unexplained: NonNegative = Field(description="part of the responses that no separable camera explains, rms")
 
 
+Edges = Annotated[tuple[Coordinate, ...], Field(strict=False, min_length=2, max_length=2)]
+"""Of the first and of the last projector pixel."""
+
+
+class Parallax(_Part):
+    """How a calibration's factors move with depth: the projector's window, seen from the sensor's centre on a plane at
+    distance z, has its edges at tan-angles window + parallax (1/z - 1/depth), in index coordinates."""
+
+    depth_mm: Distance = Field(description="sensor to the board [mm]")
+    row_tan: Edges = Field(description="first and last edge of the window's rows on the board")
+    column_tan: Edges = Field(description="the same of its columns")
+    row_mm: Edges = Field(description="parallax of these edges; the baseline, where the projector faces as the camera")
+    column_mm: Edges = Field(description="the same of columns")
+    pixel_pitch_mm: Distance = Field(description="between centres of (binned) sensor pixels")
+    mask_distance_mm: Distance = Field(description="sensor to the mask")
+
+    @model_validator(mode="after")
+    def _a_window_behind_a_mask(self) -> Parallax:
+        for name, window in (("row_tan", self.row_tan), ("column_tan", self.column_tan)):
+            if not window[1] > window[0]:
+                raise ValueError(f"{name} ends at {window[1]:g} and begins at {window[0]:g}; give increasing edges")
+        if not self.mask_distance_mm < self.depth_mm:
+            raise ValueError(f"mask_distance_mm {self.mask_distance_mm:g} must be below depth_mm {self.depth_mm:g}")
+        return self
+
+
 class CalibrationManifest(_Head):
     """A calibration: of which camera, and how its factors are used."""
 
@@ -316,6 +346,9 @@ class CalibrationManifest(_Head):
     digital: Digital | None = Field(default=None, description="of the session's frames")
     checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
     noise: FactorNoise | None = Field(default=None, description="how exact the factors are; none: not stated")
+    parallax: Parallax | None = Field(
+        default=None, description="how the factors move with depth; none: not known, and no `--focus`"
+    )
     result: Plain = Field(default={}, description="the session in numbers, as `calibrate --json` gives them")
     estimate: str | None = Field(default=None, description="the estimator's own words")
     verdict: str | None = Field(

@@ -49,7 +49,7 @@ class Cause(Enum):
     )
     DEPTH = (
         "depth, light that lands beside where the calibration saw it",
-        "put the scene at the calibrated distance, or calibrate at the scene's",
+        "put the scene at the calibrated distance, calibrate at the scene's, or give its depth as focus",
     )
     INDIRECT = (
         "light from scene pixels that are not lit, over other surfaces or from depths along both axes",

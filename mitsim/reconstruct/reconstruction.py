@@ -23,8 +23,10 @@ from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
+from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.focus import focused
 from mitsim.reconstruct.misfit import Misfit, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
@@ -70,7 +72,9 @@ class Reconstruction:
     seconds
         by stage.
     inputs
-        fingerprints of shots and factors, ``lam`` as it was asked for, and the method.
+        fingerprints of shots and factors, ``lam`` as it was asked for, and the method; the focus, where one was.
+    focus
+        the depth whose factors were used; None: the calibrated one's.
     """
 
     image: FloatArray
@@ -86,6 +90,7 @@ class Reconstruction:
     status: Status
     seconds: dict[str, float]
     inputs: dict[str, str | float]
+    focus: Depth | None = None
 
     @property
     def ok(self) -> bool:
@@ -117,6 +122,8 @@ class Reconstruction:
             "condition_whole": self.condition_whole,
             "condition_sides": self.condition_sides,
             "residual": self.residual,
+            "focus_mm": self.focus and self.focus.mm,
+            "focus_error_mm": self.focus and self.focus.error_mm,
             "misfit": self.misfit and self.misfit.summary(),
             **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
             "status": str(self.status),
@@ -172,7 +179,11 @@ class Reconstruction:
 
 @single_threaded_blas()
 def reconstruct(
-    shots: Capture, factors: Factors, lam: float | Literal["auto"] = "auto", method: str = "tikhonov"
+    shots: Capture,
+    factors: Factors,
+    lam: float | Literal["auto"] = "auto",
+    method: str = "tikhonov",
+    focus: float | Literal["auto"] | None = None,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -187,16 +198,24 @@ def reconstruct(
         from the data.
     method
         ``tikhonov`` (closed form) or ``tv`` (least total variation).
+    focus
+        depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
+        least of the measurements unexplained.
 
     Raises
     ------
     MitsimError
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
-        or another lambda or method.
+        another lambda, method or focus, or a calibration that does not state its parallax.
     """
-    asked = inputs(shots, factors, lam, method)
+    asked = inputs(shots, factors, lam, method, focus)
     factors.check_fit(shots)
     started = time.perf_counter()
+    depth = best_depth(shots, factors) if focus == "auto" else Depth(focus) if focus is not None else None
+    found = time.perf_counter()
+    if depth is not None:
+        of_depth = focused(factors, depth.mm)
+        shots, factors = of_depth.of(shots), of_depth.factors
     data = accumulated(shots, factors)
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
@@ -209,6 +228,7 @@ def reconstruct(
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status
+    flags = (*status.flags, *((depth.doubt,) if depth and depth.doubt else ()), *_flags(shots, factors))
     return Reconstruction(
         image=solution.image,
         lam=solution.lam,
@@ -220,14 +240,16 @@ def reconstruct(
         rounding=getattr(solution, "rounding", None),
         misfit=misfit,
         uncertainties=uncertainties,
-        status=replace(status, flags=(*status.flags, *_flags(shots, factors))),
+        status=replace(status, flags=flags),
         seconds={
-            "accumulate": added - started,
+            **({"focus": found - started} if depth else {}),
+            "accumulate": added - found,
             "solve": solved - added,
             "misfit": judged - solved,
             "uncertainty": time.perf_counter() - judged,
         },
         inputs=asked,
+        focus=depth,
     )
 
 
@@ -323,21 +345,26 @@ def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:
     return shots.ambient.variance.mean(axis=1), shots.ambient.variance.mean(axis=0)
 
 
-def inputs(shots: Capture, factors: Factors, lam: float | str, method: str) -> dict[str, str | float]:
+def inputs(
+    shots: Capture, factors: Factors, lam: float | str, method: str, focus: float | str | None = None
+) -> dict[str, str | float]:
     """What decides an image.
 
     Parameters
     ----------
     shots, factors
         told by their fingerprints.
-    lam, method
-        as asked for; ArgumentError for an unknown method, or another lambda than reconstruct takes.
+    lam, method, focus
+        as asked for; ArgumentError for an unknown method, or another lambda or focus than reconstruct takes.
     """
     if method not in METHODS:
         raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
     if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < np.inf):
         raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
-    return {"run": shots.fingerprint, "calibration": factors.fingerprint, "lambda": lam, "method": method}
+    if focus is not None and focus != "auto" and (isinstance(focus, str) or not 0 < focus < np.inf):
+        raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, or auto")
+    asked = {"run": shots.fingerprint, "calibration": factors.fingerprint, "lambda": lam, "method": method}
+    return asked if focus is None else {**asked, "focus": focus}
 
 
 def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:

@@ -22,6 +22,8 @@ PatternFactor = npt.NDArray[np.int8]
 """(n, K) of 0/1 or +-1: one side of K separable patterns."""
 _MOST_DIGITS = 9
 """Digits of K that are read; no projector has 1e9 pixels a side."""
+NAMES = "uniform, dots:K, dots:RxC, hadamard:K or random:K"
+"""How families are called."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,7 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     Parameters
     ----------
     text
-        ``uniform``, ``dots:K``, ``hadamard:K`` or ``random:K``.
+        ``uniform``, ``dots:K``, ``dots:RxC`` (periods of rows and of columns), ``hadamard:K`` or ``random:K``.
     n
         projector pixels a side.
     seed
@@ -228,13 +230,23 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     """
     name, colon, size = text.partition(":")
     if name not in (*_SAME_BOTH_SIDES, "random") or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
-        raise MitsimError(f"patterns {text!r}: use uniform, dots:K, hadamard:K or random:K")
-    if colon and not (size.isascii() and size.isdigit() and len(size) <= _MOST_DIGITS):
-        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {n}")
-    k = int(size or 1)
-    if not 1 <= k <= n:
-        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {n}, the projector's pixels a side")
+        raise MitsimError(f"patterns {text!r}: use {NAMES}")
+    if name == "dots" and "x" in size:
+        rows, _, columns = size.partition("x")
+        left, right = (_shifting_dots(n, _period(text, period, n)) for period in (rows, columns))
+        return PatternFamily(text, left, right)
+    k = _period(text, size, n) if colon else 1
     if name == "random":
         return PatternFamily(text, _random_binary(n, k, seed, "left"), _random_binary(n, k, seed, "right"))
     factor = _SAME_BOTH_SIDES[name](n, k)
     return PatternFamily(text, factor, factor)
+
+
+def _period(text: str, size: str, n: int) -> int:
+    """K of the patterns ``text``, written as ``size``, for ``n`` projector pixels a side."""
+    if not (size.isascii() and size.isdigit() and len(size) <= _MOST_DIGITS):
+        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {n}")
+    k = int(size)
+    if not 1 <= k <= n:
+        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {n}, the projector's pixels a side")
+    return k

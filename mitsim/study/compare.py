@@ -136,9 +136,10 @@ class Comparison:
 
 
 def label(name: str) -> str:
-    """What people call the patterns ``name``, such as "49 dots" for ``dots:7``."""
-    kind, _, k = name.partition(":")
-    return f"{int(k) ** 2} {'Hadamard' if kind == 'hadamard' else kind}" if k else kind.capitalize()
+    """What people call the patterns ``name``, such as "49 dots" for ``dots:7`` and "7 x 14 dots" for ``dots:7x14``."""
+    kind, _, size = name.partition(":")
+    count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
+    return f"{count} {'Hadamard' if kind == 'hadamard' else kind}" if count else kind.capitalize()
 
 
 def peak_time(bench: Bench, expected: ExpectedFrames) -> float:

@@ -87,8 +87,9 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "seconds", "output"}
     assert found.keys() == keys | {
         *("truth_error", "rank_sides", "condition_whole", "condition_sides"),
-        *("misfit", "uncertainty", "uncertainty_budget"),
+        *("misfit", "uncertainty", "uncertainty_budget", "focus_mm", "focus_error_mm"),
     }
+    assert found["focus_mm"] is None and found["focus_error_mm"] is None
     assert number(found["uncertainty"], 1e-6, 0.1) and all(map(number, found["uncertainty_budget"].values()))
     assert found["misfit"].keys() == {
         *("chi_square", "unexplained", "worst_tile", "noise_stated", "flagged", "cause", "signatures", "map"),
@@ -111,6 +112,18 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     written = json.loads((tmp_path / "image" / "result.json").read_text())
     assert written.pop("inputs").keys() == {"run", "calibration", "lambda", "method"}
     assert written == found
+
+
+def test_reconstruct_at_another_depth(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    options = "--calibration", lab.calibration, "--json", "--quiet", "-o"
+    found = call("reconstruct", lab.run, *options, tmp_path / "image", "--focus", "400").payload
+    assert found["focus_mm"] == 400 and found["focus_error_mm"] is None
+    assert_seconds(found["seconds"], "focus", "accumulate")
+    assert json.loads((tmp_path / "image" / "result.json").read_text())["inputs"]["focus"] == 400
+    assert call("reconstruct", lab.run, *options, tmp_path / "other", "--focus", "near").refusal.startswith(
+        "--focus 'near': give"
+    )
+    assert not (tmp_path / "other").exists()
 
 
 def test_reconstruct_writes_into_the_run_by_default(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:

@@ -37,6 +37,19 @@ def test_identity_and_provenance(small_scene: Callable[..., Path]) -> None:
 
 
 @pytest.mark.parametrize("rig", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
+def test_parallax_tells_the_window_at_any_depth(small_scene: Callable[..., Path], rig: str | None) -> None:
+    """60 mm beside the camera, square to it: the same for both edges, to Mitsuba's single precision."""
+    bench = open_bench(small_scene(**({"rig": rig} if rig else {})))
+    parallax = bench.parallax
+    assert parallax.row_mm == pytest.approx((0, 0), abs=1e-3)
+    assert parallax.column_mm == pytest.approx((-60, -60), abs=1e-3)
+    rows, columns = bench.windows_at(330.0)
+    shift = 1 / 330 - 1 / parallax.depth_mm
+    assert rows == pytest.approx(np.add(parallax.row_tan, np.multiply(parallax.row_mm, shift)), abs=1e-6)
+    assert columns == pytest.approx(np.add(parallax.column_tan, np.multiply(parallax.column_mm, shift)), abs=1e-6)
+
+
+@pytest.mark.parametrize("rig", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
 def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[..., Path], rig: str | None) -> None:
     """Its light is that of a sheet of that reflectance on the aligned plane, even where the scene has none."""
     place = {} if rig is None else {"rig": rig}

@@ -22,6 +22,8 @@ from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from mitsim.reconstruct.status import Status, Verdict
 from mitsim.rig.patterns import parse_patterns
 from mitsim.study.quality import reconstruct as reconstruct_folders
+from tests import ideal_sessions
+from tests.ideal_sessions import picture
 
 N, PIXELS = 4, 9
 
@@ -91,6 +93,17 @@ def test_the_time_of_both_parts_is_stated(shots: Capture, factors: Factors) -> N
     result = reconstruct(shots, factors)
     assert min(result.seconds.values()) > 0 and sum(result.seconds.values()) <= time.perf_counter() - begin
     assert result.summary()["seconds"]["total"] == pytest.approx(sum(result.seconds.values()))
+
+
+def test_dots_may_have_a_period_for_each_axis(tmp_path: Path) -> None:
+    """Rows of period 2, columns of 6: twelve shots and as many blocks; the print comes out of them."""
+    shots, factors = ideal_sessions.bench().run("dots:2x6", picture(), 0), ideal_sessions.bench().calibrated(0)
+    again = load_run(shots.save(tmp_path / "run"))
+    assert len(again.manifest.patterns.captures) == 12 and again.manifest.patterns.family == "dots:2x6"
+    prepared = accumulated(again, factors).prepared
+    assert (prepared.left.n_blocks, prepared.right.n_blocks) == (2, 6)
+    image = reconstruct(again, factors)
+    assert image.ok and np.abs(image.image - picture()).max() < 0.1  # 0.02 of noise; 0.4 with the periods exchanged
 
 
 def test_the_memory_that_is_asked_for_holds_the_factorised_model(

@@ -14,6 +14,8 @@ FAMILIES = [
     "dots:3",
     "dots:5",
     "dots:16",
+    "dots:3x5",
+    "dots:16x1",
     "hadamard:1",
     "hadamard:4",
     "hadamard:12",
@@ -40,11 +42,13 @@ def test_captures_add_up_to_the_patterns_that_the_solver_is_told(name: str, n: i
 @pytest.mark.parametrize("name", FAMILIES)
 def test_number_of_captures(name: str) -> None:
     family = parse_patterns(name, 16)
-    k = int(name.partition(":")[2] or 1)
+    rows, cross, columns = name.partition(":")[2].partition("x")
+    k = int(rows or 1)
+    count = k * int(columns) if cross else k**2
     # hadamard:1 is all ones, so it needs no second half.
     halves = 2 if name.startswith("hadamard") and k > 1 else 1
-    assert len(family.shots) == halves * k**2
-    assert len({capture.names for capture in family.shots}) == halves * k**2, "streams would be shared"
+    assert len(family.shots) == halves * count
+    assert len({capture.names for capture in family.shots}) == halves * count, "streams would be shared"
 
 
 @pytest.mark.parametrize("n", [16, 23])
@@ -61,13 +65,13 @@ def test_classes_weigh_every_pixel_as_light_does(name: str, n: int) -> None:
 @settings(max_examples=25, deadline=None)
 @given(n=st.integers(1, 40), data=st.data())
 def test_dots_light_every_pixel_exactly_once(n: int, data: st.DataObject) -> None:
-    k = data.draw(st.integers(1, n))
-    family = parse_patterns(f"dots:{k}", n)
+    rows, columns = data.draw(st.integers(1, n)), data.draw(st.integers(1, n))
+    family = parse_patterns(f"dots:{rows}x{columns}", n)
     assert np.array_equal(sum(family.light(capture) for capture in family.shots), np.ones((n, n)))
     labels, weights = family.lighting.labels, family.lighting.weights
-    assert weights.shape == (k * k, k * k)
-    assert np.array_equal(weights.sum(axis=0), np.ones(k * k)), "each class belongs to one pattern"
-    assert len(np.unique(labels)) == k * k
+    assert weights.shape == (rows * columns, rows * columns)
+    assert np.array_equal(weights.sum(axis=0), np.ones(rows * columns)), "each class belongs to one pattern"
+    assert len(np.unique(labels)) == rows * columns
 
 
 def test_uniform_lighting_is_the_uniform_familys() -> None:
@@ -81,6 +85,16 @@ def test_dots_are_the_papers_grid_of_every_kth_pixel() -> None:
     family = parse_patterns("dots:3", 8)
     lit = family.light(next(c for c in family.shots if (c.row, c.column) == (1, 2)))
     assert np.array_equal(np.argwhere(lit), [(r, c) for r in (1, 4, 7) for c in (2, 5)])
+
+
+def test_dots_of_two_periods_repeat_each_along_its_own_axis() -> None:
+    family = parse_patterns("dots:3x2", 7)
+    lit = family.light(next(c for c in family.shots if (c.row, c.column) == (1, 1)))
+    assert np.array_equal(np.argwhere(lit), [(r, c) for r in (1, 4) for c in (1, 3, 5)])
+    both, one = parse_patterns("dots:3x3", 7), parse_patterns("dots:3", 7)
+    assert both.shots == one.shots
+    assert np.array_equal(both.left, one.left) and np.array_equal(both.right, one.right)
+    assert np.array_equal(both.lighting.labels, one.lighting.labels)
 
 
 def test_hadamard_repeats_its_matrix_and_the_halves_complement() -> None:
@@ -137,6 +151,13 @@ def test_random_is_a_fair_coin() -> None:
         ("dots:\u00b2", "whole number"),
         ("dots: 3", "whole number"),
         ("dots:x", "whole number"),
+        ("dots:7x", "whole number"),
+        ("dots:x7", "whole number"),
+        ("dots:7x14x3", "whole number"),
+        ("dots:7X14", "whole number"),
+        ("dots:4x17", "1 to 16"),
+        ("dots:0x4", "1 to 16"),
+        ("hadamard:4x4", "whole number"),
         ("dots", "use uniform"),
         ("dots:", "use uniform"),
         ("uniform:2", "use uniform"),

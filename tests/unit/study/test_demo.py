@@ -110,7 +110,13 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("uniform", "Uniform"), ("dots:7", "49 dots"), ("hadamard:8", "64 Hadamard"), ("random:3", "9 random")],
+    [
+        ("uniform", "Uniform"),
+        ("dots:7", "49 dots"),
+        ("dots:7x14", "7 x 14 dots"),
+        ("hadamard:8", "64 Hadamard"),
+        ("random:3", "9 random"),
+    ],
 )
 def test_labels(name: str, said: str) -> None:
     assert label(name) == said

@@ -1,0 +1,173 @@
+"""Factors of a calibrated depth in; out come those of another depth, and the part of the sensor where they are known.
+
+A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d tau, and
+projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor of depth z is the calibrated
+one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z - 1/z_0) at the board.
+Columns change slowly (a mask feature is some ten pixels wide), so values between them are interpolated. Beyond the
+window no column was calibrated; but sensor pixels further on saw the same part of the mask in a column within, at u + v
+and tau - v (1/d - 1/z_0), for any v. Only at the sensor's own edge there is nothing left to see, and these few rows are
+left out, of frames and factors alike. Brightness stays that of the board where it was calibrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.manifests import Parallax
+from mitsim.core.measurement import Ambient, Measurement
+from mitsim.core.runs import Capture
+from mitsim.reconstruct.factors import Factors
+
+_NEIGHBOURS = 4
+"""Columns that a cubic takes: of 2 to 8 it leaves least (a sheet at 360 mm, 128 pixels: 3.1e-3, 2.1e-3, 2.1e-3, 2.1e-3
+of the measurements); more neighbours add noise."""
+_LEAST_PART = 0.5
+"""Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Focused:
+    """``factors`` of a depth, on the sensor's ``rows`` and ``columns`` where these are known; ``sensor`` is the whole's
+    shape."""
+
+    factors: Factors
+    rows: slice
+    columns: slice
+    sensor: tuple[int, int]
+
+    def of(self, shots: Capture) -> Capture:
+        """What that part of the sensor saw of ``shots``."""
+        return _Part(shots, self)
+
+
+def focused(factors: Factors, depth_mm: float) -> Focused:
+    """The factors of a surface at ``depth_mm`` from the sensor, from calibrated ``factors``.
+
+    ArgumentError for a depth where too little of them is known, MitsimError for a calibration that does not state its
+    parallax.
+    """
+    parallax = stated_parallax(factors)
+    if not (np.isfinite(depth_mm) and depth_mm > parallax.mask_distance_mm):
+        raise ArgumentError(
+            "focus", f"{depth_mm:g}: give a depth above {parallax.mask_distance_mm:g} mm, where the mask is"
+        )
+    shift = 1 / depth_mm - 1 / parallax.depth_mm
+    left, rows = moved(factors.left, parallax, 0, shift)
+    right, columns = moved(factors.right, parallax, 1, shift)
+    for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
+        if known.stop - known.start < _LEAST_PART * size:
+            raise ArgumentError(
+                "focus",
+                f"{depth_mm:g}: {max(known.stop - known.start, 0)} of {size} sensor rows or columns know the shadow "
+                f"there; give a depth nearer to the calibrated {parallax.depth_mm:g} mm, or calibrate at that depth",
+            )
+    # Without a copy the factors of the calibrated depth are the calibration's own, to the last bit.
+    shape = len(factors.left), len(factors.right)
+    return Focused(replace(factors, left=left[rows], right=right[columns]), rows, columns, shape)
+
+
+def stated_parallax(factors: Factors) -> Parallax:
+    """How ``factors`` move with depth; MitsimError where their calibration does not state it."""
+    parallax = factors.manifest.parallax
+    if parallax is None:
+        raise MitsimError(
+            f"focus: calibration {factors.name} does not state its parallax, as none did before; calibrate again, or "
+            "add it to the manifest"
+        )
+    if min(factors.left.shape[1], factors.right.shape[1]) < _NEIGHBOURS:
+        raise MitsimError(
+            f"focus: calibration {factors.name} has {factors.left.shape[1]} x {factors.right.shape[1]} projector "
+            f"pixels; columns of other depths need at least {_NEIGHBOURS} a side"
+        )
+    return parallax
+
+
+def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float, float, float]:
+    """Projector pixels that a change of 1/z by 1/mm moves, at the window's first and at its last edge; and what one mm
+    along the sensor takes off.
+
+    Parameters
+    ----------
+    parallax
+        of the calibration.
+    axis
+        0 for rows, 1 for columns.
+    count
+        n, projector pixels along it.
+    """
+    window, edges = (parallax.row_tan, parallax.row_mm) if axis == 0 else (parallax.column_tan, parallax.column_mm)
+    pixel = (window[1] - window[0]) / count
+    return edges[0] / pixel, edges[1] / pixel, 1 / pixel
+
+
+def moved(factor: FloatArray, parallax: Parallax, axis: int, shift: float | FloatArray) -> tuple[FloatArray, slice]:
+    """The columns of another depth, and the sensor rows where all of them are known.
+
+    Parameters
+    ----------
+    factor
+        (m, n) of the calibrated depth.
+    parallax
+        of its calibration.
+    axis
+        0 for the left factor, 1 for the right one.
+    shift
+        1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
+    """
+    rows, count = factor.shape
+    first, last, by_place = pixels_of_parallax(parallax, axis, count)
+    place = (np.arange(rows) - (rows - 1) / 2) * parallax.pixel_pitch_mm
+    edges = np.linspace(first, last, 2 * count + 1)[1::2]  # of pixel centres
+    column = np.arange(count) + (edges - by_place * place[:, None]) * shift
+    # Columns that one sensor pixel's step along the sensor makes up for.
+    step = parallax.pixel_pitch_mm * (1 / parallax.mask_distance_mm - 1 / parallax.depth_mm) * by_place
+    before, beyond = np.ceil(np.maximum(1 - column, 0) / step), np.ceil(np.maximum(column - count + 2, 0) / step)
+    steps = np.where(column < 0, -before, np.where(column > count - 1, beyond, 0)).astype(np.intp)
+    column, row = column - steps * step, np.arange(rows)[:, None] + steps
+    known = ((row >= 0) & (row < rows) & (column >= 0) & (column <= count - 1)).all(axis=1)
+    inside = np.flatnonzero(known)
+    part = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+    return _cubic(factor, np.clip(row, 0, rows - 1), column), part
+
+
+def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
+    """Lagrange's cubic through the four columns around each ``column`` of each ``row``, exact at whole numbers."""
+    start = np.clip(np.floor(column).astype(np.intp) - 1, 0, factor.shape[1] - _NEIGHBOURS)
+    t = column - start
+    weights = (
+        -(t - 1) * (t - 2) * (t - 3) / 6,
+        t * (t - 2) * (t - 3) / 2,
+        -t * (t - 1) * (t - 3) / 2,
+        t * (t - 1) * (t - 2) / 6,
+    )
+    return np.asarray(sum(weight * factor[row, start + k] for k, weight in enumerate(weights)))
+
+
+class _Part(Capture):
+    """What a part of the sensor saw of a capture."""
+
+    def __init__(self, whole: Capture, part: Focused) -> None:
+        super().__init__(whole.manifest, whole.folder)
+        self._whole, self._seen = whole, part
+
+    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+        """As of the whole sensor, whose frames must have the shape that the calibration's have."""
+        part = self._seen
+        for each in self._whole.measured(part.sensor):
+            frame, light = each.frame[part.rows, part.columns], each.light[part.rows, part.columns]
+            yield replace(each, frame=frame, light=light)
+
+    @cached_property
+    def ambient(self) -> Ambient | None:
+        """The ambient frame of that part."""
+        whole, part = self._whole.ambient, self._seen
+        if whole is None:
+            return None
+        return Ambient(whole.rate[part.rows, part.columns], whole.variance[part.rows, part.columns], whole.shots)

@@ -1,0 +1,167 @@
+"""Factors of another depth, and the depth itself, held against the closed-form shadow of an ideal camera at that depth.
+
+Nothing here is rendered: the camera is that of tests/ideal_sessions.py with a projector 25 mm above and 60 mm beside
+it, whose light at depth z lies 1/z - 1/400 times that beside where the calibration saw it, and shades the sensor by
+the mask's shadow from there. That also the sensor's own width makes parallax is in that closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mitsim.core.configuration import validated
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.manifests import Parallax
+from mitsim.core.runs import Capture
+from mitsim.optics.shadow import scene_factor
+from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.focus import focused, moved
+from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
+from tests.ideal_sessions import PITCH, PIXELS, Bench, picture
+
+N = 40
+"""Projector pixels a side of images: each 15 um in the mask's plane, a quarter of a feature."""
+FINE = 128
+"""The same of the paper's projector: 5 um."""
+BASELINE = 25.0, -60.0
+WINDOW = 0.3
+PARALLAX = Parallax(
+    depth_mm=400.0,
+    row_tan=(-WINDOW / 2, WINDOW / 2),
+    column_tan=(-WINDOW / 2, WINDOW / 2),
+    row_mm=(BASELINE[0], BASELINE[0]),
+    column_mm=(BASELINE[1], BASELINE[1]),
+    pixel_pitch_mm=PITCH,
+    mask_distance_mm=2.0,
+)
+
+
+def shadow(depth: float, axis: int, n: int = N) -> np.ndarray:
+    """(PIXELS, n) closed-form factor of a plane at ``depth``."""
+    edges = centred_edges(n, WINDOW / n) + BASELINE[axis] * (1 / depth - 1 / 400)
+    return scene_factor(mls_mask().terms[0][1], 0.06, centred_edges(PIXELS, PITCH), depth * edges, 2.0, depth)
+
+
+def camera(depth: float = 400.0) -> Bench:
+    return Bench(shadow(depth, 0), shadow(depth, 1))
+
+
+def calibrated(seed: int = 0) -> Factors:
+    factors = camera().calibrated(seed)
+    return replace(factors, manifest=factors.manifest.model_copy(update={"parallax": PARALLAX}))
+
+
+def shots(depth: float, patterns: str = "dots:4") -> Capture:
+    return camera(depth).run(patterns, picture(n=N), 0)
+
+
+def psnr(image: Reconstruction) -> float:
+    return -10 * float(np.log10(np.mean(np.square(image.image - picture(n=N)))))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("depth", [330.0, 360.0, 398.0, 440.0, 520.0])
+def test_moved_columns_are_those_of_the_depth(depth: float, axis: int) -> None:
+    """Within 0.8 %: a cubic leaves 0.2 to 0.6 % between columns of 5 um. Unmoved ones are 2 to 100 % off."""
+    factor, truth = shadow(400.0, axis, FINE), shadow(depth, axis, FINE)
+    found, known = moved(factor, PARALLAX, axis, 1 / depth - 1 / 400)
+
+    def error(columns: np.ndarray) -> float:
+        return float(np.linalg.norm((columns - truth)[known]) / np.linalg.norm(truth[known]))
+
+    print(depth, axis, error(found), error(factor), known)
+    assert error(found) < 0.008 and error(found) < error(factor) / 5
+    # Light leaves the window by less than 0.04 rad, 80 um in the mask's plane: four sensor pixels, and one for margin.
+    assert 0 < PIXELS - (known.stop - known.start) <= 5
+
+
+def test_depth_may_differ_from_pixel_to_pixel() -> None:
+    factor = shadow(400.0, 1)
+    shifts = 1 / np.linspace(360, 440, N) - 1 / 400
+    found, known = moved(factor, PARALLAX, 1, shifts)
+    for pixel in (0, 17, N - 1):
+        alone, _ = moved(factor, PARALLAX, 1, float(shifts[pixel]))
+        assert np.array_equal(found[known, pixel], alone[known, pixel])
+
+
+def test_the_calibrated_depth_has_the_calibrations_own_factors() -> None:
+    factors = calibrated()
+    there = focused(factors, 400.0)
+    assert np.array_equal(there.factors.left, factors.left) and np.array_equal(there.factors.right, factors.right)
+    frames, own = shots(400.0), there.of(shots(400.0))
+    for a, b in zip(frames.measured(), own.measured(), strict=True):
+        assert np.array_equal(a.frame, b.frame)
+    assert np.array_equal(reconstruct(frames, factors, focus=400.0).image, reconstruct(frames, factors).image)
+
+
+@pytest.mark.parametrize("depth", [360.0, 440.0])
+def test_a_plane_off_the_calibrated_distance_comes_into_focus(depth: float) -> None:
+    """Within 3 dB of a calibration at its own depth, whether the depth is given or found, and found within 1 mm."""
+    frames, factors = shots(depth), calibrated()
+    plain, given, found = (reconstruct(frames, factors, focus=focus) for focus in (None, depth, "auto"))
+    own = reconstruct(frames, camera(depth).calibrated(0))
+    print([round(psnr(image), 2) for image in (plain, given, found, own)], found.focus)
+    assert psnr(plain) < 20 and plain.misfit and plain.misfit.cause in (Cause.DEPTH, Cause.INDIRECT)
+    assert psnr(given) > psnr(own) - 3 and psnr(found) > psnr(own) - 3
+    assert plain.focus is None and plain.summary()["focus_mm"] is None
+    assert given.focus is not None and given.focus.mm == given.summary()["focus_mm"] == depth
+    assert found.focus is not None and abs(found.focus.mm - depth) < 1 and found.focus.error_mm < 1
+    assert not found.focus.doubt and f"focus: {found.focus.mm:.6g}" in str(found.focus)
+    assert found.inputs["focus"] == "auto" and "focus" not in plain.inputs
+
+
+def test_a_depth_that_is_not_told_is_flagged() -> None:
+    """Uniform light takes a moved image for an image; and a sheet nearer than all that is tried is not found."""
+    uniform = reconstruct(shots(380.0, "uniform"), calibrated(), 1e-3, focus="auto")
+    assert not uniform.ok and "hardly tell depth" in str(uniform.status)
+    near = reconstruct(shots(290.0), calibrated(), focus="auto")
+    assert not near.ok and "320 to 533 mm" in str(near.status)
+
+
+def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = focused(calibrated(), 360.0)
+    ambient = SimpleNamespace(rate=np.arange(PIXELS**2.0).reshape(PIXELS, -1), variance=np.ones((PIXELS, PIXELS)))
+    ambient.shots = 16
+    monkeypatch.setattr(Capture, "ambient", ambient)
+    part = there.of(shots(360.0)).ambient
+    assert part is not None and part.shots == 16 and part.rate.shape == part.variance.shape
+    assert part.rate[0, 0] == ambient.rate[there.rows.start, there.columns.start]
+    assert part.rate.shape == (len(there.factors.left), len(there.factors.right)) != (PIXELS, PIXELS)
+
+
+@pytest.mark.parametrize(
+    ("focus", "fragment"), [(0.0, "above 0"), (-5.0, "above 0"), ("near", "or auto"), (np.nan, "above 0")]
+)
+def test_a_focus_that_is_none_is_refused(focus: object, fragment: str) -> None:
+    with pytest.raises(ArgumentError, match=fragment) as caught:
+        reconstruct(shots(400.0, "uniform"), calibrated(), focus=focus)  # type: ignore[arg-type]
+    assert caught.value.argument == "focus" and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "fragment"),
+    [("row_tan", (0.1, 0.1), "increasing"), ("mask_distance_mm", 400.0, "below depth_mm"), ("column_mm", (1.0,), "2")],
+)
+def test_a_parallax_that_cannot_be_is_refused(field: str, value: object, fragment: str) -> None:
+    with pytest.raises(MitsimError, match=fragment) as caught:
+        validated(Parallax, {**PARALLAX.model_dump(), field: value}, "cal/manifest.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_depth_without_factors_is_refused() -> None:
+    frames = shots(400.0, "uniform")
+    for depth, fragment in ((1.5, "where the mask is"), (40.0, "nearer to the calibrated 400 mm")):
+        with pytest.raises(ArgumentError, match=fragment):
+            reconstruct(frames, calibrated(), focus=depth)
+    with pytest.raises(MitsimError, match="does not state its parallax"):
+        reconstruct(frames, camera().calibrated(0), focus=380.0)
+    small = replace(calibrated(), left=np.ones((PIXELS, 3)))
+    with pytest.raises(MitsimError, match="3 x 40 projector pixels"):
+        focused(small, 380.0)
