@@ -173,7 +173,7 @@ class Classes:
         """Spectrum of each frame's correlation with h at the pixels of its class."""
         weight = self._spectrum.conj()
         (row, column), (rows, columns) = self.camera.origin, self.camera.shape
-        for (a, b), frame in zip(product(range(self.k), repeat=2), frames, strict=True):
+        for (a, b), frame in zip(product(range(self.k), repeat=2), self.camera.checked(frames, self.k**2), strict=True):
             placed = np.zeros(self._spectrum.shape)
             # Moved so that the class's first pixel is the first number.
             placed[:rows, :columns] = frame
