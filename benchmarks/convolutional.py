@@ -1,6 +1,7 @@
 """Coded illumination with a diffuser camera: image quality by pattern family, the direct solver against iterations.
 
-    python benchmarks/convolutional.py PICTURE [--json FILE] [--seed 0] [--reduce 4] [--part quality|speed|both]
+    python benchmarks/convolutional.py PICTURE [--json FILE] [--seed 0] [--reduce 4] [--part speed quality]
+        [--sensor whole cropped] [--periods 1 2 3 5 7]
 
 PICTURE shows the point spread function, such as `psf_sample.tif` of the repository Waller-Lab/DiffuserCam-Tutorial (BSD
 3-Clause); ``rendered`` takes that of a diffuser that Mitsuba traces (mitsim.transport.diffuser). A scene of 128 x 128
@@ -13,7 +14,8 @@ frame exposure (mitsim.study.compare).
 Speed: CPU seconds on one thread, all within this run. Iterative: conjugate gradients on frames, to two marks: an error
 against the truth within 1 % of the direct solution's (0.09 dB; residual 1e-6), and a difference from it below 1e-6
 (residual 1e-12). Direct: `prepare` is what is done once for a camera, a family and a lambda, `solve` what every set of
-frames takes, their transforms included. Both solve for the best lambda of the first photograph.
+frames takes, their transforms included. Both solve for the lambda
+that is best for the first photograph on the whole sensor.
 """
 
 from __future__ import annotations
@@ -22,6 +24,10 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from anchor_psnr import photograph
@@ -44,31 +50,32 @@ PERIODS = (1, 2, 3, 5, 7)
 PHOTOGRAPHS = ("astronaut", "camera", "coffee")
 
 
-def quality(psf: np.ndarray, seed: int) -> list[dict[str, object]]:
-    """PSNR of every photograph, family and convention, on the cropped sensor and, at equal peak, on the whole one."""
-    sensor, rows = load_sensor(shipped("calibration", "imx249.toml")), []
-    for cropped in (False, True):
-        camera = ConvolutionalCamera(psf, N, psf.shape if cropped else None)
-        for k in PERIODS:
-            classes = Classes(camera, k)
-            for convention in CONVENTIONS[: 2 if k > 1 else 1]:
-                for name in PHOTOGRAPHS:
-                    truth = photograph(name, False)
-                    shots = take(camera, parse_patterns(f"dots:{k}", N), truth, sensor, convention, seed)
-                    solution, db = best_image(classes, shots, truth)
-                    row = {
-                        "sensor": "cropped" if cropped else "whole",
-                        "patterns": k * k,
-                        "convention": convention,
-                        "image": name,
-                        "psnr_db": round(db, 2),
-                        "divided_db": round(psnr(classes.divided(shots.frames, solution.lam), truth), 2),
-                        "lambda_relative": solution.lam / classes.largest,
-                        "saturated": shots.saturated,
-                    }
-                    rows.append(row)
-                    print(row, flush=True)
-    return rows
+Row = dict[str, object]
+Case = tuple[bool, int]
+"""Whether the sensor crops, and the dots' period."""
+
+
+def camera_of(psf: np.ndarray, cropped: bool) -> ConvolutionalCamera:
+    return ConvolutionalCamera(psf, N, psf.shape if cropped else None)
+
+
+def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
+    """PSNR of every photograph and convention."""
+    sensor, (cropped, k) = load_sensor(shipped("calibration", "imx249.toml")), case
+    classes = Classes(camera_of(psf, cropped), k)
+    for convention in CONVENTIONS[: 2 if k > 1 else 1]:
+        for name in PHOTOGRAPHS:
+            truth = photograph(name, False)
+            shots = take(classes.camera, parse_patterns(f"dots:{k}", N), truth, sensor, convention, seed)
+            solution, db = best_image(classes, shots, truth)
+            yield {
+                "convention": convention,
+                "image": name,
+                "psnr_db": round(db, 2),
+                "divided_db": round(psnr(classes.divided(shots.frames, solution.lam), truth), 2),
+                "lambda_relative": solution.lam / classes.largest,
+                "saturated": shots.saturated,
+            }
 
 
 class Watch:
@@ -99,45 +106,42 @@ def timed_solve(
     return solution, time.process_time() - start
 
 
-def speed(psf: np.ndarray, seed: int) -> list[dict[str, object]]:
+def speed(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
     """CPU seconds of both solvers."""
-    sensor, truth, rows = load_sensor(shipped("calibration", "imx249.toml")), photograph(PHOTOGRAPHS[0], False), []
-    for cropped in (False, True):
-        camera = ConvolutionalCamera(psf, N, psf.shape if cropped else None)
-        for k in PERIODS:
-            family = parse_patterns(f"dots:{k}", N)
-            shots = take(camera, family, truth, sensor, CONVENTIONS[0], seed)
-            found, _ = best_image(Classes(camera, k), shots, truth)
-            start = time.process_time()
-            factorised = Classes(camera, k).factorise(found.lam)
-            prepare_s = time.process_time() - start
-            exact, exact_s = timed_solve(factorised, shots.frames, 1e-12)
-            direct, direct_s = timed_solve(factorised, shots.frames, 1e-6)
-            watch = Watch(exact.image, truth)
-            iterative = solve_iteratively(camera, family, shots.frames, found.lam, 1e-14, 1000, watch)
-            row: dict[str, object] = {
-                "sensor": "cropped" if cropped else "whole",
-                "patterns": k * k,
-                "factorised": factorised.factors is not None,
-                "psnr_db": round(psnr(direct.image, truth), 2),
-                "difference": relative_error(iterative.image, exact.image),
-                "direct_prepare_s": prepare_s,
-                "direct_solve_s": direct_s,
-                "direct_exact_s": exact_s,
-                "direct_iterations": direct.iterations,
+    sensor, truth, (cropped, k) = (
+        load_sensor(shipped("calibration", "imx249.toml")),
+        photograph(PHOTOGRAPHS[0], False),
+        case,
+    )
+    family, whole, camera = parse_patterns(f"dots:{k}", N), camera_of(psf, False), camera_of(psf, cropped)
+    lam = best_image(Classes(whole, k), take(whole, family, truth, sensor, seed=seed), truth)[0].lam
+    frames = take(camera, family, truth, sensor, seed=seed).frames
+    start = time.process_time()
+    factorised = Classes(camera, k).factorise(lam)
+    prepare_s = time.process_time() - start
+    exact, exact_s = timed_solve(factorised, frames, 1e-12)
+    direct, direct_s = timed_solve(factorised, frames, 1e-6)
+    watch = Watch(exact.image, truth)
+    iterative = solve_iteratively(camera, family, frames, lam, 1e-14, 1000, watch)
+    row: Row = {
+        "factorised": factorised.factors is not None,
+        "psnr_db": round(psnr(direct.image, truth), 2),
+        "difference": relative_error(iterative.image, exact.image),
+        "direct_prepare_s": prepare_s,
+        "direct_solve_s": direct_s,
+        "direct_exact_s": exact_s,
+        "direct_iterations": direct.iterations,
+    }
+    for mark, ours in (("equal_error", direct_s), ("equal_answer", exact_s)):
+        if mark in watch.marks:
+            steps, spent = watch.marks[mark]
+            row |= {
+                f"iterative_{mark}_s": spent,
+                f"iterations_{mark}": steps,
+                f"speedup_{mark}": spent / ours,
+                f"speedup_{mark}_with_prepare": spent / (ours + prepare_s),
             }
-            for mark, ours in (("equal_error", direct_s), ("equal_answer", exact_s)):
-                if mark in watch.marks:
-                    steps, spent = watch.marks[mark]
-                    row |= {
-                        f"iterative_{mark}_s": spent,
-                        f"iterations_{mark}": steps,
-                        f"speedup_{mark}": spent / ours,
-                        f"speedup_{mark}_with_prepare": spent / (ours + prepare_s),
-                    }
-            rows.append(row)
-            print(row, flush=True)
-    return rows
+    yield row
 
 
 def separable_seconds() -> float:
@@ -166,18 +170,22 @@ def main() -> None:
     parser.add_argument("--json", help="write the figures to this file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--reduce", type=int, default=4)
-    parser.add_argument("--part", choices=("quality", "speed", "both"), default="both")
+    parser.add_argument("--part", choices=("quality", "speed"), nargs="+", default=("speed", "quality"))
+    parser.add_argument("--sensor", choices=("whole", "cropped"), nargs="+", default=("whole", "cropped"))
+    parser.add_argument("--periods", type=int, nargs="+", default=PERIODS)
     options = parser.parse_args()
     psf = rendered(options.reduce) if options.picture == "rendered" else load_psf(options.picture, options.reduce)
-    report: dict[str, object] = {"seed": options.seed, "psf": list(psf.shape), "n": N, "load": os.getloadavg()[0]}
+    report: dict[str, Any] = {"seed": options.seed, "psf": list(psf.shape), "n": N, "load": os.getloadavg()[0]}
     with single_threaded_blas():
-        if options.part != "quality":
-            report |= {"speed": speed(psf, options.seed), "separable_solve_s": separable_seconds()}
-        if options.part != "speed":
-            report["quality"] = quality(psf, options.seed)
-    if options.json:
-        with open(options.json, "w", encoding="utf-8") as file:
-            json.dump(report, file, indent=1)
+        if "speed" in options.part:
+            report["separable_solve_s"] = separable_seconds()
+        for part, sensor, k in product(options.part, options.sensor, options.periods):
+            for row in {"quality": quality, "speed": speed}[part](psf, (sensor == "cropped", k), options.seed):
+                rows = report.setdefault(part, [])
+                rows.append({"sensor": sensor, "patterns": k * k, **row})
+                print(part, rows[-1], flush=True)
+                if options.json:
+                    Path(options.json).write_text(json.dumps(report, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

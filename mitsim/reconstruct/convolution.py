@@ -110,9 +110,24 @@ class ConvolutionalCamera:
     def projected(self, family: PatternFamily, frames: Iterable[FloatArray]) -> FloatArray:
         """Adjoint of :meth:`frames`: (n, n) sum over the patterns of a ``family`` and their ``frames``."""
         total = np.zeros((self.n, self.n))
-        for light, frame in zip(self._lights(family), frames, strict=True):
+        count = family.left.shape[1] * family.right.shape[1]
+        for light, frame in zip(self._lights(family), self.checked(frames, count), strict=True):
             total += light * self.correlated(frame)
         return total
+
+    def checked(self, frames: Iterable[FloatArray], count: int) -> Iterator[FloatArray]:
+        """``frames`` one by one. MitsimError where one has not the sensor's shape or a number that is not finite,
+        or where there are not ``count`` of them."""
+        seen = 0
+        for seen, frame in enumerate(frames, start=1):
+            if seen > count or frame.shape != self.shape or not np.isfinite(frame).all():
+                raise MitsimError(
+                    f"frame {seen} of shape {frame.shape}, of {count} of shape {self.shape}: give as many as there are "
+                    "patterns, as large as the sensor, of finite numbers"
+                )
+            yield frame
+        if seen < count:
+            raise MitsimError(f"{seen} frames for {count} patterns; give all of them")
 
     def _lights(self, family: PatternFamily) -> Iterator[FloatArray]:
         if family.n != self.n:

@@ -94,8 +94,8 @@ class Diffuser:
     Attributes
     ----------
     relief
-        its face towards the sensor; by default cells as wide and lines as sharp, in pixels of 23.4 um, as those of the
-        DiffuserCam whose point spread function is public.
+        its face towards the sensor; by default chosen so that, in pixels of 23.4 um, its caustics fill as much of 300 x
+        400 pixels as the public point spread function of DiffuserCam, in cells about as wide.
     index
         of refraction.
     distance_mm

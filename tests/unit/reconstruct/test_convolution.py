@@ -173,6 +173,23 @@ def test_nothing_seen_is_a_dark_image() -> None:
 
 
 @pytest.mark.parametrize(
+    ("frames", "words"),
+    [
+        (np.ones((3, 6, 6)), "3 frames for 4 patterns"),
+        (np.ones((5, 6, 6)), "frame 5 of shape"),
+        (np.ones((4, 1, 6)), "frame 1 of shape"),
+        (np.full((4, 6, 6), np.nan), "of finite numbers"),
+    ],
+)
+def test_frames_that_do_not_fit_are_refused_by_both_solvers(frames: np.ndarray, words: str) -> None:
+    camera = ConvolutionalCamera(np.ones((3, 3)), 4)
+    with pytest.raises(MitsimError, match=words):
+        Classes(camera, 2).projected(frames)
+    with pytest.raises(MitsimError, match=words):
+        solve_iteratively(camera, parse_patterns("dots:2", 4), frames, 1e-3)
+
+
+@pytest.mark.parametrize(
     ("make", "words"),
     [
         (lambda: ConvolutionalCamera(np.zeros((3, 3)), 4), "not all 0"),
