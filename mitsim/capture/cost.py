@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE
 from mitsim.capture.prices import Numbers, entries
@@ -12,6 +13,9 @@ from mitsim.rig.patterns import Lighting
 
 _LANES_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
+_FOLLOWED_BYTES = 300e6
+"""What the pilot's look at light over several surfaces leaves behind: kernels, lights of four looks at several points
+(cookie_bag: 1.05e9 after the plan, the photograph 0.4e9)."""
 _ENTRY_BYTES = 45.0
 """An entry of a sparse matrix of light (12), the sum that it is added to, and what frames are formed of; measured 32 to
 45 where matrices are large."""
@@ -61,7 +65,11 @@ def frames_cost(
     held = frames_in_memory(classes, shots) + 4 * FRAMES_AT_ONCE
     return Cost(
         seconds=seconds,
-        memory_bytes=_LANES_BYTES + 8.0 * held * pixels + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES,
+        memory_bytes=_LANES_BYTES
+        + _FOLLOWED_BYTES * bool(settings.effects & names(lambda effect: effect.followed))
+        + 8.0 * held * pixels
+        + GROUPS * filed * _ENTRY_BYTES
+        + paths * _DEPOSIT_BYTES,
         disk_bytes=max(files + truth - on_disk, 0.0),
     )
 

@@ -231,8 +231,8 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     name, colon, size = text.partition(":")
     if name not in (*_SAME_BOTH_SIDES, "random") or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
         raise MitsimError(f"patterns {text!r}: use {NAMES}")
-    if name == "dots" and "x" in size:
-        rows, _, columns = size.partition("x")
+    rows, _, columns = size.partition("x")
+    if name == "dots" and rows and columns:
         left, right = (_shifting_dots(n, _period(text, period, n)) for period in (rows, columns))
         return PatternFamily(text, left, right)
     k = _period(text, size, n) if colon else 1

@@ -24,8 +24,8 @@ FOLLOWED_LADDER = (1, 2, 3, 5, 8, 12)
 WIDTHS = (1, 2, 4)
 """Projector pixels a side of a cell that are tried: what anchors see beyond their mean is little light, and need not be
 as fine as all of it; wider cells hold light of many anchors in memory."""
-_AT_ONCE = 2**21
-"""Connections that are traced at a time, 0.5 GB while they are filed."""
+_AT_ONCE = 2**20
+"""Connections that are traced at a time: 0.5 GB while they are filed."""
 _FIRST_JUDGE = 1
 """Index of the number that judges at first."""
 _FEW_ANCHORS = 2

@@ -27,7 +27,7 @@ def test_points_differ_and_share_light(name: str) -> None:
     groups = batches(points)
     assert len(groups) == len({point.setup for point in points}), "points of one setup follow each other"
     few = experiment.points(Scope(Setup(), ("coins", "page"), quick=True))
-    assert {point.key for point in few} < {point.key for point in points}, "a quick study is a start of the whole"
+    assert {point.key for point in few} <= {point.key for point in points}, "a quick study is a start of the whole"
     assert experiment.name == name and experiment.question.endswith("?") and name in EXPERIMENTS
 
 
