@@ -13,19 +13,28 @@ from dataclasses import dataclass, field
 from functools import cache
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from mitsim.core.errors import MitsimError
 from mitsim.study.experiment import Found, Point
+
+if TYPE_CHECKING:
+    from mitsim.study.studio import Studio
 
 Batch = tuple[Point, ...]
 _TRIES = 2
 """Times that a point is begun: what ended two processes would end the third."""
 
 
+class _Studio:
+    """This process's own studio, opened when it is first asked for something: to load the renderer takes seconds."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_opened(), name)
+
+
 @cache
-def _studio() -> Any:
-    """This process's own."""
+def _opened() -> Any:
     from mitsim.study.studio import Studio
 
     return Studio()
@@ -35,7 +44,7 @@ def measured(name: str, point: Point) -> Found:
     """What the experiment ``name`` finds at a ``point``, in this process's studio."""
     from mitsim.study import find_experiment
 
-    return find_experiment(name).measure(_studio(), point)
+    return find_experiment(name).measure(cast("Studio", _Studio()), point)
 
 
 def in_processes(name: str, batches: Sequence[Batch], jobs: int) -> Iterator[tuple[Point, Found]]:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
@@ -77,7 +76,7 @@ def test_what_is_there_is_not_measured_again(run: Run, tmp_path: Path) -> None:
     assert contents(tmp_path / "two") == contents(tmp_path / "one go")
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path, count: int) -> None:
     run("whole")
     begun(tmp_path)
@@ -128,6 +127,7 @@ def test_a_damaged_point_is_named(run: Run, tmp_path: Path) -> None:
         run()
 
 
+@pytest.mark.slow
 def test_bad_folders_are_refused(run: Run, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").touch()
@@ -164,13 +164,3 @@ def test_a_cluster_gives_the_same(run: Run, tmp_path: Path) -> None:
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
     with pytest.raises(MitsimError, match="no Dask scheduler answers there"):
         run("nobody", scheduler="tcp://127.0.0.1:9")
-
-
-def test_images_survive(run: Run, tmp_path: Path) -> None:
-    from mitsim.study.experiment import Point
-    from mitsim.study.points import FOLDER, Store
-
-    run()
-    point = Point.of(SCOPE.setup.changed(place="a"), number=2)
-    found = Store(tmp_path / "out" / FOLDER).load(point)
-    assert np.array_equal(found.images["a2"], np.full((2, 2), found.rows[0]["square"]))
