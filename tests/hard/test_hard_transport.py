@@ -79,6 +79,7 @@ def test_a_perfect_mirror_is_exact(measured: Recorder, small_scene: Callable[...
     measured(np.abs(frames.irradiance.sum(axis=0) / GLINT - 1).max(), at_most=1e-4)
 
 
+@pytest.mark.slow
 def test_light_over_sharp_lobes_alone_flags_the_plan(
     small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

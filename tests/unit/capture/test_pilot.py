@@ -177,6 +177,7 @@ def test_wide_cells_of_followed_light_come_true(bench: Bench, evidence: Evidence
     assert promised(evidence.ladders["followed_width"][width].value, actual)
 
 
+@pytest.mark.slow
 def test_light_to_many_anchors_is_traced_in_parts(
     bench: Bench, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -148,7 +148,9 @@ def test_noise_alone_is_no_disagreement(patterns: str) -> None:
     assert told <= 3
 
 
-@pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
+@pytest.mark.parametrize(
+    "patterns", ["dots:4", *(pytest.param(name, marks=pytest.mark.slow) for name in ("hadamard:4", "random:4"))]
+)
 def test_print_within_pixels_is_covered(patterns: str) -> None:
     """20 prints of squares whose edges lie anywhere within a pixel of 7.5 mm: 95 % of truths within 1.96 u.
 

@@ -86,6 +86,7 @@ def test_measures_have_names() -> None:
         measures_of("psnr,speed")
 
 
+@pytest.mark.slow
 def test_a_sweep_of_a_small_scene(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
     """A sheet at three depths under two families: six rows; misfit is least where the calibration was made. (Planted:
     the parameter left at the scene's own.)"""
