@@ -9,7 +9,7 @@ pixels; the sensor is as large as the picture (cropped), or gets all light (whol
 calibration/imx249.toml.
 
 Quality: PSNR at the best lambda to a quarter of a decade, peak 1, no gain or offset fit; under equal peak and equal
-frame exposure (mitsim.study.compare).
+frame exposure (mitsim.study.exposures).
 
 Speed: CPU seconds on one thread, all within this run. Iterative: conjugate gradients on frames, to two marks: an error
 against the truth within 1 % of the direct solution's (0.09 dB; residual 1e-6), and a difference from it below 1e-6
@@ -41,8 +41,8 @@ from mitsim.reconstruct.solver import prepare
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.psf import load_psf
 from mitsim.rig.sensor import load_sensor
-from mitsim.study.compare import CONVENTIONS
 from mitsim.study.diffusercam import best_image, take
+from mitsim.study.exposures import CONVENTIONS
 from mitsim.study.metrics import psnr, relative_error
 
 N = 128

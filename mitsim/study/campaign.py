@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -114,7 +114,7 @@ def run_experiment(
         for another name, an output that holds something else, and whatever a point refuses.
     """
     if study == ALL:
-        return _all(scope, output, job, where)
+        return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, where))
     campaign, job, where = _Campaign(study, scope), job or Job(), where or Where()
     own, started = where.shard.part(campaign.points), time.perf_counter()
     with campaign.folder(output) as (folder, store):
@@ -139,31 +139,35 @@ def merge(parts: Sequence[Path | str], output: Path | str) -> CampaignResult:
             raise MitsimError(
                 f"study merge: {part} is of another study, scope or version than {parts[0]}; run it again"
             )
-    campaign = _Campaign(heads[0]["study"], _scope(heads[0]["scope"], parts[0]))
+    study, scope = heads[0]["study"], _scope(heads[0]["scope"], parts[0])
+    if study == ALL:
+        return _all(scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder))
+    campaign = _Campaign(study, scope)
     with campaign.folder(output) as (folder, store):
         for part in parts:
             store.take(Store(Path(part) / FOLDER))
         return campaign.finished(folder, store, time.perf_counter() - started)
 
 
-def _all(scope: Scope, output: Path | str, job: Job | None, where: Where | None) -> CampaignResult:
-    """Every experiment of the paper, each in a folder of its own, and one page of all claims."""
+def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], CampaignResult]) -> CampaignResult:
+    """Every experiment of the paper, made by ``each`` in a folder of its own, and one page of all claims."""
     with study_folder(output, ALL, (*PAPER, "*.html")) as folder:
-        write_json(folder / f"{ALL}.json", {"kind": ALL, "status": "incomplete"})
-        found = [run_experiment(name, scope, folder / name, job, where) for name in PAPER]
-        sections = [each.section for each in found if each.section]
+        head = {"kind": ALL, "study": ALL, "scope": asdict(scope), "versions": versions()}
+        write_json(folder / f"{ALL}.json", {**head, "status": "incomplete"})
+        found = [each(name, folder / name) for name in PAPER]
+        sections = [one.section for one in found if one.section]
         if len(sections) == len(found):
             build_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
         result = CampaignResult(
             ALL,
             str(folder),
-            sum(each.points for each in found),
-            sum(each.missing for each in found),
-            sum(each.seconds for each in found),
-            claims=tuple(claim for each in found for claim in each.claims),
-            figures=tuple(f"{each.study}/{name}" for each in found for name in each.figures),
+            sum(one.points for one in found),
+            sum(one.missing for one in found),
+            sum(one.seconds for one in found),
+            claims=tuple(claim for one in found for claim in one.claims),
+            figures=tuple(f"{one.study}/{name}" for one in found for name in one.figures),
         )
-        write_json(folder / f"{ALL}.json", {"kind": ALL, "status": "complete", **result.payload()})
+        write_json(folder / f"{ALL}.json", {**head, **result.payload(), "status": "complete"})
         return result
 
 
@@ -225,8 +229,9 @@ def _head(folder: Path) -> dict[str, Any]:
     """What the study in a ``folder`` says of itself."""
     for file in sorted(folder.glob("*.json")):
         head = read_json(file)
-        if isinstance(head, dict) and {"study", "scope", "versions"} <= head.keys() and (folder / FOLDER).is_dir():
-            return head
+        whole = isinstance(head, dict) and {"study", "scope", "versions"} <= head.keys()
+        if whole and (head["study"] == ALL or (folder / FOLDER).is_dir()):
+            return dict(head)
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
 
 

@@ -20,7 +20,7 @@ _LABEL = 1.1
 """Inches beside a grid for the names of its rows."""
 
 Curve = Mapping[Any, Mean]
-"""Means by the number that varies."""
+"""Means by what varies: numbers, or their text."""
 
 
 def curves(
@@ -45,10 +45,10 @@ def curves(
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
     for axes, (title, shown) in zip(places[0], panels.items(), strict=True):
         for name, curve in shown.items():
-            numbers = np.array(list(curve), dtype=np.float64)
-            means = np.array([(mean.value, np.nan_to_num(mean.error)) for mean in curve.values()])
+            points = sorted((float(number), mean.value, np.nan_to_num(mean.error)) for number, mean in curve.items())
+            numbers, means, errors = np.array(points).reshape(-1, 3).T
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
-            axes.errorbar(numbers, means[:, 0], means[:, 1], label=name, **style)
+            axes.errorbar(numbers, means, errors, label=name, **style)
         axes.set_title(title, fontsize=FONT)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
@@ -57,7 +57,9 @@ def curves(
         if log:
             axes.set_xscale("log")
         if ticks:
-            measured = sorted({number for each in panels.values() for curve in each.values() for number in curve})
+            measured = sorted(
+                {float(number) for each in panels.values() for curve in each.values() for number in curve}
+            )
             axes.xaxis.set_major_locator(FixedLocator(measured))
             axes.xaxis.set_minor_locator(NullLocator())
             axes.xaxis.set_major_formatter("{x:g}")

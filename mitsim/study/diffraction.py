@@ -35,7 +35,7 @@ from mitsim.rig.mask import MaskKind
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.recipe import load_recipe
 from mitsim.study import plots
-from mitsim.study.compare import accumulate, peak_time
+from mitsim.study.exposures import accumulate, peak_time
 from mitsim.study.ideal import (
     GEOMETRIC,
     LINE,

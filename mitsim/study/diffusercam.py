@@ -1,7 +1,7 @@
 """A convolutional camera, a reflectance image and a sensor in; noisy frames and the best image they give out.
 
 The paper's simulation of coded illumination with a DiffuserCam (its section "Coded Illumination with Nonseparable
-Systems"), with the noise and the exposure conventions of :mod:`mitsim.study.compare`.
+Systems"), with the noise and the exposure conventions of :mod:`mitsim.study.exposures`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mitsim.reconstruct.dots import Classes
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
-from mitsim.study.compare import CONVENTIONS
+from mitsim.study.exposures import CONVENTIONS
 from mitsim.study.metrics import psnr
 
 WHITE_W_M2, WAVELENGTH_NM = 0.3, 550.0
@@ -70,7 +70,7 @@ def take(
     reflectance
         (n, n) of the scene.
     convention
-        of exposure, one of :data:`mitsim.study.compare.CONVENTIONS`.
+        of exposure, one of :data:`mitsim.study.exposures.CONVENTIONS`.
     seed
         of the noise.
     """

@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from mitsim.core.arrays import FloatArray
 from mitsim.study.table import Table, Value
 
@@ -18,6 +16,8 @@ if TYPE_CHECKING:
 
     from mitsim.study.studio import Studio
 
+IMAGE = "image"
+"""The (n, n) reflectance that a point came to, where it is kept."""
 _KEY_DIGITS = 16
 """Of a point's name: two of 10^4 points have the same with a chance of 10^-11."""
 
@@ -74,6 +74,10 @@ class Point:
     def __getitem__(self, name: str) -> Any:
         return dict(self.values)[name]
 
+    def row(self, **measured: Value) -> dict[str, Value]:
+        """A row of the table: all that varies, and what was ``measured``."""
+        return {"picture": self.setup.picture, **dict(self.setup.parameters), **dict(self.values), **measured}
+
     @property
     def key(self) -> str:
         """Name of the file that keeps its findings."""
@@ -83,10 +87,10 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What one point came to: ``rows`` of the table, and pictures (n, n) [reflectance] by name."""
+    """What one point came to: ``rows`` of the table, and ``arrays`` by name, such as :data:`IMAGE`, for figures."""
 
     rows: tuple[Mapping[str, Value], ...]
-    images: Mapping[str, FloatArray] = field(default_factory=dict)
+    arrays: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -138,11 +142,25 @@ class Scope:
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All findings of a study: a table of all points' rows, pictures by name, and the scope's measures."""
+    """All findings of a study.
+
+    Attributes
+    ----------
+    table
+        all points' rows; the column ``point`` has the points' keys.
+    arrays
+        by key of the point and name.
+    measures
+        the scope's.
+    """
 
     table: Table
-    images: Mapping[str, FloatArray]
+    arrays: Mapping[tuple[str, str], FloatArray] = field(default_factory=dict)
     measures: tuple[str, ...] = ()
+
+    def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
+        """The array ``name`` that was kept with a ``row``."""
+        return self.arrays.get((str(row["point"]), name))
 
 
 @dataclass(frozen=True)
@@ -170,8 +188,3 @@ class Experiment:
     measure: Callable[[Studio, Point], Found]
     claims: Callable[[Results], Sequence[Claim]]
     figures: Callable[[Results], Mapping[str, Figure]]
-
-
-def thumbnail(image: FloatArray) -> FloatArray:
-    """An ``image`` as findings keep it: single precision shows all that a page can."""
-    return np.asarray(image, dtype=np.float32)

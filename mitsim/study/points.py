@@ -15,7 +15,7 @@ import numpy as np
 from mitsim.core.errors import MitsimError
 from mitsim.core.output import sweep, whole_file
 from mitsim.study.experiment import Found, Point, Results
-from mitsim.study.table import joined
+from mitsim.study.table import Table
 
 FOLDER = "points"
 _ROWS = "rows"
@@ -35,14 +35,14 @@ class Store:
         """Keep what was ``found`` at a ``point``; MitsimError when it cannot be written."""
         rows = np.frombuffer(json.dumps([dict(row) for row in found.rows]).encode(), dtype=np.uint8)
         with whole_file(self._file(point)) as part, part.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **{_ROWS: rows, **found.images})  # type: ignore[arg-type]
+            np.savez_compressed(file, allow_pickle=False, **{_ROWS: rows, **found.arrays})  # type: ignore[arg-type]
 
     def load(self, point: Point) -> Found:
         """What was found at a ``point``; MitsimError when the file is damaged."""
         try:
             with np.load(self._file(point), allow_pickle=False) as file:
-                images = {name: file[name] for name in file.files if name != _ROWS}
-                return Found(tuple(json.loads(file[_ROWS].tobytes())), images)
+                arrays = {name: file[name] for name in file.files if name != _ROWS}
+                return Found(tuple(json.loads(file[_ROWS].tobytes())), arrays)
         except (OSError, ValueError, KeyError, BadZipFile) as error:
             raise MitsimError(
                 f"file {self._file(point)}: cannot be read as a point of a study ({error}); remove it and run again"
@@ -57,9 +57,10 @@ class Store:
 
     def results(self, points: Iterable[Point]) -> Results:
         """Everything found at ``points``, in their order."""
-        found = {point: self.load(point) for point in points}
-        images = {name: image for each in found.values() for name, image in each.images.items()}
-        return Results(joined(each.rows for each in found.values()), images)
+        found = {point.key: self.load(point) for point in points}
+        rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
+        arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
+        return Results(Table(rows), arrays)
 
     def tidy(self) -> None:
         """Remove what killed processes left half-written."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,20 +70,11 @@ class Table:
         chosen = self.where(**values).rows
         return [float(value) for row in chosen if isinstance(value := row.get(name), (int, float))]
 
-    def means(self, name: str, by: str, **values: Value) -> dict[Any, Mean]:
-        """:meth:`mean` for each value of a column.
-
-        Parameters
-        ----------
-        name
-            of the column whose means are taken.
-        by
-            name of the column whose values tell rows apart.
-        **values
-            that rows have.
-        """
-        chosen = self.where(**values)
-        return {value: chosen.mean(name, **{by: value}) for value in chosen.distinct(by)}
+    def means(self, name: str, by: str) -> dict[Any, Mean]:
+        """:meth:`mean` of the column ``name`` for each value of the column ``by`` that it has numbers at."""
+        return {
+            value: self.mean(name, **{by: value}) for value in self.distinct(by) if self.numbers(name, **{by: value})
+        }
 
     def write(self, path: Path) -> None:
         """To the CSV file ``path``, a header line first, all or nothing; MitsimError when it cannot be written."""
@@ -91,8 +82,3 @@ class Table:
             writer = csv.DictWriter(file, self.columns)
             writer.writeheader()
             writer.writerows(self.rows)
-
-
-def joined(tables: Iterable[Sequence[Mapping[str, Value]]]) -> Table:
-    """One table of the rows of all ``tables``."""
-    return Table(tuple(row for rows in tables for row in rows))

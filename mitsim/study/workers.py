@@ -6,6 +6,7 @@ A process keeps its studio from batch to batch. One that dies loses the point it
 from __future__ import annotations
 
 import multiprocessing
+import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -61,8 +62,10 @@ def in_processes(name: str, batches: Sequence[Batch], jobs: int) -> Iterator[tup
     jobs
         processes at a time.
     """
-    context, waiting, tries = multiprocessing.get_context("spawn"), deque(batches), dict[Point, int]()
-    crew = [_Worker.started(context, name) for _ in range(min(jobs, len(batches)))]
+    waiting, tries = deque(batches), dict[Point, int]()
+    # Processes are ended, not asked to end: what they leave in their temporary folder goes with it.
+    scratch = tempfile.TemporaryDirectory(prefix="mitsim-study-")
+    crew = [_Worker.started(name, scratch.name) for _ in range(min(jobs, len(batches)))]
     try:
         while True:
             for worker in crew:
@@ -85,12 +88,13 @@ def in_processes(name: str, batches: Sequence[Batch], jobs: int) -> Iterator[tup
                             f"code {worker.process.exitcode}; finished points are kept. Is memory short? Try --jobs 1"
                         )
                     waiting.appendleft(tuple(worker.left))
-                    crew[crew.index(worker)] = _Worker.started(context, name)
+                    crew[crew.index(worker)] = _Worker.started(name, scratch.name)
                 else:
                     yield worker.left.popleft(), answer
     finally:
         for worker in crew:
             worker.end()
+        scratch.cleanup()
 
 
 def on_cluster(name: str, batches: Sequence[Batch], address: str) -> Iterator[tuple[Point, Found]]:
@@ -142,9 +146,10 @@ class _Worker:
     left: deque[Point] = field(default_factory=deque)
 
     @classmethod
-    def started(cls, context: Any, name: str) -> _Worker:
+    def started(cls, name: str, scratch: str) -> _Worker:
+        context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(name, theirs), daemon=True)
+        process = context.Process(target=_serve, args=(name, scratch, theirs), daemon=True)
         process.start()
         theirs.close()  # so that its death ends the pipe
         return cls(process, ours)
@@ -172,8 +177,9 @@ class _Worker:
         self.process.join()
 
 
-def _serve(name: str, pipe: Connection) -> None:
+def _serve(name: str, scratch: str, pipe: Connection) -> None:
     """Measure every batch that comes, point by point, until the parent is gone."""
+    tempfile.tempdir = scratch
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
             for point in pipe.recv():

@@ -51,16 +51,10 @@ def points(bench: Bench, step: int) -> tuple[np.ndarray, np.ndarray]:
     return index, bench.geometry.pixel_centres[index]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("alpha", "accuracy"),
-    [
-        pytest.param(3e-2, 5e-3, marks=pytest.mark.slow),
-        pytest.param(1e-2, 5e-3, marks=pytest.mark.slow),
-        pytest.param(3e-3, 1e-2, marks=pytest.mark.slow),
-        (1e-3, 1e-2),
-        pytest.param(3e-4, 1e-2, marks=pytest.mark.slow),
-        pytest.param(1e-4, 2e-2, marks=pytest.mark.slow),
-    ],
+    [(3e-2, 5e-3), (1e-2, 5e-3), (3e-3, 1e-2), (1e-3, 1e-2), (3e-4, 1e-2), (1e-4, 2e-2)],
 )
 def test_a_plate_of_any_roughness(traced: Callable[..., Light], alpha: float, accuracy: float) -> None:
     light = traced(accuracy, **glossy(alpha, sheet=False))

@@ -12,19 +12,17 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from mitsim.capture.exposer import Exposer
 from mitsim.study.charts import curves, image_grid
 from mitsim.study.compare import label
-from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope, thumbnail
-from mitsim.study.paper.measure import image_name, said
-from mitsim.study.studio import EQUAL_PEAK, RENDERED, Shoot, Studio
+from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.study.exposures import EQUAL_PEAK, RENDERED, Unexposed
+from mitsim.study.paper.measure import by_patterns, found, pictured, verdict
+from mitsim.study.studio import Studio
 from mitsim.study.table import Value
 
-RATIOS = (0.01, 0.1, 1.0, 10.0, 100.0)
-"""Irradiance of the lamp over that of the projector, on the sheet of lamp_bench."""
-_EQUAL = 117.0
-"""Radiance [W m^-2 sr^-1] of the lamp of lamp_bench that lights the sheet as the projector does: ten times the shipped
-one's."""
+RADIANCES = (1.17, 11.7, 117.0, 1170.0, 11700.0)
+"""Of the scene's lamp [W m^-2 sr^-1]: that of lamp_bench lights its sheet a hundredth as the projector does, to a
+hundred times."""
 FAMILIES = ("uniform", "dots:8", "hadamard:8")
 _SPREAD = (1.0, 99.0)
 """Percentiles that a dynamic range lies between: single pixels' noise is no signal."""
@@ -35,107 +33,99 @@ def _points(scope: Scope) -> Sequence[Point]:
     setup = scope.setup if own else replace(scope.setup, scene="lamp_bench")
     seeds = scope.seeds if scope.quick else (*scope.seeds, scope.seeds[0] + 1, scope.seeds[0] + 2)
     return [
-        Point.of(
-            setup.changed(lamp=f"{_EQUAL * ratio:g}"),
-            model=RENDERED, patterns=family, exposure=EQUAL_PEAK, seed=seed, ratio=ratio,
-        )
-        for ratio in scope.chosen(RATIOS, (0.01, 1.0, 100.0))
+        Point.of(setup.changed(lamp=f"{radiance:g}"), model=RENDERED, patterns=family, exposure=EQUAL_PEAK, seed=seed)
+        for radiance in scope.chosen(RADIANCES, RADIANCES[::2])
         for seed in seeds
         for family in FAMILIES
-    ]  # fmt: skip
+    ]
 
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, patterns, seed = point.setup, str(point["patterns"]), int(point["seed"])
-    found = studio.image(setup, RENDERED, patterns, seed)
-    low, high = _range(studio.shoot(setup, RENDERED, patterns, seed))
-    row: dict[str, Value] = {"picture": None, **dict(setup.parameters), **dict(point.values), **found.row()}
-    row |= {"range_low": low, "range_high": high}
-    return Found((row,), {image_name(row): thumbnail(found.image)})
+    image = studio.image(setup, RENDERED, patterns, seed)
+    low, high = _range(studio.frames(setup, RENDERED, patterns, seed))
+    ratio = _ratio(studio.frames(setup, RENDERED, "uniform", seed))
+    return found(point, image.image, ratio=ratio, range_low=low, range_high=high, **image.row())
 
 
-def _range(shoot: Shoot) -> tuple[float, float]:
-    """Part of the full well that a frame takes up without the lamp's light, from dark to bright pixels."""
-    bench = shoot.scene.bench
-    exposer = Exposer(bench.rig, shoot.peak_s, 0)
-    dark = exposer.electrons(shoot.expected.projector_off)
-    frames = [np.percentile(exposer.electrons(frame) - dark, _SPREAD) for frame in shoot.expected]
-    low, high = np.mean(frames, axis=0) / bench.sensor.superpixel_full_well_e
+def _ratio(uniform: Unexposed) -> float:
+    """Light of the lamp over the projector's in frames of ``uniform`` light, on the whole sensor, to two digits."""
+    (white,) = uniform.expected
+    lamp = uniform.expected.projector_off.irradiance.sum()
+    return float(f"{lamp / (white.irradiance.sum() - lamp):.2g}")
+
+
+def _range(frames: Unexposed) -> tuple[float, float]:
+    """Part of the full well that ``frames`` take up without the lamp's light, from dark to bright pixels."""
+    exposer = frames.exposer(frames.seconds(EQUAL_PEAK))
+    dark = exposer.electrons(frames.expected.projector_off)
+    ends = [np.percentile(exposer.electrons(frame) - dark, _SPREAD) for frame in frames.expected]
+    low, high = np.mean(ends, axis=0) / frames.lit.bench.sensor.superpixel_full_well_e
     return float(low), float(high)
 
 
 def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
     ratios = table.distinct("ratio")
-    means = {
-        (ratio, family): table.mean("psnr_db", ratio=ratio, patterns=family) for ratio in ratios for family in FAMILIES
-    }
-    better = [ratio for ratio in ratios if means[ratio, "hadamard:8"].value > means[ratio, "dots:8"].value]
     least, most = ratios[0], ratios[-1]
+    strong = next((ratio for ratio in ratios if ratio >= 1), most)
 
     def told(family: str, ratio: float) -> str:
-        return f"{label(family).lower()} {said(means[ratio, family])}"
+        return f"{label(family).lower()} {table.mean('psnr_db', patterns=family, ratio=ratio)} dB"
 
-    def spread(family: str, ratio: float) -> str:
-        own: dict[str, Value] = {"patterns": family, "ratio": ratio}
-        low, high = (table.mean(name, **own).value for name in ("range_low", "range_high"))
+    def spread(family: str) -> str:
+        rows = table.where(patterns=family, ratio=strong)
+        low, high = (rows.mean(name).value for name in ("range_low", "range_high"))
         return f"{label(family).lower()} {low:.3f} to {high:.3f}"
 
-    strong = next((ratio for ratio in ratios if ratio >= 1), most)
+    def gain(ratio: float) -> float:
+        hadamard, dots = (table.mean("psnr_db", patterns=name, ratio=ratio).value for name in ("hadamard:8", "dots:8"))
+        return hadamard - dots
+
     dots, hadamard = (table.mean("range_high", patterns=name, ratio=strong).value for name in ("dots:8", "hadamard:8"))
+    better = [ratio for ratio in ratios if gain(ratio) > 0]
     beyond = better == [ratio for ratio in ratios if better and ratio >= better[0]]
+    where = f"from {better[0]:g} times on" if better else "at no ratio"
     return [
         Claim(
             "Under strong ambient light dots keep less dynamic range than Hadamard patterns (part of the full well)",
             "0 to 0.02 against 0.06 to 0.17", "not simulated",
-            f"lamp {strong:g} times: {spread('dots:8', strong)}, {spread('hadamard:8', strong)}",
-            "confirmed" if dots < hadamard else "not confirmed",
+            f"lamp {strong:g} times: {spread('dots:8')}, {spread('hadamard:8')}", verdict(dots < hadamard),
         ),
         Claim(
             "Hadamard patterns are better under strong ambient light", "better", "not simulated",
-            f"from {better[0]:g} times on; {told('dots:8', most)}, {told('hadamard:8', most)} at {most:g}" if better
-            else f"at no ratio; {told('dots:8', most)}, {told('hadamard:8', most)} at {most:g}",
-            ("confirmed" if beyond else "confirmed only at some ratios") if better else "not confirmed",
+            f"{where}; {told('dots:8', most)}, {told('hadamard:8', most)} at {most:g}",
+            "confirmed only at some ratios" if better and not beyond else verdict(bool(better)),
         ),
         Claim(
             "Dots are preferred when ambient light is not strong: they take half the frames", "preferred",
             "not simulated", f"{told('dots:8', least)}, {told('hadamard:8', least)} at {least:g}",
-            "confirmed" if least not in better else "not confirmed",
+            verdict(least not in better),
         ),
     ]  # fmt: skip
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    shown = {label(family): table.means("psnr_db", "ratio", patterns=family) for family in FAMILIES}
-    spans = {label(family): table.means("range_high", "ratio", patterns=family) for family in FAMILIES}
-    axis = "lamp's light over the projector's [1]"
+    axis, lines = "lamp's light over the projector's [1]", by_patterns(table)
+
+    def panel(title: str, column: str, said: str) -> Figure:
+        shown = {name: rows.means(column, "ratio") for name, rows in lines.items()}
+        return curves({f"{title}, the lamp's frame taken off": shown}, axis, said, log=True)
+
     drawn = {
-        "psnr.png": curves({"equal peak, the lamp's frame taken off": shown}, axis, log=True),
-        "range.png": curves(
-            {"brightest pixels, the lamp's frame taken off": spans}, axis, "part of the full well [1]", log=True
-        ),
+        "psnr.png": panel("equal peak", "psnr_db", "PSNR [dB]"),
+        "range.png": panel("brightest pixels", "range_high", "part of the full well [1]"),
     }
-    first = table.rows[0]["seed"]
-    drawn["images.png"] = image_grid(
-        {
-            label(family): [
-                (results.images[image_name(row)], f"{row['psnr_db']:.1f} dB")
-                for row in table.where(patterns=family, seed=first).rows
-            ]
-            for family in FAMILIES
-        },
-        [f"lamp {ratio:g}" for ratio in table.distinct("ratio")],
-    )
+    ratios: list[Value] = table.distinct("ratio")
+    if grid := pictured(results, lines, "ratio", ratios):
+        drawn["images.png"] = image_grid(grid, [f"lamp {ratio:g}" for ratio in table.distinct("ratio")])
     return drawn
 
 
 EXPERIMENT = Experiment(
-    name="ambient",
-    title="A lamp beside the projector",
-    question="How much ambient light does each kind of pattern stand?",
-    points=_points,
-    measure=_measure,
-    claims=_claims,
-    figures=_figures,
-)
+    "ambient",
+    "A lamp beside the projector",
+    "How much ambient light does each kind of pattern stand?",
+    _points, _measure, _claims, _figures,
+)  # fmt: skip

@@ -10,15 +10,17 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.study.charts import curves, image_grid
-from mitsim.study.compare import label
-from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope, thumbnail
-from mitsim.study.paper.measure import captioned, image_name, said
-from mitsim.study.pictures import QUICK_IMAGES
-from mitsim.study.studio import IDEALISED, MODELS, RENDERED, Studio
+from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.study.exposures import EQUAL_PEAK, MODELS
+from mitsim.study.paper.measure import by_patterns, by_print, found, judged, panels, pictured
+from mitsim.study.studio import Image, Studio
+from mitsim.study.table import Table
 
 BINNINGS = (1, 2, 4, 8)
 """Pixels a side that are averaged: the paper's 512 to 64 pixels a side."""
+_FINE, _COARSE = BINNINGS[0], BINNINGS[-1]
 FAMILIES = ("uniform", "dots:5", "dots:7")
+_SHOWN = ("uniform", "dots:7")
 _STABLE_DB = 3.0
 """What an image may lose and still be called stable: half of its squared error is then as before."""
 
@@ -28,87 +30,60 @@ def _points(scope: Scope) -> Sequence[Point]:
         Point.of(scope.setup.printed(name), model=model, patterns=family, binning=binning, seed=seed)
         for name in scope.pictures
         for seed in scope.seeds
-        for family in scope.chosen(FAMILIES, ("uniform", "dots:7"))
-        for binning in scope.chosen(BINNINGS, (1, 8))
+        for family in scope.chosen(FAMILIES, _SHOWN)
+        for binning in scope.chosen(BINNINGS, (_FINE, _COARSE))
         for model in MODELS
     ]
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    setup, binning = point.setup, int(point["binning"])
-    shoot = studio.shoot(setup, point["model"], point["patterns"], int(point["seed"]))
+    binning = int(point["binning"])
+    frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
     # With fewer data than unknowns noise cannot be told, nor lambda chosen by it.
-    found = shoot.image(shoot.peak_s, "best", binning)
-    pixels = studio.bench(setup).geometry.pixels // binning
-    row = {"picture": setup.picture, **dict(setup.parameters), **dict(point.values), "pixels": pixels, **found.row()}
-    shown = setup.picture in (*QUICK_IMAGES, None) and point["patterns"] != "dots:5"
-    images = {image_name(row): thumbnail(found.image)} if shown else {}
-    return Found((row,), images)
+    image = Image.of(frames, frames.seconds(EQUAL_PEAK), "best", binning)
+    pixels = frames.lit.bench.geometry.pixels // binning
+    return found(point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    means = {
-        (model, family, binning): results.table.mean("psnr_db", model=model, patterns=family, binning=binning)
-        for model in MODELS
-        for family in ("uniform", "dots:7")
-        for binning in (BINNINGS[0], BINNINGS[-1])
-    }
+    def lost(family: str, rows: Table) -> tuple[str, float]:
+        fine, coarse = (rows.mean("psnr_db", patterns=family, binning=binning) for binning in (_FINE, _COARSE))
+        return f"{fine} to {coarse} dB", fine.value - coarse.value
 
-    def told(family: str) -> list[str]:
-        return [
-            " to ".join(said(means[model, family, binning]) for binning in (1, 8)) for model in (IDEALISED, RENDERED)
-        ]
+    def stable(rows: Table) -> tuple[str, bool]:
+        said, loss = lost("dots:7", rows)
+        return said, loss <= _STABLE_DB
 
-    lost = {
-        (model, family): means[model, family, 1].value - means[model, family, 8].value
-        for model in MODELS
-        for family in ("uniform", "dots:7")
-    }
-    holds = [model for model in MODELS if lost[model, "dots:7"] <= _STABLE_DB]
-    degrades = all(lost[model, "uniform"] > 0 for model in MODELS)
-    better = all(means[model, "dots:7", 8].value > means[model, "uniform", 1].value for model in MODELS)
-    stable = "confirmed" if len(holds) == 2 else f"confirmed only {holds[0]}" if holds else "not confirmed"
-    gains = [f"{means[model, 'dots:7', 8].value - means[model, 'uniform', 1].value:+.1f} dB" for model in MODELS]
-    dots, uniform = told("dots:7"), told("uniform")
+    def degrades(rows: Table) -> tuple[str, bool]:
+        said, loss = lost("uniform", rows)
+        return said, loss > 0
+
+    def better(rows: Table) -> tuple[str, bool]:
+        dots = rows.mean("psnr_db", patterns="dots:7", binning=_COARSE).value
+        gain = dots - rows.mean("psnr_db", patterns="uniform", binning=_FINE).value
+        return f"{gain:+.1f} dB", gain > 0
+
+    table = results.table
     return [
-        Claim("49 dots are stable down to 64 x 64 pixels (3 dB lost at most)", "stable", dots[0], dots[1], stable),
-        Claim(
-            "Uniform light degrades with fewer pixels", "degrades", uniform[0], uniform[1],
-            "confirmed" if degrades else "not confirmed",
-        ),
-        Claim(
-            "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512", "better",
-            gains[0], gains[1],
-            "confirmed" if better else "not confirmed",
-        ),
-    ]  # fmt: skip
+        judged(table, "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)", "stable", stable),
+        judged(table, "Uniform light degrades with fewer pixels", "degrades", degrades),
+        judged(table, "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512", "better", better),
+    ]
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    panels = {
-        model: {
-            label(family): table.means("psnr_db", "pixels", model=model, patterns=family)
-            for family in table.distinct("patterns")
-        }
-        for model in MODELS
-    }
-    drawn = {"psnr.png": curves(panels, "sensor pixels a side, equal peak", log=True)}
-    for family in ("uniform", "dots:7"):
-        shown = table.distinct("binning")
-        grid = captioned(results, "binning", shown, patterns=family)
-        pixels = [table.where(binning=binning).distinct("pixels")[0] for binning in shown]
-        if grid:
+    drawn = {"psnr.png": curves(panels(by_patterns(table), "pixels"), "sensor pixels a side, equal peak", log=True)}
+    pixels = table.distinct("pixels")
+    for family in _SHOWN:
+        if grid := pictured(results, by_print(table.where(patterns=family)), "pixels", pixels):
             drawn[f"images_{family.replace(':', '')}.png"] = image_grid(grid, [f"{each} x {each}" for each in pixels])
     return drawn
 
 
 EXPERIMENT = Experiment(
-    name="binning",
-    title="How many sensor pixels",
-    question="What is left where the sensor has fewer pixels than the image, with one frame and with 49?",
-    points=_points,
-    measure=_measure,
-    claims=_claims,
-    figures=_figures,
-)
+    "binning",
+    "How many sensor pixels",
+    "What is left where the sensor has fewer pixels than the image, with one frame and with 49?",
+    _points, _measure, _claims, _figures,
+)  # fmt: skip

@@ -1,137 +1,180 @@
-"""What experiments of the paper share: an image at a point, captions, and verdicts on what the paper states."""
+"""What experiments of the paper share: findings at a point, curves and rows of images, and verdicts on claims."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from mitsim.core.arrays import FloatArray
-from mitsim.reconstruct.solver import prepare
-from mitsim.study.experiment import Claim, Found, Point, Results, thumbnail
+from mitsim.study.charts import Curve
+from mitsim.study.compare import label
+from mitsim.study.experiment import IMAGE, Claim, Found, Point, Results
+from mitsim.study.exposures import EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.study.pictures import QUICK_IMAGES
-from mitsim.study.studio import IDEALISED, MODELS, RENDERED, Studio
-from mitsim.study.table import Mean, Table, Value
+from mitsim.study.studio import Studio
+from mitsim.study.table import Table, Value
 
-_NAMED = ("picture", "model", "patterns", "exposure", "seed", "mask_distance", "binning", "method", "ratio")
-"""Columns that tell images apart."""
 TOLERANCE_DB = 2.0
 """How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""
-_SHOWN_PRINTS = QUICK_IMAGES
-"""Test images whose reconstructions are shown."""
+Lines = Mapping[str, Table]
+"""Rows of a table by what they are called in a figure."""
+
+
+def found(point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
+    """What a point came to, in one row.
+
+    Parameters
+    ----------
+    point
+        that was measured.
+    image
+        of it, where it is to be shown; kept for a few prints.
+    **measured
+        columns of the row.
+    """
+    kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
+    return Found((point.row(**measured),), shown(image) if kept and image is not None else {})
+
+
+def shown(image: FloatArray) -> dict[str, FloatArray]:
+    """An ``image`` as findings keep it: single precision shows all that a page can."""
+    return {IMAGE: image.astype("float32")}
 
 
 def imaged(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:
-    """The image of a point, kept where it is shown with the singular values of the rendered model.
+    """The image that a user gets at a point with model, patterns, exposure and seed.
 
     Parameters
     ----------
-    studio
-        where it is made.
-    point
-        with model, patterns, exposure, seed, and what else varies.
+    studio, point
+        where it is made, and what varies.
     shown
         patterns whose images are kept.
     """
-    setup, values = point.setup, dict(point.values)
-    model, patterns, seed = str(point["model"]), str(point["patterns"]), int(point["seed"])
-    exposure = str(values.get("exposure", "equal peak"))
-    found = studio.image(setup, model, patterns, seed, exposure)
-    family = studio.bench(setup).family(patterns, seed)
-    count = family.left.shape[1] * family.right.shape[1]
-    row = {"picture": setup.picture, **dict(setup.parameters), **values, "patterns_count": count, **found.row()}
-    images: dict[str, FloatArray] = {}
-    if patterns in shown and (setup.picture in _SHOWN_PRINTS or setup.picture is None):
-        images[image_name(row)] = thumbnail(found.image)
-    if patterns in shown and model == RENDERED:
-        factors = studio.factors(setup, seed)
-        prepared = prepare(factors.left, factors.right, family.left, family.right, centre=factors.manifest.centre)
-        images[f"spectrum {patterns}"] = prepared.left.singular**2
-    return Found((row,), images)
+    values = dict(point.values)
+    patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
+    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure)
+    return found(point, image.image if patterns in shown else None, **image.row())
 
 
-def captioned(
-    results: Results, across: str, columns: Sequence[Value], **fixed: Value
-) -> dict[str, list[tuple[FloatArray, str]]]:
-    """Rows of an image grid: each shown print in both models, by the value ``across`` its ``columns``.
+def by_patterns(table: Table, families: Collection[str] | None = None) -> Lines:
+    """The rows of each pattern family in a ``table``, or of those of ``families``."""
+    there = table.distinct("patterns")
+    return {label(name): table.where(patterns=name) for name in there if families is None or name in families}
+
+
+def panels(lines: Lines, by: str, column: str = "psnr_db") -> Mapping[str, Mapping[str, Curve]]:
+    """Means of both models side by side.
 
     Parameters
     ----------
-    results
-        of points that :func:`imaged` measured.
-    across, columns
-        what varies along a row, and its values.
-    **fixed
-        of all else that varies; the first that was measured otherwise.
+    lines
+        rows by name.
+    by, column
+        columns: along the axis, and up.
     """
-    rows: dict[str, list[tuple[FloatArray, str]]] = {}
-    for print_ in (*_SHOWN_PRINTS, None):
-        for model in MODELS:
-            chosen = results.table.where(picture=print_, model=model, **fixed)
-            cells = [_cell(results, chosen.where(**{across: value})) for value in columns]
-            found = [cell for cell in cells if cell is not None]
-            if len(found) == len(columns):
-                rows[f"{print_ or 'scene'}, {model}"] = found
-    return rows
+    return {
+        model: {name: rows.where(model=model).means(column, by) for name, rows in lines.items()} for model in MODELS
+    }
 
 
-def said(mean: Mean) -> str:
-    """A ``mean`` PSNR as people read it."""
-    return f"{mean} dB"
-
-
-def stated(results: Results, claim: str, band: tuple[float, float], **values: Value) -> Claim:
-    """A claim of PSNR within a ``band`` [dB], for rows with these ``values``: at which exposures it holds.
-
-    Parameters
-    ----------
-    results
-        of all points.
-    claim, band
-        what the paper says.
-    **values
-        patterns, and what else it says it of.
-    """
-    table = results.table.where(**values)
-    exposures = table.distinct("exposure") or [None]
-    means = {
-        model: {each: table.mean("psnr_db", model=model, **_of(exposure=each)) for each in exposures}
+def by_print(table: Table) -> Lines:
+    """The rows of a ``table`` of each shown print in both models."""
+    return {
+        f"{print_ or 'scene'}, {model}": table.where(picture=print_, model=model)
+        for print_ in (*QUICK_IMAGES, None)
         for model in MODELS
     }
-    low, high = band[0] - TOLERANCE_DB, band[1] + TOLERANCE_DB
-    holds = [each for each in exposures if all(low <= means[model][each].value <= high for model in MODELS)]
-    return Claim(
-        claim,
-        f"{band[0]:g} to {band[1]:g} dB",
-        _by_exposure(means[IDEALISED]),
-        _by_exposure(means[RENDERED]),
-        confirmed(holds, exposures),
-    )
 
 
-def confirmed(holds: Sequence[Value], everywhere: Sequence[Value]) -> str:
-    """The verdict on a claim that ``holds`` at some of the exposures ``everywhere``."""
-    if not holds:
-        return "not confirmed"
-    return "confirmed" if len(holds) == len(everywhere) else f"confirmed only at {' and '.join(map(str, holds))}"
+def pictured(
+    results: Results, lines: Lines, across: str, columns: Sequence[Value], caption: str = "{psnr_db:.1f} dB"
+) -> dict[str, list[tuple[FloatArray, str]]]:
+    """Rows of an image grid, those of which all images were kept.
+
+    Parameters
+    ----------
+    results
+        with the images.
+    lines
+        rows of the table by the grid's.
+    across, columns
+        what varies along a row of the grid, and its values.
+    caption
+        of an image, from its row of the table.
+    """
+    grid = {}
+    for name, rows in lines.items():
+        cells = []
+        for value in columns:
+            kept = ((results.array(row), row) for row in rows.where(**{across: value}).rows)
+            cells += [(image, caption.format(**row)) for image, row in kept if image is not None][:1]
+        if len(cells) == len(columns):
+            grid[name] = cells
+    return grid
 
 
-def _by_exposure(means: dict[Value, Mean]) -> str:
-    if len(means) == 1:
-        return said(next(iter(means.values())))
-    return "; ".join(f"{exposure}: {said(mean)}" for exposure, mean in means.items())
+def judged(table: Table, claim: str, paper: str, judge: Callable[[Table], tuple[str, bool]]) -> Claim:
+    """What becomes of a claim at each way of exposing, in each model.
+
+    Parameters
+    ----------
+    table
+        what was measured.
+    claim, paper
+        what the paper says.
+    judge
+        from the rows of one model and exposure: what they say, and whether the claim holds for them.
+    """
+    exposures: list[Value] = table.distinct("exposure") or [None]
+    said = {
+        (model, each): judge(table.where(model=model) if each is None else table.where(model=model, exposure=each))
+        for model in MODELS
+        for each in exposures
+    }
+    at = [str(each) for each in exposures if all(said[model, each][1] for model in MODELS)]
+    of = [model for model in MODELS if all(said[model, each][1] for each in exposures)]
+    told = {
+        model: "; ".join(
+            said[model, each][0] if len(exposures) == 1 else f"{each}: {said[model, each][0]}" for each in exposures
+        )
+        for model in MODELS
+    }
+    if len(at) == len(exposures):
+        verdict = "confirmed"
+    elif at:
+        verdict = f"confirmed only at {' and '.join(at)}"
+    else:
+        verdict = f"confirmed only {of[0]}" if of else "not confirmed"
+    return Claim(claim, paper, told[IDEALISED], told[RENDERED], verdict)
 
 
-def _of(**values: Value) -> dict[str, Value]:
-    return {name: value for name, value in values.items() if value is not None}
+def stated(table: Table, claim: str, band: tuple[float, float]) -> Claim:
+    """A claim of PSNR within a band.
+
+    Parameters
+    ----------
+    table
+        rows that it is said of.
+    claim, band
+        what the paper says [dB].
+    """
+
+    def judge(rows: Table) -> tuple[str, bool]:
+        mean = rows.mean("psnr_db")
+        return f"{mean} dB", band[0] - TOLERANCE_DB <= mean.value <= band[1] + TOLERANCE_DB
+
+    return judged(table, claim, f"{band[0]:g} to {band[1]:g} dB", judge)
 
 
-def _cell(results: Results, rows: Table) -> tuple[FloatArray, str] | None:
-    for row in rows.rows:
-        for name, image in results.images.items():
-            if name == image_name(row):
-                return image, f"{row['psnr_db']:.1f} dB"
-    return None
+def verdict(holds: bool) -> str:
+    """On a claim that ``holds`` or not."""
+    return "confirmed" if holds else "not confirmed"
 
 
-def image_name(row: Mapping[str, Value]) -> str:
-    """Name of the image that a ``row`` is of."""
-    return " ".join(str(row[part]) for part in _NAMED if row.get(part) is not None)
+def bars(lines: Lines, column: str = "psnr_db") -> Mapping[str, tuple[float, float]]:
+    """Means of a ``column`` in both models, by the names of ``lines``."""
+    means = {
+        name: [rows.where(model=model).mean(column).value for model in (IDEALISED, RENDERED)]
+        for name, rows in lines.items()
+    }
+    return {name: (idealised, rendered) for name, (idealised, rendered) in means.items()}

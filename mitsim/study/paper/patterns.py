@@ -6,16 +6,18 @@ Paper, section IV-B and figure 4: singular values, and the mean PSNR of eight te
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from matplotlib.figure import Figure
 
 from mitsim.study.charts import curves, image_grid
-from mitsim.study.compare import CONVENTIONS, label
+from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
-from mitsim.study.paper.measure import captioned, confirmed, imaged, stated
+from mitsim.study.exposures import CONVENTIONS, EQUAL_FRAME, MODELS, RENDERED
+from mitsim.study.paper.measure import by_print, imaged, judged, panels, pictured, stated
 from mitsim.study.plots import singular_values
-from mitsim.study.studio import EQUAL_FRAME, IDEALISED, MODELS, RENDERED, Studio
-from mitsim.study.table import Value
+from mitsim.study.studio import Studio
+from mitsim.study.table import Table
 
 FAMILIES = (
     "uniform", "random:2", "random:4", "random:5", "random:7", "random:8", "dots:2", "dots:3", "dots:4", "dots:5",
@@ -26,93 +28,80 @@ _KINDS = {"dots": "shifting dots", "hadamard": "repeated Hadamard", "random": "r
 _UNIFORM, _DOTS = (21.0, 23.0), (34.0, 35.5)
 """Decibels in the paper's figures 4 to 6, of one uniform pattern and of 49 dots, mask at 2000 um."""
 _SHOWN = ("uniform", "random:7", "dots:4", "dots:7", "hadamard:8")
+_SPECTRUM = "spectrum"
+"""Squares of the left factor's singular values, of the calibrated camera with the family's patterns."""
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    """All families on every print, each way of exposing them, in both models."""
-    families = scope.chosen(FAMILIES, _FEW)
-    conventions = scope.chosen(CONVENTIONS, CONVENTIONS[:2])
     return [
         Point.of(scope.setup.printed(name), model=model, patterns=family, exposure=exposure, seed=seed)
         for name in scope.pictures
         for seed in scope.seeds
-        for family in families
-        for exposure in conventions
+        for family in scope.chosen(FAMILIES, _FEW)
+        for exposure in scope.chosen(CONVENTIONS, CONVENTIONS[:2])
         for model in MODELS
     ]
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    """Image and quality; what the family's model is conditioned like."""
-    return imaged(studio, point, shown=_SHOWN)
+    frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
+    made = imaged(studio, point, _SHOWN)
+    count = frames.family.left.shape[1] * frames.family.right.shape[1]
+    arrays = dict(made.arrays)
+    if point["patterns"] in _SHOWN and point["model"] == RENDERED:
+        arrays[_SPECTRUM] = frames.prepared().left.singular ** 2
+    return replace(made, rows=tuple({**row, "patterns_count": count} for row in made.rows), arrays=arrays)
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    """The paper's."""
     table = results.table
-    exposures = table.distinct("exposure")
     return [
-        stated(results, "One uniform pattern gives 21 to 23 dB", _UNIFORM, patterns="uniform"),
-        stated(results, "49 shifting dots give 34 to 35.5 dB", _DOTS, patterns="dots:7"),
-        _compared(results, "More dots, better images (49 against 4)", "dots:7", "dots:2", exposures),
-        _compared(results, "Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7", exposures),
-        _compared(
-            results, "Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8", exposures
-        ),
+        stated(table.where(patterns="uniform"), "One uniform pattern gives 21 to 23 dB", _UNIFORM),
+        stated(table.where(patterns="dots:7"), "49 shifting dots give 34 to 35.5 dB", _DOTS),
+        _better(table, "More dots, better images (49 against 4)", "dots:7", "dots:2"),
+        _better(table, "Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
+        _better(table, "Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),
     ]
 
 
-def _compared(results: Results, claim: str, better: str, other: str, exposures: Sequence[Value]) -> Claim:
-    """A claim that one family is ``better`` than an ``other``: at which exposures it is, rendered and idealised."""
-    told: dict[str, list[str]] = {model: [] for model in MODELS}
-    holds: list[Value] = []
-    for exposure in exposures:
-        gains = []
-        for model in MODELS:
-            one, two = (results.table.where(model=model, exposure=exposure, patterns=name) for name in (better, other))
-            if not (len(one) and len(two)):
-                return Claim(claim, "higher", "not measured", "not measured", "not measured")
-            gains.append(one.mean("psnr_db").value - two.mean("psnr_db").value)
-            told[model].append(f"{exposure}: {gains[-1]:+.1f} dB")
-        if min(gains) > 0:
-            holds.append(exposure)
-    return Claim(claim, "higher", "; ".join(told[IDEALISED]), "; ".join(told[RENDERED]), confirmed(holds, exposures))
+def _better(table: Table, claim: str, better: str, other: str) -> Claim:
+    """A claim that one family is ``better`` than an ``other``."""
+
+    def judge(rows: Table) -> tuple[str, bool]:
+        one, two = (rows.mean("psnr_db", patterns=name).value for name in (better, other))
+        return f"{one - two:+.1f} dB", one > two
+
+    return judged(table, claim, "higher", judge)
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
-    """PSNR by the number of patterns, the conditioning, and images."""
     table, drawn = results.table, {}
     for exposure in table.distinct("exposure"):
-        panels = {
-            model: {
-                said_kind: {
-                    row["patterns_count"]: table.mean(
-                        "psnr_db", model=model, exposure=exposure, patterns=row["patterns"]
-                    )
-                    for row in table.where(model=model, exposure=exposure).rows
-                    if str(row["patterns"]).split(":")[0] in (kind, "uniform")
-                }
-                for kind, said_kind in _KINDS.items()
-            }
-            for model in MODELS
+        lines = {
+            said: Table(tuple(row for row in table.where(exposure=exposure).rows if _is(row["patterns"], kind)))
+            for kind, said in _KINDS.items()
         }
-        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(panels, f"patterns, {exposure}")
-    spectra = {label(family): results.images[f"spectrum {family}"]
-               for family in _SHOWN if f"spectrum {family}" in results.images}  # fmt: skip
-    if spectra:
-        drawn["singular_values.png"] = singular_values(spectra)
-    grid = captioned(results, "patterns", _SHOWN, exposure=EQUAL_FRAME)
+        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
+            panels(lines, "patterns_count"), f"patterns, {exposure}"
+        )
+    spectra = {
+        label(str(row["patterns"])): found for row in table.rows if (found := results.array(row, _SPECTRUM)) is not None
+    }
+    drawn["singular_values.png"] = singular_values(spectra)
+    grid = pictured(results, by_print(table.where(exposure=EQUAL_FRAME)), "patterns", _SHOWN)
     if grid:
         drawn["images.png"] = image_grid(grid, [label(family) for family in _SHOWN])
     return drawn
 
 
+def _is(patterns: object, kind: str) -> bool:
+    """Whether ``patterns`` are of a ``kind``; one uniform pattern is the first of each."""
+    return str(patterns).partition(":")[0] in (kind, "uniform")
+
+
 EXPERIMENT = Experiment(
-    name="patterns",
-    title="Which patterns, and how many",
-    question="What do uniform, random, shifting-dots and Hadamard patterns recover, by their number and exposure?",
-    points=_points,
-    measure=_measure,
-    claims=_claims,
-    figures=_figures,
-)
+    "patterns",
+    "Which patterns, and how many",
+    "What do uniform, random, shifting-dots and Hadamard patterns recover, by their number and exposure?",
+    _points, _measure, _claims, _figures,
+)  # fmt: skip

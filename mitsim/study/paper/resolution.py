@@ -14,24 +14,29 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.figure import Figure
 
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.study.charts import curves, image_grid
-from mitsim.study.compare import label
-from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope, thumbnail
-from mitsim.study.paper.measure import image_name
-from mitsim.study.studio import EQUAL_FRAME, IDEALISED, MODELS, RENDERED, Studio
-from mitsim.study.table import Mean, Table, Value
+from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.study.exposures import EQUAL_FRAME, MODELS, LitScene
+from mitsim.study.paper.measure import by_patterns, judged, panels, pictured, shown
+from mitsim.study.pictures import PRINT_MM
+from mitsim.study.studio import Studio
+from mitsim.study.table import Table
 from mitsim.study.transfer import contrast, modulation, slanted_edge
 
 PAIRS_A_MM = (0.13, 0.17, 0.21, 0.26, 0.35, 0.43, 0.52, 0.6)
 """The paper's groups 20 to 5, and one that no pixel of 0.9375 mm can tell."""
 FAMILIES = ("uniform", "dots:3", "dots:4", "dots:7")
-PIXEL_MM = 120 / 128
-"""Of the image, on the print: 120 mm of it are lit."""
 _TOLD = 0.1
 """Contrast below which bars are not told apart: what the eye needs of a print."""
-_SEEN = slice(16, -16)
+_SEEN, _BESIDE = slice(16, -16), slice(8, -8)
 """Pixels that are looked at: the margin is beside the bars of the sheet's other half, or beyond the print."""
 _FINEST = 0.52  # the paper's group 5
+_COARSE = 0.35
+"""Cycles a pixel up to which the truth must show bars: pixels that average over them leave 0.8 of their contrast."""
+_SHOWS = 0.4
+"""Contrast that the truth must have of such bars: half of what print and pixels leave."""
 
 
 def _points(scope: Scope) -> Sequence[Point]:
@@ -47,105 +52,88 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    name, values = str(point.setup.picture), dict(point.values)
-    found = studio.image(point.setup, point["model"], point["patterns"], int(point["seed"]), EQUAL_FRAME)
-    row: dict[str, Value] = {"picture": name, **dict(point.setup.parameters), **values, **found.row()}
-    kind, _, frequency = name.partition(" ")
+    image = studio.image(point.setup, point["model"], point["patterns"], int(point["seed"]), EQUAL_FRAME)
+    lit = studio.lit(point.setup)
+    kind, _, frequency = str(point.setup.picture).partition(" ")
+    pixel_mm, row = _pixel_mm(lit), point.row(**image.row())
     if kind == "edge":
-        cycles, transfer = slanted_edge(found.image[_SEEN, _SEEN])
-        rows = [
-            {**row, "pairs_a_mm": float(each) / PIXEL_MM, "transfer": float(value)}
-            for each, value in zip(cycles, transfer, strict=True)
-        ]
-        return Found(tuple(rows))
-    left, right = np.split(found.image, 2, axis=1)
-    halves = (left[_SEEN, 8:-8], 0), (right[_SEEN, 8:-8], 1)
-    own = float(frequency) * PIXEL_MM
-    row |= {
-        "pairs_a_mm": float(frequency),
-        "contrast": float(np.mean([modulation(*half, own) for half in halves])),
-        "contrast_of_extremes": float(np.mean([contrast(*half) for half in halves])),
-    }
-    return Found((row,), {image_name(row): thumbnail(found.image)})
+        cycles, transfer = slanted_edge(image.image[_SEEN, _SEEN])
+        pairs = zip(cycles / pixel_mm, transfer, strict=True)
+        return Found(tuple({**row, "pairs_a_mm": float(each), "transfer": float(value)} for each, value in pairs))
+    own = float(frequency) * pixel_mm
+    if own < _COARSE and (there := _contrast(lit.truth, own)) < _SHOWS:
+        raise MitsimError(
+            f"scene {point.setup.scene}: bars of {frequency} line pairs a mm show a contrast of {there:.2f} in its "
+            f"truth; the study needs a print {PRINT_MM:g} mm wide, flat and facing the camera, that fills the image"
+        )
+    extremes = float(np.mean([contrast(*half) for half in _halves(image.image)]))
+    row |= {"pairs_a_mm": float(frequency), "contrast": _contrast(image.image, own), "contrast_of_extremes": extremes}
+    return Found((row,), shown(image.image))
+
+
+def _pixel_mm(lit: LitScene) -> float:
+    """Width of the image's pixels on the print."""
+    depth = lit.light.plan.settings.depth
+    extents = [high - low for low, high in lit.bench.windows_at(depth)]
+    return float(np.mean(extents)) * depth / lit.bench.n
+
+
+def _halves(image: FloatArray) -> list[tuple[FloatArray, int]]:
+    """Bars of each half of an ``image``, without the margins, and the axis along which they lie."""
+    left, right = np.split(image, 2, axis=1)
+    return [(left[_SEEN, _BESIDE], 0), (right[_SEEN, _BESIDE], 1)]
+
+
+def _contrast(image: FloatArray, cycles: float) -> float:
+    """Mean of both halves at so many ``cycles`` a pixel."""
+    return float(np.mean([modulation(*half, cycles) for half in _halves(image)]))
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    bars = results.table
-    finest = {model: {family: _limit(bars, model, family) for family in bars.distinct("patterns")} for model in MODELS}
-    counts = [family for family in bars.distinct("patterns") if family != "uniform"]
-    order = ["uniform", *counts]
-    rises = [all(finest[model][a] <= finest[model][b] for a, b in pairwise(order)) for model in MODELS]
-    told = [
-        ", ".join(f"{label(family).lower()} {finest[model][family]:g}" for family in order)
-        for model in (IDEALISED, RENDERED)
-    ]
-    kept = [
-        f"contrast {bars.mean('contrast', model=model, patterns='dots:7', pairs_a_mm=_FINEST).value:.2f}"
-        for model in (IDEALISED, RENDERED)
-    ]
-    full = all(finest[model]["dots:7"] >= _FINEST for model in MODELS)
+    table = results.table
+
+    def rises(rows: Table) -> tuple[str, bool]:
+        finest = {name: _limit(of_family) for name, of_family in by_patterns(rows).items()}
+        said = ", ".join(f"{name.lower()} {limit:g}" for name, limit in finest.items())
+        return said, all(fewer <= more for fewer, more in pairwise(finest.values()))
+
+    def apart(rows: Table) -> tuple[str, bool]:
+        dots = rows.where(patterns="dots:7")
+        return f"contrast {dots.mean('contrast', pairs_a_mm=_FINEST).value:.2f}", _limit(dots) >= _FINEST
+
+    resolution = "Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm)"
     return [
-        Claim(
-            "Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm)", "rises",
-            told[0], told[1], "confirmed" if all(rises) else "not confirmed",
-        ),
-        Claim(
-            "49 patterns tell 0.52 line pairs a mm apart", "told apart",
-            kept[0], kept[1], "confirmed" if full else "not confirmed",
-        ),
-    ]  # fmt: skip
+        judged(table, resolution, "rises", rises),
+        judged(table, f"49 patterns tell {_FINEST} line pairs a mm apart", "told apart", apart),
+    ]
 
 
-def _limit(bars: Table, model: str, family: str) -> float:
+def _limit(rows: Table) -> float:
     """Finest bars up to which all are told apart; 0 for none."""
     limit = 0.0
-    for pairs in sorted(bars.where(model=model, patterns=family).distinct("pairs_a_mm")):
-        rows = bars.where(model=model, patterns=family, pairs_a_mm=pairs)
-        if not rows.numbers("contrast"):
-            continue
-        if rows.mean("contrast").value < _TOLD:
+    for pairs, mean in sorted(rows.means("contrast", "pairs_a_mm").items()):
+        if mean.value < _TOLD:
             break
         limit = float(pairs)
     return limit
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn = results.table, {}
-    for column, file, axis in (("contrast", "contrast", "contrast [1]"), ("transfer", "edge", "transfer [1]")):
-        panels = {}
-        for model in MODELS:
-            shown = {}
-            for family in table.distinct("patterns"):
-                own = table.where(model=model, patterns=family)
-                found: dict[float, Mean] = {}
-                for pairs in sorted(own.distinct("pairs_a_mm")):
-                    at = own.where(pairs_a_mm=pairs)
-                    if at.numbers(column):
-                        found[float(pairs)] = at.mean(column)
-                shown[label(family)] = found
-            panels[model] = shown
-        drawn[f"{file}.png"] = curves(panels, "line pairs a mm of the print", axis, ticks=False)
-    names = [str(name) for name in table.distinct("picture") if str(name).startswith("bars")]
-    grid = {
-        f"{label(family)}, {model}": [
-            (results.images[image_name(row)], f"contrast {row['contrast']:.2f}")
-            for name in names
-            for row in table.where(model=model, patterns=family, picture=name).rows[:1]
-        ]
-        for family in table.distinct("patterns")
-        for model in MODELS
-    }
-    if names:
-        drawn["images.png"] = image_grid(grid, [name.replace("bars ", "") for name in names])
+    table, drawn, lines = results.table, {}, by_patterns(results.table)
+    for column, file in (("contrast", "contrast"), ("transfer", "edge")):
+        drawn[f"{file}.png"] = curves(
+            panels(lines, "pairs_a_mm", column), "line pairs a mm of the print", f"{column} [1]", ticks=False
+        )
+    names = [name for name in table.distinct("picture") if name.startswith("bars")]
+    both = {f"{name}, {model}": rows.where(model=model) for name, rows in lines.items() for model in MODELS}
+    grid = pictured(results, both, "picture", names, "contrast {contrast:.2f}")
+    drawn["images.png"] = image_grid(grid, [name.replace("bars ", "") for name in names])
     return drawn
 
 
 EXPERIMENT = Experiment(
-    name="resolution",
-    title="How fine",
-    question="Which bars are told apart, and how much contrast does an edge keep?",
-    points=_points,
-    measure=_measure,
-    claims=_claims,
-    figures=_figures,
-)
+    "resolution",
+    "How fine",
+    "Which bars are told apart, and how much contrast does an edge keep?",
+    _points, _measure, _claims, _figures,
+)  # fmt: skip

@@ -10,10 +10,9 @@ from matplotlib.figure import Figure
 
 from mitsim.core.errors import MitsimError
 from mitsim.study.charts import curves
-from mitsim.study.compare import CONVENTIONS
-from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope, Setup
+from mitsim.study.experiment import Claim, Experiment, Point, Results, Scope, Setup
+from mitsim.study.exposures import CONVENTIONS, EQUAL_PEAK, RENDERED
 from mitsim.study.paper.measure import imaged
-from mitsim.study.studio import EQUAL_PEAK, RENDERED, Studio
 from mitsim.study.table import Value
 
 MEASURES = {
@@ -29,9 +28,7 @@ _KNOBS = ("patterns", "exposure", "seed")
 """What may be varied besides scene parameters and the accuracy."""
 _MOST = 10_000
 """Points of one sweep: more are a typing error."""
-
-
-_OTHERS = {"picture", "model", "patterns_count", "shots", "exposure_s", "flagged", "lambda", "psnr_db", "ssim"} | {
+_OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "lambda", "psnr_db", "ssim"} | {
     column for column, _ in MEASURES.values()
 }
 """Columns that are no knob."""
@@ -72,6 +69,8 @@ def _points(scope: Scope) -> Sequence[Point]:
             "study sweep: nothing is varied; give --over NAME=FIRST:LAST:COUNT, such as roughness=0.1:0.5:5"
         )
     names, values = [name for name, _ in scope.sweep], [each for _, each in scope.sweep]
+    if taken := _OTHERS.intersection(names):
+        raise MitsimError(f"--over {taken.pop()}: is a column of every study's table; give the parameter another name")
     found = []
     for chosen in product(*values):
         setting = dict(zip(names, chosen, strict=True))
@@ -81,8 +80,8 @@ def _points(scope: Scope) -> Sequence[Point]:
             knobs: dict[str, Value] = {name: setting.get(name, other) for name, other in fixed.items()}
             if knobs["exposure"] not in CONVENTIONS:
                 raise MitsimError(f"--over exposure={knobs['exposure']}: use {', '.join(CONVENTIONS)}")
-            varied = {f"{name} ": value for name, value in setting.items() if name not in _KNOBS}
-            found.append(Point.of(setup, model=RENDERED, **{**knobs, "seed": _whole(knobs["seed"]), **varied}))
+            light = {name: setting[name] for name in ("accuracy",) if name in setting}
+            found.append(Point.of(setup, model=RENDERED, **{**knobs, "seed": _whole(knobs["seed"]), **light}))
     if len(found) > _MOST:
         raise MitsimError(f"study sweep: {len(found)} points; give at most {_MOST}")
     # Those of one setup together: they share its light.
@@ -95,11 +94,6 @@ def _setup(setup: Setup, setting: Mapping[str, str]) -> Setup:
     parameters = {name: value for name, value in setting.items() if name not in (*_KNOBS, "accuracy")}
     changed = setup.changed(**parameters)
     return replace(changed, accuracy=_number(setting["accuracy"])) if "accuracy" in setting else changed
-
-
-def _measure(studio: Studio, point: Point) -> Found:
-    found = imaged(studio, point)
-    return Found(tuple({name.strip(): value for name, value in row.items()} for row in found.rows))
 
 
 def _claims(_: Results) -> Sequence[Claim]:
@@ -149,12 +143,4 @@ def _is_number(value: Value) -> bool:
     return True
 
 
-EXPERIMENT = Experiment(
-    name="sweep",
-    title="A sweep",
-    question="What does a knob do to the image?",
-    points=_points,
-    measure=_measure,
-    claims=_claims,
-    figures=_figures,
-)
+EXPERIMENT = Experiment("sweep", "A sweep", "What does a knob do to the image?", _points, imaged, _claims, _figures)

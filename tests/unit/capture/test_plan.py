@@ -155,9 +155,9 @@ def test_settings_do_not_depend_on_the_machines_pace() -> None:
     }
     slow = replace(EVIDENCE, **efforts, forming=replace(EVIDENCE.forming, seconds=1.0))
     for accuracy in ACCURACIES:
-        assert plan(accuracy).settings == plan(accuracy, slow).settings
-        assert plan(accuracy).sampling_target == plan(accuracy, slow).sampling_target
-        assert plan(accuracy).predicted_seconds < plan(accuracy, slow).predicted_seconds
+        one, other = plan(accuracy), plan(accuracy, slow)
+        assert one.settings == other.settings and one.sampling_target == other.sampling_target
+        assert one.predicted_seconds < other.predicted_seconds
 
 
 @pytest.mark.parametrize("accuracy", [0.0, -1e-3, 1e-7, 0.5, math.nan, math.inf])

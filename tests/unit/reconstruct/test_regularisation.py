@@ -78,7 +78,10 @@ def psnr(image, truth):
     return -10 * np.log10(np.mean((image - truth) ** 2))
 
 
-@pytest.mark.parametrize(("k", "peak", "read_noise"), [(1, 1e4, 2.24), (5, 1e4, 2.24), (7, 1e4, 2.24), (7, 15.0, 7.4)])
+@pytest.mark.parametrize(
+    ("k", "peak", "read_noise"),
+    [(1, 1e4, 2.24), (5, 1e4, 2.24), (7, 15.0, 7.4), pytest.param(7, 1e4, 2.24, marks=pytest.mark.slow)],
+)
 def test_automatic_lambda_is_within_half_a_decibel_of_the_oracle(factor, photograph, k, peak, read_noise):
     # Poisson noise is not of one variance, as the score assumes, there are up to 12.8 million data for 16384
     # unknowns, and at 15 electrons little is left of the image: all this the score must survive.
@@ -144,7 +147,7 @@ def test_noise_of_the_calibration_counts(factor, photograph):
 
 
 @pytest.mark.parametrize("distance", [0.5, 0.75])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_noise_within_the_models_range_counts_where_it_is_more(photograph, distance, seed):
     """Noise that is a fifth stronger within the range, and that both halves of the sensor agree on: taken for an image
     behind a mask near the sensor, whose shadows hardly differ, it is one of -55 dB. At most 2.9 dB are lost where 77 to

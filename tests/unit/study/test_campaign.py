@@ -4,12 +4,14 @@ import csv
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.study import campaign
 from mitsim.study.campaign import CampaignResult, Where, merge, run_experiment
 from mitsim.study.experiment import Scope, Setup
 from mitsim.study.points import Shard
@@ -91,9 +93,29 @@ def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path,
     assert merge(parts[1:], tmp_path / "half").missing == len(list((parts[0] / "points").iterdir()))
 
 
-def test_a_killed_worker_loses_its_point_only(run: Run, tmp_path: Path) -> None:
+def test_all_studies_are_sharded_and_merged_too(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On one page. (Planted: parts merged as one study's.)"""
+    monkeypatch.setattr(campaign, "PAPER", (TOY,))
+    parts = [tmp_path / f"part{number}" for number in (1, 2)]
+    for number, part in enumerate(parts, start=1):
+        found = run_experiment("all", SCOPE, part, where=Where(Shard(number, 2), jobs=1))
+        assert found.missing == 6 and not (part / "all.html").exists()
+    joined = merge(parts, tmp_path / "whole")
+    assert not joined.missing and begun(tmp_path) == sorted(ALL)
+    assert [claim.verdict for claim in joined.claims] == ["confirmed"] and joined.figures == (f"{TOY}/squares.png",)
+    assert "Two squared is four" in (tmp_path / "whole" / "all.html").read_text()
+    run("alone")
+    assert contents(tmp_path / "whole" / TOY) == contents(tmp_path / "alone")
+
+
+def test_a_killed_worker_loses_its_point_only(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing that processes leave in their temporary folders stays. (Planted: their folder the parent's.)"""
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     (tmp_path / "fatal b2").write_text("once")
     assert not run().missing
+    assert list(scratch.iterdir()) == []
     assert begun(tmp_path) == sorted([*ALL, "b2"])
     run("whole")
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")

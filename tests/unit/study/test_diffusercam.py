@@ -10,8 +10,8 @@ from mitsim.reconstruct.convolution import ConvolutionalCamera
 from mitsim.reconstruct.dots import Classes
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.sensor import load_sensor
-from mitsim.study.compare import CONVENTIONS
 from mitsim.study.diffusercam import best_image, take
+from mitsim.study.exposures import CONVENTIONS
 from mitsim.study.metrics import psnr
 
 N = 12

@@ -10,8 +10,8 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.study import EXPERIMENTS, PAPER, find_experiment
 from mitsim.study.campaign import Where, run_experiment
-from mitsim.study.experiment import Results, Scope, Setup
-from mitsim.study.paper.measure import confirmed, stated
+from mitsim.study.experiment import IMAGE, Results, Scope, Setup
+from mitsim.study.paper.measure import judged, pictured, stated
 from mitsim.study.paper.sweep import measures_of, values_of
 from mitsim.study.points import batches
 from mitsim.study.table import Table
@@ -31,34 +31,57 @@ def test_points_differ_and_share_light(name: str) -> None:
     assert experiment.name == name and experiment.question.endswith("?") and name in EXPERIMENTS
 
 
-def results(**means: float) -> Results:
+def table(**means: float) -> Table:
     """Two prints a decibel apart of each ``model__exposure``."""
     rows = [
         {"model": name.split("__")[0], "exposure": name.split("__")[1], "psnr_db": mean + side, "patterns": "dots:7"}
         for name, mean in means.items()
         for side in (-0.5, 0.5)
     ]
-    return Results(Table(tuple(rows)), {})
+    return Table(tuple(rows))
 
 
 def test_a_claim_holds_where_both_models_are_near_the_papers_figure() -> None:
     """Two decibels beside a band count as it. (Planted: the rendered model alone.)"""
-    found = results(idealised__peak=36.9, rendered__peak=40.0, idealised__frame=32.1, rendered__frame=37.4)
-    claim = stated(found, "49 dots give 34 to 35.5 dB", (34, 35.5), patterns="dots:7")
+    found = table(idealised__peak=36.9, rendered__peak=40.0, idealised__frame=32.1, rendered__frame=37.4)
+    claim = stated(found, "49 dots give 34 to 35.5 dB", (34, 35.5))
     assert claim.verdict == "confirmed only at frame" and claim.paper == "34 to 35.5 dB"
     assert claim.idealised == "peak: 36.9 ± 0.5 dB; frame: 32.1 ± 0.5 dB"
-    near = results(idealised__peak=36.9, rendered__peak=33.0)
-    assert stated(near, "", (34, 35.5), patterns="dots:7").verdict == "confirmed"
-    far = results(idealised__peak=31.9, rendered__peak=33.0)
-    assert stated(far, "", (34, 35.5), patterns="dots:7").verdict == "not confirmed"
+    near = table(idealised__peak=36.9, rendered__peak=33.0)
+    assert stated(near, "", (34, 35.5)).verdict == "confirmed"
+    far = table(idealised__peak=31.9, rendered__peak=37.6)
+    assert stated(far, "", (34, 35.5)).verdict == "not confirmed"
 
 
 @pytest.mark.parametrize(
-    ("holds", "verdict"),
-    [([], "not confirmed"), (["a"], "confirmed only at a"), (["a", "b"], "confirmed")],
+    ("above", "verdict"),
+    [
+        ("", "not confirmed"),
+        ("idealised__peak rendered__frame", "not confirmed"),
+        ("idealised__peak rendered__peak", "confirmed only at peak"),
+        ("rendered__peak rendered__frame", "confirmed only rendered"),
+        ("idealised__peak rendered__peak idealised__frame rendered__frame", "confirmed"),
+    ],
 )
-def test_verdicts(holds: list[str], verdict: str) -> None:
-    assert confirmed(holds, ["a", "b"]) == verdict
+def test_verdicts(above: str, verdict: str) -> None:
+    """(Planted: exposures of which one model holds.)"""
+    cases = ("idealised__peak", "idealised__frame", "rendered__peak", "rendered__frame")
+    found = table(**{case: 10.0 if case in above.split() else 0.0 for case in cases})
+    claim = judged(found, "", "", lambda rows: ("", rows.mean("psnr_db").value > 5))
+    assert claim.verdict == verdict
+
+
+def test_images_are_those_of_their_rows() -> None:
+    """Rows that are alike in all columns but one; a row of the grid with an image missing is left out. (Planted: the
+    first image of the table.)"""
+    rows = [{"point": f"{name}{number}", "patterns": name, "number": number} for name in "ab" for number in (1, 2)]
+    arrays = {(str(row["point"]), IMAGE): np.full((2, 2), index) for index, row in enumerate(rows)}
+    del arrays["b1", IMAGE]
+    found = Results(Table(tuple(rows)), arrays)
+    lines = {name: found.table.where(patterns=name) for name in "ab"}
+    grid = pictured(found, lines, "number", (2, 1), "number {number}")
+    assert list(grid) == ["a"]
+    assert [(image[0, 0], caption) for image, caption in grid["a"]] == [(1, "number 2"), (0, "number 1")]
 
 
 @pytest.mark.parametrize(

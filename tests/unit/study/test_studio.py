@@ -9,8 +9,9 @@ import pytest
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.study.experiment import Setup
+from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
-from mitsim.study.studio import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED, Studio
+from mitsim.study.studio import Image, Studio
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def test_exposures_follow_their_conventions(studio: Studio, setup: Setup, model:
 
 
 def test_light_and_factors_are_made_once(studio: Studio, setup: Setup) -> None:
-    assert studio.scene(setup).light is studio.scene(setup).light
+    assert studio.lit(setup).light is studio.lit(setup).light
     assert studio.factors(setup, 3) is studio.factors(setup, 3)
     assert studio.factors(setup, 3) is not studio.factors(setup, 4)
 
@@ -91,12 +92,12 @@ def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[
     path.write_text(path.read_text().replace("printed_reflectance.png", "reflectance.png"))
     own = path.parent / "printed_reflectance.png"
     before = own.rename(path.parent / "reflectance.png").read_bytes()
-    truth = studio.scene(setup).truth
+    truth = studio.lit(setup).truth
     # The sheet is 128 mm wide, of which the projector's 16 pixels light 120.
     seen = picture("coins")[16:-16, 16:-16].reshape(16, 30, 16, 30).mean(axis=(1, 3)) / 255 / 0.99
     assert np.abs(truth - seen).max() < 0.03 and truth.std() > 0.1
     assert (path.parent / "reflectance.png").read_bytes() == before
-    blank = studio.scene(Setup(str(path), variant=variant, accuracy=1e-2)).truth
+    blank = studio.lit(Setup(str(path), variant=variant, accuracy=1e-2)).truth
     assert np.abs(blank - 100 / 255 / 0.99).max() < 0.01
 
 
@@ -105,9 +106,9 @@ def test_binned_frames_are_those_of_larger_pixels(studio: Studio, setup: Setup, 
     """Without binning the best lambda is no worse than the automatic one. Of 16 pixels a side, as many as unknowns,
     16 dots lose nothing, and uniform light much. (Planted: rows of one pixel in four instead of their mean.)"""
     best = {
-        (patterns, binning): shoot.image(shoot.peak_s, "best", binning).quality.psnr_db
+        (patterns, binning): Image.of(frames, frames.seconds(EQUAL_PEAK), "best", binning).quality.psnr_db
         for patterns in ("uniform", "dots:4")
-        for shoot in [studio.shoot(setup, model, patterns)]
+        for frames in [studio.frames(setup, model, patterns)]
         for binning in (1, 4)
     }
     for patterns in ("uniform", "dots:4"):

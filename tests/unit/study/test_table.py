@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.study.table import Table, joined
+from mitsim.study.table import Table
 
 ROWS = tuple(
     {"model": model, "patterns": patterns, "psnr_db": value, "seed": seed}
@@ -34,14 +34,16 @@ def test_what_was_not_measured_is_refused() -> None:
 
 
 def test_means_by_a_column_keep_its_order() -> None:
-    by = Table(ROWS).means("psnr_db", "patterns", model="rendered")
+    """Values with no number have no mean. (Planted: None among the means.)"""
+    more = Table((*ROWS, {"model": "rendered", "patterns": "dots:4", "psnr_db": None, "seed": 0}))
+    by = more.where(model="rendered").means("psnr_db", "patterns")
     assert list(by) == ["uniform", "dots:7"] and by["dots:7"].value == 40
     assert Table(ROWS).distinct("seed") == [0, 1, 2] and Table(ROWS).distinct("nothing") == []
 
 
 def test_a_csv_has_all_columns_and_comes_back(tmp_path: Path) -> None:
     """Rows need not have the same columns."""
-    table = joined([ROWS, ({"psnr_db": 1.5, "note": "a, b"},)])
+    table = Table((*ROWS, {"psnr_db": 1.5, "note": "a, b"}))
     table.write(tmp_path / "t.csv")
     rows = list(csv.DictReader((tmp_path / "t.csv").open(newline="", encoding="utf-8")))
     assert list(rows[0]) == ["model", "patterns", "psnr_db", "seed", "note"]

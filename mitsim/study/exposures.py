@@ -1,0 +1,218 @@
+"""Light of a scene and a camera in; exposures of any pattern family, and the images they come to, out.
+
+Twice: *rendered*, the light itself with calibrated factors, and *idealised*, the paper's model of the same scene with
+its own exact factors. Both have the same truth and sensor.
+
+Exposure conventions: *equal peak* exposes each family so that its brightest pixel fills the same part of the full well;
+*equal frame* gives every frame the exposure of uniform light; *equal total* shares that exposure among the family's
+frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Literal
+
+import numpy as np
+
+from mitsim.capture.ambient import taken_off
+from mitsim.capture.bench import Bench
+from mitsim.capture.exposer import Exposer, peak_irradiance
+from mitsim.capture.light import Light
+from mitsim.capture.request import Exposure
+from mitsim.core.arrays import FloatArray
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solver import Prepared, Solution, prepare
+from mitsim.rig.patterns import PatternFamily
+from mitsim.study.ideal import IdealCamera
+from mitsim.study.metrics import Quality, psnr
+
+EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
+IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
+LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
+"""Of the largest sigma^2: where none can be chosen by the data, the best of these, a quarter of a decade apart."""
+
+
+class LitScene:
+    """A bench in its light.
+
+    Parameters
+    ----------
+    light
+        by projector pixel.
+    """
+
+    def __init__(self, light: Light) -> None:
+        self.light, self.bench = light, light.bench
+        self.uniform_s = cache(self._uniform_s)
+        """Exposure time [s] of uniform light at equal peak, by model."""
+
+    @property
+    def truth(self) -> FloatArray:
+        """(n, n) apparent reflectance."""
+        return self.light.truth
+
+    def quality(self, image: FloatArray) -> Quality:
+        """How near an ``image`` (n, n) is to the truth."""
+        return Quality.of(image, self.truth, self.light.apparent.error)
+
+    def expected(self, model: str, family: PatternFamily) -> ExpectedFrames:
+        """Frames of a ``family`` in one ``model`` of :data:`MODELS`, without noise."""
+        if model == RENDERED:
+            return self._merged.frames(family.lighting, self.light.seed)
+        return self._ideal.frames(family, self.truth * self._flux)
+
+    def rendered(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
+        """Rendered frames with calibrated factors.
+
+        Parameters
+        ----------
+        factors
+            of the camera.
+        family, seed
+            the patterns, and seed of the noise.
+        """
+        sides = factors.left, factors.right
+        return Unexposed(self, RENDERED, family, sides, factors.manifest.centre, seed)
+
+    def idealised(self, family: PatternFamily, seed: int) -> Unexposed:
+        """Frames of the paper's model, with its own factors.
+
+        Parameters
+        ----------
+        family, seed
+            the patterns, and seed of the noise, which is not that of rendered frames.
+        """
+        camera = self._ideal
+        return Unexposed(self, IDEALISED, family, camera.calibrated(self._flux), camera.centre, seed + 1)
+
+    def _uniform_s(self, model: str) -> float:
+        return peak_time(self.bench, self.expected(model, self.bench.family("uniform")))
+
+    @cached_property
+    def _merged(self) -> Light:
+        return self.light.merged()
+
+    @cached_property
+    def _ideal(self) -> IdealCamera:
+        return IdealCamera(self.bench, self.bench.geometry.mask)
+
+    @property
+    def _flux(self) -> float:
+        return float(self.light.apparent.board_flux.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Unexposed:
+    """Frames of a scene under a family before any exposure, and the factors that make images of them.
+
+    Attributes
+    ----------
+    lit, model, family
+        the scene, one of :data:`MODELS`, and the patterns.
+    sides, centre
+        left and right factor, and whether means are taken out of frames.
+    seed
+        of the sensor's noise.
+    """
+
+    lit: LitScene
+    model: str
+    family: PatternFamily
+    sides: tuple[FloatArray, FloatArray]
+    centre: bool
+    seed: int
+
+    @cached_property
+    def expected(self) -> ExpectedFrames:
+        """The frames, without noise."""
+        return self.lit.expected(self.model, self.family)
+
+    def seconds(self, exposure: str) -> float:
+        """Exposure time [s] of each frame by the convention ``exposure``, one of :data:`CONVENTIONS`."""
+        if exposure == EQUAL_PEAK:
+            return peak_time(self.lit.bench, self.expected)
+        return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
+
+    def prepared(self, binning: int = 1) -> Prepared:
+        """The factorised model of frames whose pixels are averaged ``binning`` x ``binning``."""
+        left, right = (side.reshape(-1, binning, side.shape[1]).mean(axis=1) for side in self.sides)
+        return prepare(left, right, self.family.left, self.family.right, centre=self.centre)
+
+    def data(self, seconds: float, binning: int = 1) -> tuple[Prepared, Accumulator]:
+        """The factorised model, and one noisy exposure of all frames added up for it.
+
+        Parameters
+        ----------
+        seconds, binning
+            as for :meth:`solve`.
+        """
+        model = self.prepared(binning)
+        (sums,) = accumulate(self.exposer(seconds), self.family, self.expected, [model], binning)
+        return model, sums
+
+    def solve(self, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1) -> Solution:
+        """The image of one exposure.
+
+        Parameters
+        ----------
+        seconds
+            exposure time of each frame.
+        lam
+            lambda; best: that of :data:`LAMBDAS` which is nearest to the truth.
+        binning
+            pixels a side that are averaged.
+        """
+        model, sums = self.data(seconds, binning)
+        if lam != "best":
+            return model.solve(sums, lam)
+        scale, truth = model.problem(sums).scale, self.lit.truth
+        return max((model.solve(sums, scale * each) for each in LAMBDAS), key=lambda one: psnr(one.image, truth))
+
+    def exposer(self, seconds: float) -> Exposer:
+        """The camera, at an exposure time of so many ``seconds``."""
+        speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
+        return Exposer(self.lit.bench.rig, seconds, self.seed, speckle)
+
+    def noise(self, seconds: float) -> float:
+        """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
+        exposer, sensor = self.exposer(seconds), self.lit.bench.sensor
+        rounding = 0.0 if sensor.bits is None else 1 / (12 * sensor.gain_dn_per_e**2)
+        read = sensor.superpixel_read_noise_e**2 + sensor.superpixel_dark_current_e_per_s * seconds + rounding
+        variances = [exposer.electrons(frame).mean() + read for frame in self.expected]
+        return float(np.sqrt(np.mean(variances))) / seconds
+
+
+def peak_time(bench: Bench, expected: ExpectedFrames) -> float:
+    """Exposure time [s] on ``bench`` at equal peak: the brightest pixel of the ``expected`` frames fills the default
+    part of the full well."""
+    return Exposure().choose(bench.rig, peak_irradiance(expected))
+
+
+def accumulate(
+    exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
+) -> list[Accumulator]:
+    """One noisy exposure of a family's frames, ambient light taken off where there is some, added up for each model.
+
+    Parameters
+    ----------
+    exposer, family, expected, models
+        the camera and its exposure, patterns, their frames without noise, and what these are to be solved with.
+    binning
+        pixels a side that are averaged after the exposure.
+    """
+    sums = [model.accumulator() for model in models]
+    with single_threaded_blas():
+        ambient = taken_off(exposer, family, expected)
+        for measurement, row, column in exposer.measurements(family, expected):
+            frame = measurement - ambient
+            size = len(frame) // binning
+            binned = frame.reshape(size, binning, size, binning).mean(axis=(1, 3)) if binning > 1 else frame
+            for each in sums:
+                each.add(binned, row, column)
+    return sums
