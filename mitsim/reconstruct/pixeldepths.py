@@ -77,7 +77,7 @@ class PixelDepths:
         return Solved(image, lam, left_over)
 
     def variance(self, solved: Solved) -> float:
-        """Of a datum, from what a ``solved`` image leaves over; a reflectance and a depth for each pixel are known of it."""
+        """Of a datum, from what a ``solved`` image leaves over, less a reflectance and a depth for each pixel."""
         return float(solved.left_over / max(self._all.data - 2 * solved.image.size, 1))
 
     def final(self, shift: FloatArray, solved: Solved) -> Solved:
