@@ -82,11 +82,7 @@ class CampaignResult:
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
-        said = [
-            f"{claim.verdict}: {claim.claim} ({claim.paper} in the paper; {claim.idealised} idealised, "
-            f"{claim.rendered} rendered)"
-            for claim in self.claims
-        ]
+        said = [f"{claim.verdict}: {claim.claim} ({claim.figures})" for claim in self.claims]
         return [*said, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
 
 

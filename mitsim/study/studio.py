@@ -134,7 +134,15 @@ class Studio:
             lit.rendered(self.factors(setup, seed), family, seed) if model == RENDERED else lit.idealised(family, seed)
         )
 
-    def image(self, setup: Setup, model: str, patterns: str, seed: int = 0, exposure: str = EQUAL_PEAK) -> Image:
+    def image(
+        self,
+        setup: Setup,
+        model: str,
+        patterns: str,
+        seed: int = 0,
+        exposure: str = EQUAL_PEAK,
+        focus: Literal["auto", "map"] | None = None,
+    ) -> Image:
         """A scene as it comes out: rendered, as a user's own frames are exposed and reconstructed.
 
         Parameters
@@ -149,13 +157,15 @@ class Studio:
             of the frames' noise, and of the calibration's.
         exposure
             one of :data:`mitsim.study.exposures.CONVENTIONS`.
+        focus
+            of rendered frames, as for :func:`mitsim.reconstruct`.
         """
         frames = self.frames(setup, model, patterns, seed)
         if model != RENDERED:
             return Image.of(frames, frames.seconds(exposure))
         seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
         shots = frames.lit.light.expose(patterns, seed=seed, exposure=seconds)
-        found = reconstruct(shots, self.factors(setup, seed))
+        found = reconstruct(shots, self.factors(setup, seed), focus=focus)
         misfit, told = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
