@@ -70,7 +70,7 @@ def curves(
     return figure
 
 
-def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str]) -> Figure:
+def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
     """Images (n, n) [reflectance] with a caption below each, cut to 0..1 for display only.
 
     Parameters
@@ -79,6 +79,8 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
         images and captions by the rows' names.
     columns
         titles.
+    title
+        of all.
     """
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     figure, _ = figure_of((size + 0.32) * len(rows) + 0.3, size * len(columns) + _LABEL, layout="compressed")
@@ -94,4 +96,6 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
             if index == 0:
                 axes.set_title(title, fontsize=FONT - 1)
         line[0].set_ylabel(name, fontsize=FONT - 1)
+    if title:
+        figure.suptitle(title, fontsize=FONT)
     return figure

@@ -119,7 +119,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     }
     ratios: list[Value] = table.distinct("ratio")
     if grid := pictured(results, lines, "ratio", ratios):
-        drawn["images.png"] = image_grid(grid, [f"lamp {ratio:g}" for ratio in table.distinct("ratio")])
+        drawn["images.png"] = image_grid(
+            grid, [f"lamp {ratio:g}" for ratio in ratios], "rendered, equal peak, the lamp's frame taken off"
+        )
     return drawn
 
 

@@ -165,7 +165,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     }
     shown: list[Value] = [NONE, MAP]
     if grid := pictured(results, lines, "focus", shown):
-        drawn["images.png"] = image_grid(grid, ["one depth", "a depth for each pixel"])
+        drawn["images.png"] = image_grid(grid, ["one depth", "a depth for each pixel"], "rendered, 60 mm")
     return drawn
 
 
