@@ -88,13 +88,13 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
     cells: Any = figure.subplots(len(rows), len(columns), squeeze=False)
     for index, (name, images) in enumerate(rows.items()):
         line = cells[index]
-        for axes, (image, caption), title in zip(line, images, columns, strict=True):
+        for axes, (image, caption), column in zip(line, images, columns, strict=True):
             axes.imshow(lightness(image), cmap="gray", vmin=0, vmax=1, interpolation="none")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.set_xlabel(caption, fontsize=FONT - 2)
             if index == 0:
-                axes.set_title(title, fontsize=FONT - 1)
+                axes.set_title(column, fontsize=FONT - 1)
         line[0].set_ylabel(name, fontsize=FONT - 1)
     if title:
         figure.suptitle(title, fontsize=FONT)
