@@ -186,6 +186,7 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "gift_card/card.png": pictures.gift_card,
     "metal_blade/projector.png": projector_window,
     "metal_blade/etching.png": pictures.blade_etching,
+    "highlight/projector.png": toed_in_window,
     "keystone/projector.png": toed_in_window,
     "keystone/reflectance.png": small_photograph,
 }

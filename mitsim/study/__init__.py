@@ -24,6 +24,7 @@ EXPERIMENTS = (
     "exposure",
     "resolution",
     "ambient",
+    "reflectivity",
     "regularisation",
     "depth",
     "sweep",
