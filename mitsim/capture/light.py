@@ -178,6 +178,11 @@ class Light:
         own = replace(self.plan, request=request_of(self.plan, {}).changed(patterns=patterns))
         return capture(self.bench, request_of(own, request), job, output, light=self)
 
+    def behind(self, bench: Bench) -> Light:
+        """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up
+        to it."""
+        return replace(self, simulation=Simulation(bench, self.simulation.settings))
+
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""
         return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))

@@ -61,7 +61,9 @@ class LitScene:
         """How near an ``image`` (n, n) is to the truth."""
         return Quality.of(image, self.truth, self.light.apparent.error)
 
-    def expected(self, model: str, family: PatternFamily, plane: Plane | None = None) -> ExpectedFrames:
+    def expected(
+        self, model: str, family: PatternFamily, plane: Plane | None = None, bench: Bench | None = None
+    ) -> ExpectedFrames:
         """Frames without noise.
 
         Parameters
@@ -72,10 +74,14 @@ class LitScene:
             the patterns.
         plane
             where the idealised scene is; None: where the camera was calibrated.
+        bench
+            another mask in the same light; None: the scene's own.
         """
         if model == RENDERED:
-            return self._merged.frames(family.lighting, self.light.seed)
-        return self._ideal.frames(family, self.truth * self._flux, plane)
+            light = self._merged if bench is None else self._merged.behind(bench)
+            return light.frames(family.lighting, self.light.seed)
+        camera = self._ideal if bench is None else IdealCamera(bench, bench.geometry.mask)
+        return camera.frames(family, self.truth * self.board_flux, plane)
 
     def rendered(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
         """Rendered frames with calibrated factors.
@@ -101,7 +107,7 @@ class LitScene:
             where the scene is; None: where the factors are of.
         """
         camera = self._ideal
-        return Unexposed(self, IDEALISED, family, camera.calibrated(self._flux), camera.centre, seed + 1, plane)
+        return Unexposed(self, IDEALISED, family, camera.calibrated(self.board_flux), camera.centre, seed + 1, plane)
 
     def _uniform_s(self, model: str) -> float:
         return peak_time(self.bench, self.expected(model, self.bench.family("uniform")))
@@ -115,7 +121,8 @@ class LitScene:
         return IdealCamera(self.bench, self.bench.geometry.mask)
 
     @property
-    def _flux(self) -> float:
+    def board_flux(self) -> float:
+        """That a projector pixel of a white board puts on the sensor without the mask [W m^-2], mean over pixels."""
         return float(self.light.apparent.board_flux.mean())
 
 

@@ -24,6 +24,7 @@ from mitsim.study.experiment import Setup
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
 from mitsim.study.metrics import Quality
 from mitsim.study.pictures import picture
+from mitsim.study.sweepcam import Places, calibrated_places
 from mitsim.study.table import Value
 
 Kept = TypeVar("Kept")
@@ -117,6 +118,20 @@ class Studio:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
         blank = setup.printed(None)
         return self._once("factors", 4, (blank, seed), lambda: self.bench(blank).calibrate(seed))
+
+    def places(self, setup: Setup, places_mm: tuple[float, ...], seed: int) -> Places:
+        """Factors of the same camera with its mask moved.
+
+        Parameters
+        ----------
+        setup, seed
+            as for :meth:`factors`.
+        places_mm
+            how far it is moved along both axes.
+        """
+        blank = setup.printed(None)
+        key = blank, places_mm, seed
+        return self._once("places", 1, key, lambda: calibrated_places(self.bench(blank), places_mm, seed))
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
         """Frames of a family before any exposure.

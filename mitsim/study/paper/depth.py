@@ -25,8 +25,11 @@ from mitsim.study.studio import Image, Studio
 from mitsim.study.table import Table, Value
 
 CALIBRATED_MM = 400.0
+"""The paper's distance."""
 DEPTHS_MM = (360.0, 380.0, 395.0, 400.0, 405.0, 420.0, 440.0)
+"""A tenth of the distance either way, as the shipped scenes with depth have, and what a bag's folds are."""
 BASELINES_MM = (0.0, 15.0, 60.0, 150.0, 300.0)
+"""From co-located, over a pico projector that touches the camera, to one on the other side of a bench."""
 FAMILIES = ("uniform", "dots:4", "dots:7")
 ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.5**0.5))}
 """Unit vectors of the baseline; the shipped rig's is along the columns."""
