@@ -11,16 +11,17 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+from filelock import FileLock
 from skimage import io
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.rig.patterns import PatternFamily
-from mitsim.study.experiment import Setup
+from mitsim.study.experiment import Point, Setup
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
 from mitsim.study.metrics import Quality
 from mitsim.study.pictures import picture
@@ -90,9 +91,15 @@ class Studio:
     """Benches, their light and their factors, the last few of each; a temporary folder holds scenes with other prints.
 
     To be used as a context, which removes that folder.
+
+    Parameters
+    ----------
+    shared
+        folder of calibrations that several studios share; None: this one's are its own.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, shared: str | None = None) -> None:
+        self._shared = None if shared is None else Path(shared) / "calibrations"
         self._folder = tempfile.TemporaryDirectory(prefix="mitsim-study-")
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
 
@@ -117,7 +124,7 @@ class Studio:
     def factors(self, setup: Setup, seed: int) -> Factors:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
         blank = setup.printed(None)
-        return self._once("factors", 4, (blank, seed), lambda: self.bench(blank).calibrate(seed))
+        return self._once("factors", 4, (blank, seed), lambda: self._calibrated(blank, seed))
 
     def places(self, setup: Setup, places_mm: tuple[float, ...], seed: int) -> Places:
         """Factors of the same camera with its mask moved.
@@ -189,6 +196,19 @@ class Studio:
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust)
+
+    def _calibrated(self, blank: Setup, seed: int) -> Factors:
+        """By this studio, or by another that was first: factors in memory are as a file has them."""
+        if self._shared is None:
+            return self.bench(blank).calibrate(seed)
+        place = self._shared / Point.of(blank, seed=seed).key
+        place.parent.mkdir(exist_ok=True)
+        with FileLock(place.with_suffix(".lock")):
+            if not place.exists():
+                part = place.with_suffix(".part")  # whole or not at all: this process may be ended
+                shutil.rmtree(part, ignore_errors=True)
+                self.bench(blank).calibrate(seed).save(part).rename(place)
+            return load_calibration(place)
 
     def _opened(self, setup: Setup) -> Bench:
         path = setup.scene if setup.picture is None else self._printed(setup.scene, setup.picture)

@@ -86,6 +86,24 @@ def test_light_and_factors_are_made_once(studio: Studio, setup: Setup) -> None:
     assert studio.factors(setup, 3) is not studio.factors(setup, 4)
 
 
+def test_studios_share_their_calibrations(studio: Studio, setup: Setup, tmp_path: Path) -> None:
+    """One studio's session serves another, to the last bit what it would have found itself; an unfinished one does not.
+    (Planted: seeds taken for one.)"""
+    own = studio.factors(setup, 3)
+    with Studio(str(tmp_path)) as first, Studio(str(tmp_path)) as second:
+        found = first.factors(setup, 3)
+        (place,) = [path for path in (tmp_path / "calibrations").iterdir() if path.is_dir()]
+        before = place.stat().st_mtime_ns
+        again = second.factors(setup, 3)
+        assert place.stat().st_mtime_ns == before
+        second.factors(setup, 4)
+    for other in (found, again):
+        assert np.array_equal(other.left, own.left) and np.array_equal(other.right, own.right)
+        assert other.manifest.noise == own.manifest.noise and other.ok == own.ok
+        assert other.manifest.parallax == own.manifest.parallax
+    assert len([path for path in (tmp_path / "calibrations").iterdir() if path.is_dir()]) == 2
+
+
 def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[..., Path], variant: str) -> None:
     """Its truth is the picture, averaged over pixels; the scene's own files are as they were."""
     path = shared_scene("printed", reflectance=np.full((48, 48), 100))
