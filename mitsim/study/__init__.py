@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 STUDIES: Mapping[str, str] = MappingProxyType({"accuracy": "accuracy:measure", "diffraction": "diffraction:measure"})
 """Studies of one bench by name, as ``module:function``; the function takes (bench, request, job) and gives
 :class:`mitsim.study.runner.Findings`."""
-PAPER = ("patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient", "regularisation")
+PAPER = (
+    *("patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient", "regularisation"),
+    "convolutional",
+)
 """Studies of the paper's experiments, which `mitsim study all` puts on one page in this order."""
 EXPERIMENTS = (*PAPER, "sweep")
 """Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
