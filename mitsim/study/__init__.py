@@ -27,6 +27,7 @@ PAPER = (
     "ambient",
     "reflectivity",
     "regularisation",
+    "convolutional",
     "depth",
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
