@@ -26,12 +26,23 @@ EXPERIMENTS = (
     "ambient",
     "reflectivity",
     "regularisation",
+    "separation",
     "sweep",
 )
 """Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
 ALL = "all"
 """What the study of all experiments of the paper is called."""
-PAPER = ("patterns", "distance", "binning", "exposure", "resolution", "ambient", "reflectivity", "regularisation")
+PAPER = (
+    "patterns",
+    "distance",
+    "binning",
+    "exposure",
+    "resolution",
+    "ambient",
+    "reflectivity",
+    "regularisation",
+    "separation",
+)
 """Those that `mitsim study all` puts on one page, in its order."""
 
 
