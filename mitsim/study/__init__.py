@@ -29,6 +29,7 @@ PAPER = (
     "regularisation",
     "convolutional",
     "depth",
+    "separation",
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
 order."""

@@ -1,0 +1,161 @@
+"""Direct from global light by the dots themselves: what it gains over images that take all light for direct.
+
+Nayar, Krishnan, Grossberg and Raskar (2006) need a camera with a lens; here :mod:`mitsim.reconstruct.separation` does
+it, in scenes whose light over several surfaces is known. Depth hides most of it, so every scene is shown twice: as it
+is, and with direct light as the calibrated factors have it at any depth, as if depth were mended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.interpolate import RegularGridInterpolator
+
+from mitsim.capture.light import Light
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.separation import separate
+from mitsim.reconstruct.solver import Prepared
+from mitsim.rig.patterns import Shot
+from mitsim.study.charts import image_grid
+from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
+from mitsim.study.gloss import direct_of
+from mitsim.study.metrics import psnr
+from mitsim.study.paper.measure import verdict
+from mitsim.study.studio import Studio
+
+SCENES = ("corner", "cookie_bag")
+FAMILIES = ("dots:4", "dots:7", "dots:12")
+AS_IT_IS, MENDED = DEPTHS = ("as it is", "depth mended")
+_ACCURACY = 3e-3
+"""Of the light: global light is a tenth of it and more."""
+Measured = list[tuple[Shot, FloatArray]]
+"""Frames [electrons/s] with their shots."""
+
+
+def _points(scope: Scope) -> Sequence[Point]:
+    base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
+    own = scope.pictures == (None,)
+    setups = [base] if own else [replace(base, scene=name) for name in scope.chosen(SCENES, SCENES[:1])]
+    return [
+        Point.of(setup, subject=setup.scene, depth=depth, patterns=family, seed=seed)
+        for setup in setups
+        for seed in scope.seeds
+        for family in scope.chosen(FAMILIES, FAMILIES[1:2])
+        for depth in DEPTHS
+    ]
+
+
+def _measure(studio: Studio, point: Point) -> Found:
+    frames = studio.frames(point.setup, RENDERED, str(point["patterns"]), int(point["seed"]))
+    lit, model = frames.lit, frames.prepared()
+    if not lit.light.simulation.physics.interreflection:
+        raise MitsimError(f"study separation: light over several surfaces is not worth following in {point['subject']}")
+    alone = LitScene(direct_of(lit.light)).expected(RENDERED, frames.family)
+    direct = [frames.exposer(1.0).electrons(frame) for frame in alone]
+    every = [frames.exposer(1.0).electrons(frame) for frame in frames.expected]
+    if point["depth"] == MENDED:
+        ideal = [_modelled(frames, shot) for shot in frames.family.shots]
+        every = [ideal_ + all_ - direct_ for ideal_, all_, direct_ in zip(ideal, every, direct, strict=True)]
+        direct = ideal
+    measured, bound = (_noisy(frames, rates) for rates in (every, direct))
+    whole = _weights(model, measured)
+    patterns = frames.family.left.astype(float), frames.family.right.astype(float)
+    total = np.sum([frame for _, frame in measured], axis=0)
+    found = separate(model, frames.sides, patterns, whole.sum, total)
+    less = _weights(model, [(shot, frame - found.common) for shot, frame in measured])
+    images = {
+        "all light": model.solve(whole).image,
+        "separated": model.solve(less).image,
+        "direct alone": model.solve(_weights(model, bound)).image,
+        "global": found.image,
+    }
+    known = global_truth(lit.light)
+    levels = {f"{name.replace(' ', '_')}_db": psnr(image, lit.truth) for name, image in images.items()}
+    levels["global_db"] = psnr(found.image, known)
+    levels["gain_db"] = levels["separated_db"] - levels["all_light_db"]
+    row = point.row(**levels, global_rms=float(np.sqrt(np.square(known).mean())), told=float(found.told[0]))
+    kept = {"direct, true": lit.truth, "global, true": known, **images}
+    return Found((row,), {name: image.astype("float32") for name, image in kept.items()})
+
+
+def _modelled(frames: Unexposed, shot: Shot) -> FloatArray:
+    """Direct light [electrons/s] of a ``shot`` as the factors have it."""
+    left, right = frames.sides
+    return np.asarray(left @ (frames.family.light(shot) * frames.lit.truth) @ right.T)
+
+
+def _noisy(frames: Unexposed, rates: Sequence[FloatArray]) -> Measured:
+    """One exposure at equal peak of frames of these ``rates`` [electrons/s]; the peak is that of rendered frames."""
+    seconds = frames.seconds(EQUAL_PEAK)
+    exposer = frames.exposer(seconds)
+    return [
+        (shot, exposer.rate(exposer.digital(np.maximum(rate, 0.0) * seconds, *shot.names)))
+        for shot, rate in zip(frames.family.shots, rates, strict=True)
+    ]
+
+
+def _weights(model: Prepared, measured: Measured) -> Accumulator:
+    sums = model.accumulator()
+    for shot, frame in measured:
+        sums.add(frame, shot.row, shot.column)
+    return sums
+
+
+def global_truth(light: Light) -> FloatArray:
+    """(n, n) what a ``light`` that bounced looks like under uniform light: in each direction that the calibrated window
+    has a pixel in, over the board's light there."""
+    bench, tray = light.bench, light.simulation.smooth.bundle
+    cells = np.asarray(sum(group.smooth.sum(axis=0) for group in light.groups)) / len(light.groups)
+    shape = len(tray.rows.centres), len(tray.columns.centres)
+    density = cells.reshape(-1, *shape).sum(axis=0) / (tray.rows.width * tray.columns.width)
+    windows = [np.linspace(*edges, bench.n + 1) for edges in bench.windows]
+    rows, columns = ((edges[1:] + edges[:-1]) / 2 for edges in windows)
+    seen = RegularGridInterpolator(
+        (tray.rows.centres, tray.columns.centres), density, bounds_error=False, fill_value=None
+    )(np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1))
+    area = np.outer(*(np.diff(edges) for edges in windows))
+    return np.asarray(seen * area / light.apparent.board_flux.reshape(bench.n, bench.n))
+
+
+def _claims(results: Results) -> Sequence[Claim]:
+    table = results.table
+
+    def claim(depth: str) -> Claim:
+        rows = table.where(depth=depth)
+        gains = {name: rows.mean("gain_db", subject=name) for name in table.distinct("subject")}
+        told = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
+        gained = all(gain.value > 0 for gain in gains.values())
+        return Claim(
+            f"Dots tell global light apart, {depth}: gain", "Nayar et al. 2006", "not simulated", told, verdict(gained)
+        )
+
+    return [claim(depth) for depth in table.distinct("depth")]
+
+
+def _figures(results: Results) -> Mapping[str, Figure]:
+    table, drawn = results.table.where(patterns="dots:7"), {}
+    names = ("direct, true", "all light", "separated", "direct alone", "global, true", "global")
+    for depth in table.distinct("depth"):
+        grid = {}
+        for subject in table.distinct("subject"):
+            row = table.where(subject=subject, depth=depth).rows[0]
+            kept = [(results.array(row, name), row.get(f"{name.replace(' ', '_')}_db")) for name in names]
+            grid[subject.replace("_", " ")] = [
+                (image, "" if level is None else f"{level:.1f} dB") for image, level in kept if image is not None
+            ]
+        drawn[f"images_{depth.replace(' ', '_')}.png"] = image_grid(grid, names)
+    return drawn
+
+
+EXPERIMENT = Experiment(
+    "separation",
+    "Direct and global light",
+    "What do dots tell of light that came over several surfaces, and what does the image gain?",
+    _points, _measure, _claims, _figures,
+)  # fmt: skip
