@@ -17,11 +17,21 @@ if TYPE_CHECKING:
 STUDIES: Mapping[str, str] = MappingProxyType({"accuracy": "accuracy:measure", "diffraction": "diffraction:measure"})
 """Studies of one bench by name, as ``module:function``; the function takes (bench, request, job) and gives
 :class:`mitsim.study.runner.Findings`."""
-EXPERIMENTS = ("patterns", "distance", "binning", "exposure", "resolution", "ambient", "regularisation", "sweep")
+EXPERIMENTS = (
+    "patterns",
+    "distance",
+    "binning",
+    "exposure",
+    "resolution",
+    "ambient",
+    "regularisation",
+    "waterfall",
+    "sweep",
+)
 """Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
 ALL = "all"
 """What the study of all experiments of the paper is called."""
-PAPER = ("patterns", "distance", "binning", "exposure", "resolution", "ambient", "regularisation")
+PAPER = ("patterns", "distance", "binning", "exposure", "resolution", "ambient", "regularisation", "waterfall")
 """Those that `mitsim study all` puts on one page, in its order."""
 
 
