@@ -16,7 +16,7 @@ under the geometric shadow of the mask. Between that and the light itself nothin
   falloff over the sensor, below 1e-3 of the frames, goes with it). The truth shows that mean, so gloss over the scene
   is no error.
 - *defocus*: a pinhole for the projector's lens, and sharp pixels.
-- *rendering*: each projector pixel has the flux that the truth states, without the sampling error of the light: no
+- *render noise*: each projector pixel has the flux that the truth states, without the sampling error of the light: no
   effect of nature, but what the simulation adds at its accuracy.
 
 The truth is the same for all. Not taken out: what lies in the idealised model as well (response of pixels, thickness of
@@ -49,8 +49,8 @@ from mitsim.transport.projector import CanvasMap
 FALLOFF, DIFFRACTION, KEYSTONE, DEPTH, OCCLUSION, DETAIL, INTERREFLECTION, MIRRORS = (
     "falloff", "diffraction", "keystone", "depth", "occlusion", "detail", "interreflection", "mirrors",
 )  # fmt: skip
-GLOSS, AMBIENT, BLACK_LEVEL, DEFOCUS, SPECKLE, RENDERING = (
-    "gloss", "ambient", "black level", "defocus", "speckle", "rendering",
+GLOSS, AMBIENT, BLACK_LEVEL, DEFOCUS, SPECKLE, RENDER_NOISE = (
+    "gloss", "ambient", "black level", "defocus", "speckle", "render noise",
 )  # fmt: skip
 REGISTERED = MappingProxyType(
     {
@@ -117,7 +117,7 @@ class Anatomy:
         bench, moved = self.light.bench, off & _MOVED
         # Light over mirrors lies among direct light, and only tracing tells one from the other.
         direct = self._traced(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
-        flux = self._exact if RENDERING in off else self.light.flux
+        flux = self._exact if RENDER_NOISE in off else self.light.flux
         by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
         groups = tuple(_scaled(group, np.append(by_pixel * self._brightness(off), 0.0)) for group in direct.groups)
         if GLOSS in off:
@@ -303,7 +303,7 @@ def _present(light: Light) -> dict[str, bool]:
         BLACK_LEVEL: physics.black_level > 0,
         DEFOCUS: not physics.projector.ideal,
         SPECKLE: physics.speckle > 0,
-        RENDERING: True,
+        RENDER_NOISE: True,
     }
 
 

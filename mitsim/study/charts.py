@@ -25,6 +25,8 @@ _ROW = 0.27
 """Inches of a row of a waterfall: a line of text, and a third of one between two."""
 _COLUMNS = (14.0, 92.0)
 """Points from a waterfall to the numbers beside it: "-23.1 ± 0.2" has 60."""
+_LETTERS = 122
+"""Of a line below a figure, small ones."""
 _END, _QUIET = "#c7d2de", "#6b7280"
 """Bar of the level that a waterfall begins at, and what stands beside the data."""
 
@@ -130,6 +132,10 @@ class Fall:
     steps: tuple[Step, ...]
     last: Mean
 
+    def step(self, name: str) -> Step:
+        """That of the effect ``name``."""
+        return next(step for step in self.steps if step.name == name)
+
     @property
     def levels(self) -> FloatArray:
         """(steps + 1,) PSNR [dB] before the first step and after each."""
@@ -147,8 +153,8 @@ def waterfall(panels: Mapping[str, Fall], seen: float) -> Figure:
         change [dB] from which a step has a row, if any panel has it; others are named below, and are one bar.
     """
     names = [step.name for step in next(iter(panels.values())).steps]
-    large = {step.name for fall in panels.values() for step in fall.steps if step.largest >= seen}
-    few = [name for name in names if name not in large]
+    change = {name: max(fall.step(name).largest for fall in panels.values()) for name in names}
+    large = {name for name in names if change[name] >= seen}
     figure, _ = figure_of(len(panels) * (_ROW * (len(large) + 3) + 0.6) + 0.9)
     figure.clear()
     places: Any = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -160,18 +166,21 @@ def waterfall(panels: Mapping[str, Fall], seen: float) -> Figure:
         axes.set_title(title, fontsize=FONT, loc="left", fontweight="bold")
         _draw_fall(axes, fall, large)
         label_axes(axes, "PSNR [dB]" if axes is places[-1] else "", "", grid="x")
-    said = "Changes of PSNR [dB] by each effect: bars in order, beside them alone and on the whole without it."
-    if few:
-        said += "\n" + "\n".join(wrap(f"Less than {seen:g} dB each, in the bar called others: {', '.join(few)}.", 125))
-    figure.supxlabel(said, fontsize=FONT - 2, color=_QUIET, x=0.01, ha="left")
+    small = ", ".join(name for name in names if 0 < change[name] < seen)
+    none = ", ".join(name for name in names if change[name] == 0)
+    said = ["Changes of PSNR [dB] by each effect: bars in order, beside them alone and on the whole without it."]
+    said += [f"Less than {seen:g} dB each, in the bar called others: {small}."] if small else []
+    said += [f"Nothing at all, as the scene does not call for them: {none}."] if none else []
+    lines = [line for sentence in said for line in wrap(sentence, _LETTERS)]
+    figure.supxlabel("\n".join(lines), fontsize=FONT - 2, color=_QUIET, x=0.01, ha="left")
     return figure
 
 
 def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
     """Bars of the steps that are ``large``, and one of all others."""
     others = sum(step.in_order.value for step in fall.steps if step.name not in large)
-    rest = Step("others", Mean(others, np.nan, 1))
-    steps = [*(step for step in fall.steps if step.name in large), rest]
+    steps = [step for step in fall.steps if step.name in large]
+    steps += [Step("others", Mean(others, np.nan, 1))] if others else []
     last, level, text = len(steps) + 1, fall.first.value, {"fontsize": FONT - 2, "va": "center"}
     for row, step in enumerate(steps, start=1):
         change = step.in_order.value
@@ -189,7 +198,8 @@ def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
         axes.barh(row, end.value - left, 0.66, left=left, color=colour, zorder=3)
         axes.annotate(f"{end} dB", (end.value, row), (5, 0), textcoords="offset points", fontweight="bold", **text)
     for points, heading in zip(_COLUMNS, ("alone", "left out"), strict=True):
-        _beside(axes, 0, points, heading)
+        if any(getattr(step, heading.replace(" ", "_")) for step in steps):
+            _beside(axes, 0, points, heading)
     axes.set_yticks(range(last + 1), ["idealised", *(step.name for step in steps), "rendered"])
     axes.set_ylim(last + 0.5, -0.5)
     axes.tick_params(axis="y", length=0, labelsize=FONT - 1)

@@ -46,7 +46,7 @@ SATURATION, QUANTISATION, CALIBRATION_NOISE = "saturation", "quantisation", "cal
 EFFECTS = (
     partial.FALLOFF, partial.DIFFRACTION, partial.KEYSTONE, partial.DEPTH, partial.OCCLUSION, partial.DETAIL,
     partial.INTERREFLECTION, partial.MIRRORS, partial.GLOSS, partial.AMBIENT, partial.BLACK_LEVEL, partial.DEFOCUS,
-    partial.SPECKLE, SATURATION, CALIBRATION_NOISE, QUANTISATION, partial.RENDERING,
+    partial.SPECKLE, SATURATION, CALIBRATION_NOISE, QUANTISATION, partial.RENDER_NOISE,
 )  # fmt: skip
 """In the order in which they are added: of the rig, of the scene, of light, of the camera, of the simulation."""
 ASSUMED, CALIBRATED = MODELS = ("assumed", "calibrated")

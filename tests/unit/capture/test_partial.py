@@ -66,7 +66,7 @@ def test_nothing_taken_out_is_the_light_itself(far: Light) -> None:
         partial.BLACK_LEVEL,
         partial.DEFOCUS,
         partial.SPECKLE,
-        partial.RENDERING,
+        partial.RENDER_NOISE,
     )
 
 
@@ -99,21 +99,42 @@ def test_a_turned_projector_has_a_keystone(turned: Light) -> None:
     assert not partial._off_plane(turned)
 
 
+def sharp_deposits(light: Light) -> Deposits:
+    """A ray from each projector pixel, without blur."""
+    settings = light.simulation.settings
+    settings = replace(settings, effects=settings.effects - {"blur"})
+    return Simulation(light.bench, settings).direct.trace(1, 0, 1)
+
+
+def pixel_of(light: Light, deposits: Deposits) -> FloatArray:
+    """Where ``deposits`` lie on the aligned plane, by projector pixels that fill the window's bounding box."""
+    n = light.bench.n
+    places = [
+        np.floor((tangents - first) / (last - first) * n)
+        for tangents, (first, last) in zip((deposits.row, deposits.column), light.bench.windows, strict=True)
+    ]
+    return np.asarray(places[0] * n + places[1])
+
+
 def test_depth_is_parallax(far: Light) -> None:
-    """60 mm beside the camera, 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside in its row, and back on
-    the plane in the cell of its pixel. (Planted: the projector's other side.)"""
-    bench = far.bench
-    deposits = far.simulation.direct.trace(1, 0, 1)
-    place = partial._Place(bench)
+    """The projector, 60 mm aside (x = 60, column -60), 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside,
+    0.35 pixels, and without depth in its pixel on the plane. (Planted: the projector on the other side.)"""
+    deposits, place = sharp_deposits(far), partial._Place(far.bench)
     aside = place.parallax(deposits)
-    sign = np.sign(aside[1].mean())
-    # The scene's projector is a float32 emitter: 1e-6 of its canvas.
-    assert np.allclose(aside[1], sign * 60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
+    assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
+    assert (pixel_of(far, deposits) != deposits.pixel).mean() > 0.2
     back = place.moved(deposits, frozenset({partial.DEPTH}))
-    assert np.allclose(back.inverse_depth, 1 / 400)
-    sharp = partial._Filing(bench, far.simulation.settings, True, frozenset({partial.DEFOCUS})).direct
-    assert sharp.projector.blur > 0, "settings decide of blur"
+    assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), deposits.pixel)
     assert partial._off_plane(far)
+
+
+def test_without_keystone_light_lies_in_its_pixel(turned: Light) -> None:
+    """(Planted: the homography the other way round.)"""
+    deposits = sharp_deposits(turned)
+    assert (pixel_of(turned, deposits) != deposits.pixel).mean() > 0.2
+    straight = partial._Place(turned.bench).moved(deposits, frozenset({partial.KEYSTONE}))
+    assert np.array_equal(pixel_of(turned, straight), deposits.pixel)
+    assert np.array_equal(straight.inverse_depth, deposits.inverse_depth)
 
 
 def test_falloff_over_pixels_is_that_of_a_matt_sheet(turned: Light) -> None:
