@@ -30,6 +30,7 @@ PAPER = (
     "convolutional",
     "depth",
     "separation",
+    "waterfall",
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
 order."""

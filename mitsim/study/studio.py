@@ -115,16 +115,16 @@ class Studio:
 
         MitsimError as :func:`mitsim.open_bench`, and for another print on a scene that has none.
         """
-        return self._once("bench", 3, setup, lambda: self._opened(setup))
+        return self.once("bench", 3, setup, lambda: self._opened(setup))
 
     def lit(self, setup: Setup) -> LitScene:
         """The scene of a ``setup`` in its light."""
-        return self._once("light", 1, setup, lambda: LitScene(self.bench(setup).light(accuracy=setup.accuracy)))
+        return self.once("light", 1, setup, lambda: LitScene(self.bench(setup).light(accuracy=setup.accuracy)))
 
     def factors(self, setup: Setup, seed: int) -> Factors:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
         blank = setup.printed(None)
-        return self._once("factors", 4, (blank, seed), lambda: self._calibrated(blank, seed))
+        return self.once("factors", 4, (blank, seed), lambda: self._calibrated(blank, seed))
 
     def places(self, setup: Setup, places_mm: tuple[float, ...], seed: int) -> Places:
         """Factors of the same camera with its mask moved.
@@ -138,7 +138,7 @@ class Studio:
         """
         blank = setup.printed(None)
         key = blank, places_mm, seed
-        return self._once("places", 1, key, lambda: calibrated_places(self.bench(blank), places_mm, seed))
+        return self.once("places", 1, key, lambda: calibrated_places(self.bench(blank), places_mm, seed))
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
         """Frames of a family before any exposure.
@@ -228,7 +228,16 @@ class Studio:
             io.imsave(place / _PRINT, picture(name), check_contrast=False)
         return place / own.name
 
-    def _once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
+    def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
+        """What is made once while neighbours share it.
+
+        Parameters
+        ----------
+        kind, most, key
+            what it is, how many of its kind are kept, and which of them it is.
+        make
+            makes it.
+        """
         kept = self._kept.setdefault(kind, OrderedDict())
         if key not in kept:
             while len(kept) >= most:
