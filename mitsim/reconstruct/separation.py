@@ -14,9 +14,12 @@ pixels explain of F, the least squares of all frames over X and F = Q_L f Q_R^T 
     K f - A_L^T (A_L f A_R^T) A_R = Q_L^T (sum_ij Y_ij) Q_R - A_L^T W A_R
 
 X being eliminated. **What is told.** An eigenvalue of the left side over K is the part of a mode of F that lit pixels
-do not explain: 0 under uniform light, where nothing is told, near 1 - 1/K for dots far apart. **What is not**: global
-light that changes from frame to frame or from dot to dot (near an edge, caustics) stays in X, and so does what a lit
-pixel gets of its own light; lamps' light and the projector's black are in all frames alike, and are taken for global.
+do not explain: 0 under uniform light, where nothing is told, near 1 where the dots' shadows leave gaps between them. An
+even haze is the mode told least: dots nearer than a mask feature is wide in the scene (12 mm, 13 pixels of the anchor)
+cast nearly its shadow, and 49 dots tell a 600th of it, enough where the model holds, too little where it does not
+(depth). **What is not told**: global light that changes from frame to frame or from dot to dot (near an edge, caustics)
+stays in X, and so does what a lit pixel gets of its own light; lamps' light and the projector's black are in all frames
+alike, and are taken for global.
 """
 
 from __future__ import annotations

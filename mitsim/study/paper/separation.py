@@ -18,7 +18,8 @@ from mitsim.capture.light import Light
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.accumulator import Accumulator
-from mitsim.reconstruct.separation import separate
+from mitsim.reconstruct.focus import stated_parallax
+from mitsim.reconstruct.separation import separate, widened
 from mitsim.reconstruct.solver import Prepared
 from mitsim.rig.patterns import Shot
 from mitsim.study.charts import image_grid
@@ -30,10 +31,15 @@ from mitsim.study.paper.measure import verdict
 from mitsim.study.studio import Studio
 
 SCENES = ("corner", "cookie_bag")
-FAMILIES = ("dots:4", "dots:7", "dots:12")
+FAMILIES = ("dots:4", "dots:7", "dots:10")
 AS_IT_IS, MENDED = DEPTHS = ("as it is", "depth mended")
+ALL, SEPARATED, ALONE, GLOBAL = IMAGES = ("all light", "separated", "direct alone", "global")
+"""Images of all light taken for direct, of what is left once global light is told apart, of direct light without any
+other, and of global light."""
 _ACCURACY = 3e-3
 """Of the light: global light is a tenth of it and more."""
+_MARGIN = 2
+"""Periods of the dots beyond the window that light comes from: in the corner four give no more."""
 Measured = list[tuple[Shot, FloatArray]]
 """Frames [electrons/s] with their shots."""
 
@@ -43,45 +49,60 @@ def _points(scope: Scope) -> Sequence[Point]:
     own = scope.pictures == (None,)
     setups = [base] if own else [replace(base, scene=name) for name in scope.chosen(SCENES, SCENES[:1])]
     return [
-        Point.of(setup, subject=setup.scene, depth=depth, patterns=family, seed=seed)
+        Point.of(setup, subject=setup.scene, patterns=family, seed=seed)
         for setup in setups
         for seed in scope.seeds
         for family in scope.chosen(FAMILIES, FAMILIES[1:2])
-        for depth in DEPTHS
     ]
 
 
 def _measure(studio: Studio, point: Point) -> Found:
     frames = studio.frames(point.setup, RENDERED, str(point["patterns"]), int(point["seed"]))
-    lit, model = frames.lit, frames.prepared()
+    lit = frames.lit
     if not lit.light.simulation.physics.interreflection:
         raise MitsimError(f"study separation: light over several surfaces is not worth following in {point['subject']}")
-    alone = LitScene(direct_of(lit.light)).expected(RENDERED, frames.family)
-    direct = [frames.exposer(1.0).electrons(frame) for frame in alone]
-    every = [frames.exposer(1.0).electrons(frame) for frame in frames.expected]
-    if point["depth"] == MENDED:
-        ideal = [_modelled(frames, shot) for shot in frames.family.shots]
-        every = [ideal_ + all_ - direct_ for ideal_, all_, direct_ in zip(ideal, every, direct, strict=True)]
-        direct = ideal
-    measured, bound = (_noisy(frames, rates) for rates in (every, direct))
+    parallax = stated_parallax(studio.factors(point.setup, int(point["seed"])))
+    margin = _MARGIN * max(frames.family.left.shape[1], frames.family.right.shape[1])
+    seen = widened(frames.sides[0], parallax, 0, margin), widened(frames.sides[1], parallax, 1, margin)
+    electrons = frames.exposer(1.0).electrons
+    direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected(RENDERED, frames.family)]
+    bounced = [electrons(frame) - own for frame, own in zip(frames.expected, direct, strict=True)]
+    known = global_truth(lit.light)
+    rows, arrays = [], {"direct, true": lit.truth, "global, true": known}
+    for depth in DEPTHS:
+        own = direct if depth == AS_IT_IS else [_modelled(frames, shot) for shot in frames.family.shots]
+        images, told = _images(frames, own, bounced, seen)
+        levels = {f"{name}_db": psnr(image, known if name == GLOBAL else lit.truth) for name, image in images.items()}
+        gain = levels[f"{SEPARATED}_db"] - levels[f"{ALL}_db"]
+        rows.append(point.row(depth=depth, gain_db=gain, told=told, **levels))
+        arrays |= {f"{depth} {name}": image for name, image in images.items()}
+    return Found(tuple(rows), {name: image.astype("float32") for name, image in arrays.items()})
+
+
+def _images(
+    frames: Unexposed, direct: Sequence[FloatArray], bounced: Sequence[FloatArray], seen: tuple[FloatArray, FloatArray]
+) -> tuple[dict[str, FloatArray], float]:
+    """Images of one exposure of all light, and the least part of a mode that the patterns tell.
+
+    Parameters
+    ----------
+    frames
+        patterns, exposure time and factors.
+    direct, bounced
+        light of each frame [electrons/s].
+    seen
+        the factors, and more columns beside.
+    """
+    model = frames.prepared()
+    measured = _noisy(frames, [own + more for own, more in zip(direct, bounced, strict=True)])
     whole = _weights(model, measured)
     patterns = frames.family.left.astype(float), frames.family.right.astype(float)
     total = np.sum([frame for _, frame in measured], axis=0)
-    found = separate(model, frames.sides, patterns, whole.sum, total)
+    found = separate(model, seen, patterns, whole.sum, total)
     less = _weights(model, [(shot, frame - found.common) for shot, frame in measured])
-    images = {
-        "all light": model.solve(whole).image,
-        "separated": model.solve(less).image,
-        "direct alone": model.solve(_weights(model, bound)).image,
-        "global": found.image,
-    }
-    known = global_truth(lit.light)
-    levels = {f"{name.replace(' ', '_')}_db": psnr(image, lit.truth) for name, image in images.items()}
-    levels["global_db"] = psnr(found.image, known)
-    levels["gain_db"] = levels["separated_db"] - levels["all_light_db"]
-    row = point.row(**levels, global_rms=float(np.sqrt(np.square(known).mean())), told=float(found.told[0]))
-    kept = {"direct, true": lit.truth, "global, true": known, **images}
-    return Found((row,), {name: image.astype("float32") for name, image in kept.items()})
+    solved = {ALL: whole, SEPARATED: less, ALONE: _weights(model, _noisy(frames, direct))}
+    images = {name: model.solve(sums).image for name, sums in solved.items()}
+    return {**images, GLOBAL: found.image}, float(found.told[0])
 
 
 def _modelled(frames: Unexposed, shot: Shot) -> FloatArray:
@@ -128,28 +149,35 @@ def _claims(results: Results) -> Sequence[Claim]:
 
     def claim(depth: str) -> Claim:
         rows = table.where(depth=depth)
-        gains = {name: rows.mean("gain_db", subject=name) for name in table.distinct("subject")}
+        gains = {name: rows.mean("gain_db", subject=name, patterns="dots:7") for name in table.distinct("subject")}
         told = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
         gained = all(gain.value > 0 for gain in gains.values())
         return Claim(
-            f"Dots tell global light apart, {depth}: gain", "Nayar et al. 2006", "not simulated", told, verdict(gained)
+            f"49 dots tell global light apart, {depth}: gain",
+            "Nayar et al. 2006",
+            "not simulated",
+            told,
+            verdict(gained),
         )
 
     return [claim(depth) for depth in table.distinct("depth")]
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn = results.table.where(patterns="dots:7"), {}
-    names = ("direct, true", "all light", "separated", "direct alone", "global, true", "global")
+    drawn = {}
+    table = results.table.where(patterns="dots:7")
     for depth in table.distinct("depth"):
         grid = {}
-        for subject in table.distinct("subject"):
-            row = table.where(subject=subject, depth=depth).rows[0]
-            kept = [(results.array(row, name), row.get(f"{name.replace(' ', '_')}_db")) for name in names]
-            grid[subject.replace("_", " ")] = [
-                (image, "" if level is None else f"{level:.1f} dB") for image, level in kept if image is not None
+        for row in table.where(depth=depth).rows:
+            truths = [(results.array(row, name), None) for name in ("direct, true", "global, true")]
+            images = [(results.array(row, f"{depth} {name}"), row[f"{name}_db"]) for name in IMAGES]
+            shown = [truths[0], *images[:-1], truths[1], images[-1]]
+            grid[str(row["subject"]).replace("_", " ")] = [
+                (image, "" if level is None else f"{level:.1f} dB") for image, level in shown if image is not None
             ]
-        drawn[f"images_{depth.replace(' ', '_')}.png"] = image_grid(grid, names)
+        drawn[f"images_{depth.replace(' ', '_')}.png"] = image_grid(
+            grid, ["direct, true", *IMAGES[:-1], "global, true", GLOBAL]
+        )
     return drawn
 
 
