@@ -26,7 +26,7 @@ the mask); light of sharp lobes is not moved, and indirect light stays where it 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -73,6 +73,8 @@ _WHOLE = "pixels that are lit all over"
 """Beside :data:`DETAIL`, where nothing moves or hides a pixel's points."""
 _POINTS = 2
 """Points a side of a cell that stand for even light, none on an edge; a keystone leaves 1e-3 of cells uneven."""
+_SIMULATIONS = 4
+"""Kept, as shadows seen from many anchors take seconds to prepare, but up to half a GB each (cookie_bag)."""
 _IN_PLACE = 1e-3
 """Projector pixels that light may lie beside its place on the aligned plane and count as on it: float32 leaves 1e-4."""
 
@@ -100,7 +102,7 @@ class Anatomy:
         self.light, self._exact, self._purpose = light, exact, purpose
         self._even = np.divide(board.mean(), board, out=np.ones_like(board), where=board > 0)
         self._kept: dict[tuple[bool, frozenset[str]], Light] = {}
-        self._simulations: dict[Settings, Simulation] = {}
+        self._simulated = lru_cache(maxsize=_SIMULATIONS)(lambda settings: Simulation(light.bench, settings))
         self.effects = tuple(name for name, present in _present(light).items() if present)
 
     @classmethod
@@ -144,12 +146,6 @@ class Anatomy:
             )
         plain = replace(settings, anchors=1, sharp=None, occluded=(), effects=effects)
         return replace(light, groups=groups, simulation=self._simulated(plain))
-
-    def _simulated(self, settings: Settings) -> Simulation:
-        """One for each ``settings``: shadows seen from many anchors take seconds to prepare."""
-        if settings not in self._simulations:
-            self._simulations[settings] = Simulation(self.light.bench, settings)
-        return self._simulations[settings]
 
     def _brightness(self, off: frozenset[str]) -> FloatArray:
         """(n^2,) what each pixel's light is multiplied by."""

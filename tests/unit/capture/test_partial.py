@@ -182,6 +182,14 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: Light) -> None:
     assert spread[1] > 10 * spread[0]
 
 
+def test_what_hides_or_moves_points_leaves_them_where_they_are(far: Light) -> None:
+    """Where depth stays on, all points of a pixel have the mean of their values. (Planted: that of all pixels.)"""
+    deposits = sharp_deposits(far)
+    two = Deposits.joined([deposits, replace(deposits, value=3 * deposits.value)])
+    even = partial._even(two, far.bench.n**2)
+    assert np.allclose(even.value, 2 * np.tile(deposits.value, 2)) and np.array_equal(even.row, two.row)
+
+
 def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..., Path], variant: str) -> None:
     """A glossy sheet: without gloss all points of the sensor see the mean over it; all light is as much."""
     path = shared_scene("glossy", reflectance=PRINT)
@@ -199,15 +207,15 @@ def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..
 
 
 def test_lobes_are_averaged_over_anchors_with_their_weights(far: Light) -> None:
-    """Light of the first anchor alone comes to all, times its weight in the mean over the sensor."""
+    """Light of one anchor alone comes to all, times its weight in the mean over it. (Planted: its row's twice.)"""
     sharp = SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05))
     simulation = Simulation(far.bench, replace(far.simulation.settings, sharp=sharp))
     one, zero = np.ones(1), np.zeros(1, np.int64)
-    deposits = Deposits(zero + 5, zero + 2, zero, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16))
+    deposits = Deposits(zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16))
     labels = np.arange(far.bench.n**2)
     filed = simulation.sharp.file(deposits, labels, 1)
     mean = partial._even_lobes(filed, simulation)
-    weight = simulation.sharp_weights[2] * simulation.sharp_weights[0]
+    weight = simulation.sharp_weights[2] * simulation.sharp_weights[1]
     again = simulation.sharp.bundle.repeated(
         replace(simulation.sharp.bundle, anchors=1).file(deposits.averaged(simulation.sharp_weights), labels, 1)
     )

@@ -84,6 +84,18 @@ def test_lines_give_the_factors_of_stripes(studio: Studio, setup: Setup) -> None
         assert np.abs(side - like).max() < (1e-6 + 2 * 16 * leak) * np.abs(like).max()
 
 
+def test_a_session_loses_what_black_pixels_leak(studio: Studio, setup: Setup) -> None:
+    """Contrast 50: in the difference of two shots the leak cancels, and white pixels count 0.98; the factors of lines,
+    which are formed without a leak, must have it. Noise leaves 1e-4 of the scale. (Planted: no leak.)"""
+    device = Path(setup.scene).parent / "leaking.toml"
+    device.write_text('name = "leaking"\neffective_wavelength_nm = 562.0\ncontrast_ratio = 50.0\n')
+    sessions = Sessions(studio.bench(replace(setup, projector=str(device))), 3)
+    leaking, tight = (sessions.factors(frozenset(off), noise=False) for off in ((), (BLACK_LEVEL,)))
+    assert np.allclose(leaking.left, np.sqrt(1 - 1 / 50) * tight.left, rtol=1e-6)
+    scale = np.vdot(sessions.noisy.left, leaking.left) / np.vdot(leaking.left, leaking.left)
+    assert scale == pytest.approx(1, abs=1e-3)
+
+
 def test_calibration_noise_is_that_of_the_sessions_frames(levels: Levels) -> None:
     """u_i = Y_i v / |v|^2 of +-1 stripes: the variance of a number is sum_c v_c^2 var Y_rc / |v|^4 over N stripes. 1024
     numbers a side tell a deviation to 2.2 %; three of them are allowed. (Planted: the noise of one shot for two.)"""
