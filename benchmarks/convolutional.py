@@ -13,9 +13,8 @@ frame exposure (mitsim.study.exposures).
 
 Speed: CPU seconds on one thread, all within this run. Iterative: conjugate gradients on frames, to two marks: an error
 against the truth within 1 % of the direct solution's (0.09 dB; residual 1e-6), and a difference from it below 1e-6
-(residual 1e-12). Direct: `prepare` is what is done once for a camera, a family and a lambda, `solve` what every set of
-frames takes, their transforms included. Both solve for the lambda
-that is best for the first photograph on the whole sensor.
+(`exact`). Direct: `prepare` is what is done once for a camera, a family and a lambda; every set of frames takes the
+rest, their transforms included. Both solve for the lambda that is best for the first photograph on the whole sensor.
 """
 
 from __future__ import annotations
@@ -35,15 +34,15 @@ from solver import dots, frames_of, paper_factor, summed
 
 from mitsim.core.configuration import shipped
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.convolution import ConvolutionalCamera, ConvolutionSolution, solve_iteratively
-from mitsim.reconstruct.dots import Classes, FactorisedClasses
+from mitsim.reconstruct.convolution import ConvolutionalCamera
+from mitsim.reconstruct.dots import Classes
 from mitsim.reconstruct.solver import prepare
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.psf import load_psf
 from mitsim.rig.sensor import load_sensor
-from mitsim.study.diffusercam import best_image, take
+from mitsim.study.diffusercam import best_image, race, take
 from mitsim.study.exposures import CONVENTIONS
-from mitsim.study.metrics import psnr, relative_error
+from mitsim.study.metrics import psnr
 
 N = 128
 PERIODS = (1, 2, 3, 5, 7)
@@ -78,70 +77,15 @@ def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
             }
 
 
-class Watch:
-    """Notes when the image comes within 1 % of the direct solution's error, and within 1e-6 of it."""
-
-    def __init__(self, direct: np.ndarray, truth: np.ndarray) -> None:
-        self.direct, self.truth = direct, truth
-        self.error = relative_error(direct, truth)
-        self.start, self.steps = time.process_time(), 0
-        self.marks: dict[str, tuple[int, float]] = {}
-
-    def __call__(self, image: np.ndarray) -> bool:
-        self.steps += 1
-        spent = time.process_time() - self.start
-        if relative_error(image, self.truth) <= 1.01 * self.error:
-            self.marks.setdefault("equal_error", (self.steps, spent))
-        if relative_error(image, self.direct) <= 1e-6:
-            self.marks.setdefault("equal_answer", (self.steps, spent))
-        return len(self.marks) == 2
-
-
-def timed_solve(
-    factorised: FactorisedClasses, frames: np.ndarray, tolerance: float
-) -> tuple[ConvolutionSolution, float]:
-    """Solution of frames, and its CPU seconds."""
-    start = time.process_time()
-    solution = factorised.solve(factorised.classes.projected(frames), tolerance)
-    return solution, time.process_time() - start
-
-
 def speed(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
-    """CPU seconds of both solvers."""
-    sensor, truth, (cropped, k) = (
-        load_sensor(shipped("calibration", "imx249.toml")),
-        photograph(PHOTOGRAPHS[0], False),
-        case,
-    )
-    family, whole, camera = parse_patterns(f"dots:{k}", N), camera_of(psf, False), camera_of(psf, cropped)
-    lam = best_image(Classes(whole, k), take(whole, family, truth, sensor, seed=seed), truth)[0].lam
-    frames = take(camera, family, truth, sensor, seed=seed).frames
-    start = time.process_time()
-    factorised = Classes(camera, k).factorise(lam)
-    prepare_s = time.process_time() - start
-    exact, exact_s = timed_solve(factorised, frames, 1e-12)
-    direct, direct_s = timed_solve(factorised, frames, 1e-6)
-    watch = Watch(exact.image, truth)
-    iterative = solve_iteratively(camera, family, frames, lam, 1e-14, 1000, watch)
-    row: Row = {
-        "factorised": factorised.factors is not None,
-        "psnr_db": round(psnr(direct.image, truth), 2),
-        "difference": relative_error(iterative.image, exact.image),
-        "direct_prepare_s": prepare_s,
-        "direct_solve_s": direct_s,
-        "direct_exact_s": exact_s,
-        "direct_iterations": direct.iterations,
-    }
-    for mark, ours in (("equal_error", direct_s), ("equal_answer", exact_s)):
-        if mark in watch.marks:
-            steps, spent = watch.marks[mark]
-            row |= {
-                f"iterative_{mark}_s": spent,
-                f"iterations_{mark}": steps,
-                f"speedup_{mark}": spent / ours,
-                f"speedup_{mark}_with_prepare": spent / (ours + prepare_s),
-            }
-    yield row
+    """CPU seconds of both solvers (mitsim.study.diffusercam.race)."""
+    sensor, truth = load_sensor(shipped("calibration", "imx249.toml")), photograph(PHOTOGRAPHS[0], False)
+    classes, whole = (Classes(camera_of(psf, cropped), case[1]) for cropped in (case[0], False))
+    row = race(classes, whole, truth, sensor, seed)
+    for mark in ("", "_exact"):
+        ours, theirs = row[f"direct{mark}_s"], row[f"iterative{mark}_s"]
+        row |= {f"speedup{mark}": theirs / ours, f"speedup{mark}_with_prepare": theirs / (ours + row["prepare_s"])}
+    yield {"factorised": classes.factorised, **row}
 
 
 def separable_seconds() -> float:

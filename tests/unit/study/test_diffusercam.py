@@ -56,17 +56,18 @@ def test_the_best_lambda_is_found_to_a_tenth_of_a_decibel() -> None:
     assert fine[0] < max(fine) - 0.5 and fine[-1] < max(fine) - 0.5
 
 
+@pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("sensor", [None, (22, 25)])
-def test_both_solvers_come_to_one_image(sensor: tuple[int, int] | None) -> None:
-    """On all light, where the direct solver iterates on small grids, and cropped, where it factorises. (Planted: frames
-    of another noise for one of them, lambda doubled for one.)"""
+def test_both_solvers_come_to_one_image(sensor: tuple[int, int] | None, k: int) -> None:
+    """On all light, where the direct solver iterates on small grids, and cropped, where it factorises; under uniform
+    light, where lambda matters, and dots. (Planted: lambda doubled for one of them.)"""
     camera = ConvolutionalCamera(CAMERA.psf, N, sensor)
     whole = ConvolutionalCamera(CAMERA.psf, N)
-    found = race(Classes(camera, 3), Classes(whole, 3), TRUTH, SENSOR, 0)
+    found = race(Classes(camera, k), Classes(whole, k), TRUTH, SENSOR, 0)
     assert found["difference"] <= 1e-6
-    assert 0 < found["iterations"] <= found["iterations_exact"] < 200
+    assert 0 < found["iterations"] <= found["iterations_exact"] < 1000
     assert 0 < found["iterative_s"] <= found["iterative_exact_s"]
-    assert found["direct_s"] > 0 and found["psnr_db"] > 30
+    assert found["direct_s"] > 0 and found["psnr_db"] > (12 if k == 1 else 30)
 
 
 def test_iterations_that_do_not_arrive_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
