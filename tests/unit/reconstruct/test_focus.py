@@ -83,6 +83,16 @@ def test_moved_columns_are_those_of_the_depth(depth: float, axis: int) -> None:
     assert 0 < PIXELS - (known.stop - known.start) <= 5
 
 
+def test_without_a_baseline_both_sides_of_the_sensor_are_alike() -> None:
+    """Only the place on the sensor moves columns then, from its middle. (Planted: half a sensor pixel off it.)"""
+    shared = PARALLAX.model_copy(update={"row_mm": (0.0, 0.0)})
+    factor = np.random.default_rng(3).random((PIXELS, N))
+    found, known = moved(factor, shared, 0, 1 / 360 - 1 / 400)
+    turned, same = moved(factor[::-1, ::-1], shared, 0, 1 / 360 - 1 / 400)
+    assert (known.start, known.stop) == (PIXELS - same.stop, PIXELS - same.start)
+    np.testing.assert_allclose(turned[::-1, ::-1][known], found[known], rtol=1e-9)
+
+
 def test_depth_may_differ_from_pixel_to_pixel() -> None:
     factor = shadow(400.0, 1)
     shifts = 1 / np.linspace(360, 440, N) - 1 / 400
