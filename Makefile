@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | lint | docs | robustness | mutants | wheel.  Everything lives in .venv;
+# make setup | demo | paper | test | test-all | lint | docs | robustness | mutants | wheel.  Everything lives in .venv;
 # PYTHON=python3.12 picks another Python.
 VENV := .venv
 PYTHON ?= python3
@@ -14,7 +14,7 @@ test test-all robustness: export PYTHONDONTWRITEBYTECODE :=
 # One test process a processor.
 PARALLEL := -n logical --maxprocesses 8 --dist worksteal
 
-.PHONY: setup demo test test-all lint docs robustness mutants wheel
+.PHONY: setup demo paper test test-all lint docs robustness mutants wheel
 
 setup: $(READY)
 
@@ -32,6 +32,10 @@ $(DOCS_READY): $(READY)
 
 demo: setup
 	@$(VENV)/bin/mitsim demo -o demo-output
+
+# Every experiment of the paper and beyond it, on one page; goes on where it stopped.
+paper: setup
+	@$(VENV)/bin/mitsim study all -o paper-output
 
 test: setup
 	@$(VENV)/bin/python -m pytest -m 'not slow' $(PARALLEL)

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from mitsim.core.resources import Limits
     from mitsim.core.runs import Capture, load_run
     from mitsim.reconstruct.factors import Factors, load_calibration
-    from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
+    from mitsim.reconstruct.reconstruction import reconstruct
+    from mitsim.reconstruct.result import Reconstruction
     from mitsim.rig.recipe import load_recipe
     from mitsim.study.metrics import psnr, ssim
 
@@ -48,7 +49,7 @@ _HOMES = {
     "Light": "capture.light",
     "Capture": "core.runs",
     "Factors": "reconstruct.factors",
-    "Reconstruction": "reconstruct.reconstruction",
+    "Reconstruction": "reconstruct.result",
     "Rendered": "capture.render",
     "Job": "core.job",
     "Clock": "core.job",

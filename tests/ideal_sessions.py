@@ -59,10 +59,14 @@ class Bench:
     stated: bool = True
     parts: int = 1
 
+    def light(self, shown: np.ndarray) -> np.ndarray:
+        """(PIXELS, PIXELS) light of a scene as it is lit."""
+        return self.left @ shown @ self.right.T
+
     def run(self, patterns: str, scene: np.ndarray, seed: int) -> Capture:
         """Noisy shots of a family, the brightest pixel at ``peak``."""
         family, whole = parse_patterns(patterns, len(scene) // self.parts, seed), np.ones((self.parts, self.parts))
-        lights = [self.left @ (np.kron(family.light(shot), whole) * scene) @ self.right.T for shot in family.shots]
+        lights = [self.light(np.kron(family.light(shot), whole) * scene) for shot in family.shots]
         gain = self.peak / max(light.max() for light in lights)
         rng, memory = np.random.default_rng([seed, 1]), RunMemory()
         for index, light in enumerate(lights):

@@ -306,7 +306,7 @@ class Bench:
         """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid."""
         grid = self.loaded.pixels
         return {
-            "geometry": self.geometry.model_dump(),
+            "geometry": self.geometry.identity,
             "sensor": self.sensor.model_dump(exclude={"source"}),
             "projector": {
                 "name": self.projector.name,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from operator import add
 from pathlib import Path
@@ -90,6 +90,8 @@ class Light:
         connections and paths traced.
     sampling_error
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
+    samples
+        of each group, by the name of what was traced; empty where nobody kept them.
     """
 
     groups: tuple[FiledLight, ...]
@@ -102,6 +104,7 @@ class Light:
     paths: int
     sampling_error: float
     reached: bool
+    samples: Mapping[str, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Light({self.paths:.2g} paths, relative error {self.sampling_error:.1e}, of {self.bench!r})"
@@ -146,11 +149,15 @@ class Light:
         ValueError
             for shots that split a class of the light.
         """
+        return self.simulation.expected(self.groups, self.rows_of(lighting), lighting, seed, leaking)
+
+    def rows_of(self, lighting: Lighting) -> Labels:
+        """(rows,) class of ``lighting`` that each row of the light belongs to; ValueError as :meth:`frames`."""
         rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
         rows[self.labels] = lighting.labels
         if not np.array_equal(rows[self.labels], lighting.labels):
             raise ValueError("the light was traced for another family of patterns")
-        return self.simulation.expected(self.groups, rows, lighting, seed, leaking)
+        return rows
 
     def expose(
         self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
@@ -177,6 +184,11 @@ class Light:
 
         own = replace(self.plan, request=request_of(self.plan, {}).changed(patterns=patterns))
         return capture(self.bench, request_of(own, request), job, output, light=self)
+
+    def behind(self, bench: Bench) -> Light:
+        """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up
+        to it."""
+        return replace(self, simulation=Simulation(bench, self.simulation.settings))
 
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""
@@ -244,6 +256,7 @@ def trace_light(
             paths=sum(group.paths for group in groups),
             sampling_error=math.inf,
             reached=False,
+            samples=dict(groups[0].done),
         )
         # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
         expected = light.frames(checked, seed, leaking=False)
@@ -263,6 +276,27 @@ def trace_light(
         # Capped before the power as well: a target that was set very low would overflow it.
         growth = min(seen / target, _LARGEST_GROWTH) ** rate
         rounds *= min(max(1.05 * growth, least), _LARGEST_GROWTH)
+
+
+@single_threaded_blas()
+def traced_again(light: Light, simulation: Simulation, purpose: str = "scene") -> Light:
+    """The same paths of a light, as far as another simulation has their tracers, filed as that does.
+
+    Parameters
+    ----------
+    light
+        with its samples.
+    simulation
+        of the same scene.
+    purpose
+        of the light, which names its random streams.
+    """
+    streams = [integer(light.seed, "transport", purpose, group) for group in range(GROUPS)]
+    groups = [_Group(simulation, light.labels, stream) for stream in streams]
+    for group in groups:
+        group.trace(light.samples)
+    flux = np.mean([group.flux for group in groups], axis=0)
+    return replace(light, groups=tuple(group.light for group in groups), simulation=simulation, flux=flux)
 
 
 def _some(lighting: Lighting, count: int) -> Lighting:
@@ -302,11 +336,18 @@ class _Group:
 
     def sample(self, rounds: float) -> None:
         """Trace until this many times the samples that the plan predicted are done."""
+        wanted = {}
         for name, stage in self.simulation.tracers().items():
             samples = max(rounds * stage.predicted, 1.0)
-            wanted, seed = math.ceil(even(samples) if name in EVEN else samples), integer(self.seed, stage.stream)
-            while (done := self.done.get(name, 0)) < wanted:
-                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted - done)
+            wanted[name] = math.ceil(even(samples) if name in EVEN else samples)
+        self.trace(wanted)
+
+    def trace(self, wanted: Mapping[str, int]) -> None:
+        """Trace until so many samples as are ``wanted`` of each stage by its name are done."""
+        for name, stage in self.simulation.tracers().items():
+            seed = integer(self.seed, stage.stream)
+            while (done := self.done.get(name, 0)) < wanted[name]:
+                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
                 deposits = stage.tracer.trace(seed, done, count)
                 light = stage.file(deposits, self.labels, 1)
                 self._sums[name] = self._sums[name] + light if name in self._sums else light

@@ -437,9 +437,16 @@ class Simulation:
         leaking
             whether black pixels leak, so that every shot lights all of them; without, shots of few pixels form faster.
         """
-        first = len(rows)
-        black = self.physics.black_level if leaking else 0.0
-        emitted = black + (1 - black) * lighting.weights
+        return expected_of([(self, groups)], rows, lighting, seed, leaking)
+
+    def filed(self, groups: Sequence[FiledLight], first: int) -> tuple[list[Filed], list[Filed]]:
+        """Light of the projector and ambient light, with the optics that form their frames.
+
+        Parameters
+        ----------
+        groups, first
+            independent estimates of the light, and the row of ambient light in them, the last.
+        """
         lights, ambient = [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))], []
         if self.settings.anchors > 1:
             lights.append(Filed(self.coarse.optics, tuple(_rows(group.coarse, 0, first) for group in groups)))
@@ -456,8 +463,33 @@ class Simulation:
             if self.settings.followed_anchors > 1:
                 beyond = tuple(_rows(group.followed, first, first + 1) for group in groups)
                 ambient.append(Filed(self.followed_ambient.optics, beyond))
-        glint = self.glint_frames(lighting.labels)
-        return ExpectedFrames(lights, Lighting(rows, emitted), seed, ambient, glint)
+        return lights, ambient
+
+
+def expected_of(
+    parts: Sequence[tuple[Simulation, Sequence[FiledLight]]],
+    rows: Labels,
+    lighting: Lighting,
+    seed: int,
+    leaking: bool = True,
+) -> ExpectedFrames:
+    """Expected frames of light in several parts.
+
+    Parameters
+    ----------
+    parts
+        simulations of one rig, each with the light that it filed; black pixels leak as the first says, glint is that of
+        the last.
+    rows, lighting, seed, leaking
+        as for :meth:`Simulation.expected`.
+    """
+    physics = parts[0][0].physics
+    black = physics.black_level if leaking else 0.0
+    emitted = black + (1 - black) * lighting.weights
+    filed = [simulation.filed(groups, len(rows)) for simulation, groups in parts]
+    lights, ambient = ([each for part in filed for each in part[kind]] for kind in (0, 1))
+    glint = parts[-1][0].glint_frames(lighting.labels)
+    return ExpectedFrames(lights, Lighting(rows, emitted), seed, ambient, glint)
 
 
 def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:

@@ -280,7 +280,10 @@ def reconstruct(
     method: Annotated[str, typer.Option(help="tikhonov or tv")] = "tikhonov",
     focus: Annotated[
         str | None,
-        typer.Option(help="depth of the scene, or auto; the calibrated depth if not given", metavar="auto|MM"),
+        typer.Option(
+            help="depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
+            metavar="auto|MM|map",
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     variant: Variant = DEFAULT_VARIANT,
@@ -290,7 +293,7 @@ def reconstruct(
     """Recover the image from frames and a calibration alone."""
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
-    depth = None if focus is None else number_of("focus", focus)
+    depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
     result = reconstruct_folder(
         run, calibration, output or run / "reconstruction", number_of("lambda", lam), method, overwrite, depth
     )

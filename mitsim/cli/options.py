@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -169,14 +169,23 @@ def defines_of(define: Sequence[str] | None) -> dict[str, str]:
     return parameters
 
 
-def number_of(argument: str, text: str) -> float | Literal["auto"]:
-    """The number in ``text``, or auto; a refusal names the ``argument``."""
-    if text == "auto":
-        return "auto"
+def number_of(argument: str, text: str, words: Sequence[str] = ("auto",)) -> Any:
+    """The number in a text, or one of a few words.
+
+    Parameters
+    ----------
+    argument
+        what a refusal names.
+    text, words
+        what was given, and the words that are allowed instead of a number.
+    """
+    if text in words:
+        return text
     try:
         return float(text)
     except ValueError:
-        raise ArgumentError("lam" if argument == "lambda" else argument, f"{text!r}: give a number or auto") from None
+        told = f"{text!r}: give a number or {' or '.join(words)}"
+        raise ArgumentError("lam" if argument == "lambda" else argument, told) from None
 
 
 @contextmanager

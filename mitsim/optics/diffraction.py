@@ -23,6 +23,7 @@ clear aperture of both faces, propagated from the exit face: diffraction inside 
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import chain, combinations
 
 import numpy as np
@@ -108,11 +109,7 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
     means = _thick_means if shadow.thickness_mm else _thin_means
     terms: SeparableTerms = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-
-        def axis(profiles: list[FloatArray], at: Directions, wavelength: float = float(wavelength)) -> FloatArray:
-            return means(shadow, profiles, at, wavelength)
-
-        left, right = both_axes(shadow, rows, columns, axis)
+        left, right = both_axes(shadow, rows, columns, partial(means, wavelength_nm=float(wavelength)))
         terms += [(share * weight * a, b) for weight, a, b in zip(weights, left, right, strict=True)]
     return terms
 

@@ -33,15 +33,19 @@ class ProfileSampler:
     feature_mm
         their size.
     start_mm
-        where the first begins; None: centred on the axis.
+        where the first begins; None: centred on ``centre_mm``.
+    centre_mm
+        of the mask, which ``start_mm`` is counted from.
     """
 
-    def __init__(self, profile: npt.ArrayLike, feature_mm: float, start_mm: float | None = None) -> None:
+    def __init__(
+        self, profile: npt.ArrayLike, feature_mm: float, start_mm: float | None = None, centre_mm: float = 0.0
+    ) -> None:
         values = np.asarray(profile, dtype=np.float64)
         self._values = np.concatenate(([0.0], values, [0.0]))
         self._sums = np.cumsum(self._values)
         self._feature, self._count = feature_mm, len(values)
-        self._start = -len(values) / 2 if start_mm is None else start_mm / feature_mm
+        self._start = (-len(values) / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
 
     def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
         """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
@@ -74,19 +78,27 @@ def wave_samplers(
     reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + geometry.pixel_pitch
     terms: list[SeparableTerm] = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-        rows, start, step = wave_profiles(shadow, float(wavelength), -reach, reach, tau[0])
-        columns, *_ = wave_profiles(shadow, float(wavelength), -reach, reach, tau[1])
+
+        def axis(of: int, wavelength: float = float(wavelength)) -> list[tuple[float, ProfileSampler]]:
+            centre = geometry.mask_offset[of]
+            low, high = -reach - centre, reach - centre
+            profiles, start, step = wave_profiles(shadow, wavelength, low, high, tau[of] - centre / depth)
+            return [(weight, ProfileSampler(profile, step, start, centre)) for weight, profile in profiles]
+
         terms += [
-            (float(share) * weight, ProfileSampler(row, step, start), ProfileSampler(column, step, start))
-            for (weight, row), (_, column) in zip(rows, columns, strict=True)
+            (float(share) * weight, row, column) for (weight, row), (_, column) in zip(axis(0), axis(1), strict=True)
         ]
     return terms
 
 
 def geometric_samplers(geometry: CameraGeometry) -> list[SeparableTerm]:
     """The geometric shadow of the mask of ``geometry``, as samplers."""
-    mask = geometry.build_mask()
+    mask, (row, column) = geometry.build_mask(), geometry.mask_offset
     return [
-        (weight, ProfileSampler(rows, mask.feature_mm), ProfileSampler(columns, mask.feature_mm))
+        (
+            weight,
+            ProfileSampler(rows, mask.feature_mm, centre_mm=row),
+            ProfileSampler(columns, mask.feature_mm, centre_mm=column),
+        )
         for weight, rows, columns in mask.terms
     ]

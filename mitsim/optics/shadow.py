@@ -16,13 +16,15 @@ is a function of s alone, whatever the sensor point::
 So each direction has its own clear profile M(s) M(s') on the exit face, and that profile's shadow is the thin mask's.
 A cell takes the clear profile of its centre.
 
+A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z.
+
 All coordinates are index coordinates, centred, in mm; tau is a pure number.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -88,6 +90,8 @@ class ShadowGeometry:
         sensor to the mask's exit face, d, and the mask's thickness [mm].
     depth_mm
         sensor to scene, z [mm], beyond the mask; ``inf`` is allowed.
+    offset_mm
+        (row, column) of the mask's centre.
     """
 
     mask: Mask
@@ -96,12 +100,13 @@ class ShadowGeometry:
     distance_mm: float
     thickness_mm: float
     depth_mm: float
+    offset_mm: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(cls, camera: CameraGeometry, depth_mm: float) -> ShadowGeometry:
         """That of a ``camera`` toward points at ``depth_mm``."""
         centres, side, mask = camera.pixel_centres, camera.active_side, camera.build_mask()
-        return cls(mask, centres, side, camera.mask_distance, camera.mask_thickness, depth_mm)
+        return cls(mask, centres, side, camera.mask_distance, camera.mask_thickness, depth_mm, camera.mask_offset)
 
     def __post_init__(self) -> None:
         _require_beyond(self.depth_mm, self.distance_mm + self.thickness_mm)
@@ -119,6 +124,17 @@ class ShadowGeometry:
     def half_cell(self, directions: Directions) -> float:
         """Half a cell of ``directions`` seen on the mask [mm]."""
         return self.distance_mm * directions.width / 2
+
+    def from_mask(self, directions: Directions, axis: int) -> tuple[ShadowGeometry, Directions]:
+        """The same along one ``axis`` (0 rows, 1 columns), and its ``directions``, in coordinates of the mask's centre.
+
+        In them the sensor is off the axis by as much the other way.
+        """
+        offset = self.offset_mm[axis]
+        if not offset:
+            return self, directions
+        moved = replace(self, pixel_centres_mm=self.pixel_centres_mm - offset, offset_mm=(0.0, 0.0))
+        return moved, Directions(directions.centres - offset / self.depth_mm, directions.width)
 
     def crossings(self, directions: Directions) -> FloatArray:
         """(m, c) mask coordinates [mm] of rays from pixel centres toward ``directions``."""
@@ -143,7 +159,7 @@ def both_axes(
     shadow: ShadowGeometry,
     rows: Directions,
     columns: Directions,
-    axis: Callable[[list[FloatArray], Directions], FloatArray],
+    axis: Callable[[ShadowGeometry, list[FloatArray], Directions], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
     """A shadow along rows and along columns; equal axes share one computation.
 
@@ -152,14 +168,17 @@ def both_axes(
     shadow, rows, columns
         the mask, and directions along the two axes.
     axis
-        gives the shadow of profiles toward directions.
+        gives the shadow of profiles of a mask on the axis toward directions.
     """
     terms = shadow.mask.terms
     row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
-    left = axis(row_profiles, rows)
-    if rows == columns and np.array_equal(row_profiles, column_profiles):
+    by_row, seen_rows = shadow.from_mask(rows, 0)
+    left = axis(by_row, row_profiles, seen_rows)
+    alike = rows == columns and shadow.offset_mm[0] == shadow.offset_mm[1]
+    if alike and np.array_equal(row_profiles, column_profiles):
         return left, left
-    return left, axis(column_profiles, columns)
+    by_column, seen_columns = shadow.from_mask(columns, 1)
+    return left, axis(by_column, column_profiles, seen_columns)
 
 
 def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> SeparableTerms:
@@ -173,7 +192,7 @@ def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Direction
         r and c directions.
     """
     means = _thick_means if shadow.thickness_mm else _thin_means
-    left, right = both_axes(shadow, rows, columns, lambda profiles, at: means(shadow, profiles, at))
+    left, right = both_axes(shadow, rows, columns, means)
     return [(weight * a, b) for weight, a, b in zip(shadow.weights(), left, right, strict=True)]
 
 

@@ -7,32 +7,23 @@ neighbours' light; so depths are first tried in steps of a pixel of parallax, an
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from mitsim.core.arrays import FloatArray
-from mitsim.core.manifests import Parallax
-from mitsim.core.measurement import Measurement
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulator import centred, centred_columns
+from mitsim.reconstruct.alldepths import RANGE, AllDepths
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import moved, pixels_of_parallax, stated_parallax
+from mitsim.reconstruct.focus import stated_parallax
 from mitsim.reconstruct.solver import prepare
 
-RANGE = 0.25
-"""Depths that are tried, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm moves light by an eighth of a
-window of 0.3 rad."""
 _STEP = 1.0
 """Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
 _RESOLUTION = 0.01
 """Projector pixels of parallax to which the best is refined: 0.06 mm at 400 mm and a baseline of 60 mm; chosen, below
 the millimetre that is asked for."""
-_LEFT_OUT = 1e-6
-"""Part of the factors' energy that the common basis of all depths may leave out: below their noise's."""
 _FEWEST = 16
 """Steps at least, where there is no baseline and only the sensor's own width tells depth."""
 _LEAST_RISE = 1e-4
@@ -92,7 +83,7 @@ def best_depth(shots: Capture, factors: Factors) -> Depth:
 
 
 class _Search:
-    """All measurements, on a basis that the factors of all depths share.
+    """What one depth for the whole scene leaves of all measurements.
 
     Attributes
     ----------
@@ -101,30 +92,14 @@ class _Search:
     """
 
     def __init__(self, shots: Capture, factors: Factors) -> None:
-        self._parallax = stated_parallax(factors)
-        self._patterns = shots.patterns
-        self._factors = factors.left, factors.right
-        self._centre = factors.manifest.centre
-        self.reach = max(_reach(self._parallax, axis, side) for axis, side in enumerate(self._factors))
-        limit = RANGE / self._parallax.depth_mm
-        self._parts, self._bases = [], list[FloatArray]()
-        for axis, side in enumerate(self._factors):
-            shifts = np.linspace(-limit, limit, 2 * int(np.ceil(limit * self.reach)) + 1)
-            found = [moved(side, self._parallax, axis, shift) for shift in (*shifts, -limit, limit)]
-            part = slice(max(each.start for _, each in found), min(each.stop for _, each in found))
-            self._parts.append(part)
-            self._bases.append(_basis([self._own(columns[part]) for columns, _ in found]))
-        self._frames = list(self._projected(shots))
+        self._all = AllDepths(shots, factors, RANGE / stated_parallax(factors).depth_mm)
+        self.reach = max(self._all.reach(axis) for axis in (0, 1))
 
     def left_over(self, shift: float) -> float:
         """Energy of the measurements, less a constant, that factors moved by ``shift`` of 1/z leave."""
-        left, right = (
-            basis.T @ self._own(moved(side, self._parallax, axis, shift)[0][part])
-            for axis, (side, part, basis) in enumerate(zip(self._factors, self._parts, self._bases, strict=True))
-        )
-        prepared = prepare(left, right, *self._patterns)
+        prepared = prepare(self._all.side(0, shift), self._all.side(1, shift), *self._all.patterns)
         sums = prepared.accumulator()
-        for each in self._frames:
+        for each in self._all.frames:
             sums.add(each.frame, each.row, each.column)
         problem = prepared.problem(sums)
         return -float(np.square(problem.projected[problem.sigma > 0]).sum())
@@ -135,35 +110,6 @@ class _Search:
         before, least, after = (self.left_over(shift + part * pixel) for part in (-0.25, 0, 0.25))
         rise = min(self.left_over(shift + pixel), self.left_over(shift - pixel)) - least
         curvature = (before - 2 * least + after) / (pixel / 4) ** 2
-        count = len(self._frames) * np.prod([part.stop - part.start for part in self._parts])
-        unknowns = np.prod([side.shape[1] for side in self._factors])
-        variance = (self._energy + least) / max(count - unknowns, 1)
+        variance = (self._all.energy + least) / max(self._all.data - self._all.shape[0] * self._all.shape[1], 1)
         error = float(np.sqrt(2 * variance / curvature)) if curvature > 0 else float("inf")
-        return error, float(rise / self._energy)
-
-    def _own(self, columns: FloatArray) -> FloatArray:
-        return centred_columns(columns) if self._centre else columns
-
-    def _projected(self, shots: Capture) -> Iterator[Measurement]:
-        self._energy = 0.0
-        shape = len(self._factors[0]), len(self._factors[1])
-        for each in shots.measured(shape):
-            frame = each.frame[self._parts[0], self._parts[1]]
-            frame = centred(frame) if self._centre else frame
-            self._energy += float(np.square(frame).sum())
-            small = self._bases[0].T @ frame @ self._bases[1]
-            yield Measurement(small, each.row, each.column, small, each.shots, 0)
-
-
-def _reach(parallax: Parallax, axis: int, side: FloatArray) -> float:
-    """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees, along an ``axis``."""
-    rows, count = side.shape
-    first, last, by_place = pixels_of_parallax(parallax, axis, count)
-    return float(max(abs(first), abs(last), by_place * rows * parallax.pixel_pitch_mm / 2))
-
-
-def _basis(factors: list[FloatArray]) -> FloatArray:
-    """(m, r) orthonormal columns that span those of all ``factors``, but for a part of their energy."""
-    energies, vectors = np.linalg.eigh(sum(factor @ factor.T for factor in factors))
-    lost = np.cumsum(np.maximum(energies, 0.0))
-    return np.asarray(vectors[:, lost > _LEFT_OUT * lost[-1]])
+        return error, float(rise / self._all.energy)

@@ -200,30 +200,68 @@ def judge(
     for measurement in measured:
         sums.add(measurement)
     expected = sums.expected(factor_energy or 0.0)
-    beyond = sums.residual - expected - print_energy * sums.pixels / sums.pixels.sum()
-    energy, excess = float(sums.energy.sum()), float(beyond.sum())
-    unexplained = float(np.sqrt(max(excess, 0.0) / max(energy, _TINY)))
-    tiles = np.sqrt(np.maximum(beyond, 0.0) / np.maximum(sums.energy, _TINY))
-    chi_square = float(sums.residual.sum() / max(float(expected.sum()), _TINY))
-    chi_squares = sums.residual / np.maximum(expected, _TINY)
-    stated = noise.stated and factor_energy is not None
-    if stated:
-        flagged = unexplained > UNEXPLAINED and chi_square > 1 + _chance(noise, float(sums.pixels.sum()))
-        local = (tiles > UNEXPLAINED_TILE) & (chi_squares > 1 + _chance(noise, float(sums.pixels.min())))
-        flagged = flagged or bool(local.any())
-    else:
-        flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
-    signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1)) if flagged else None
-    return Misfit(
-        chi_square=chi_square,
-        unexplained=unexplained,
-        tiles=chi_squares,
-        worst_tile=float(tiles.max()),
-        stated=stated,
-        flagged=flagged,
-        cause=likely_cause(signatures, unexplained) if signatures else None,
-        signatures=signatures,
-    )
+    balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
+    found, excess = balance.misfit(noise, print_energy)
+    if not found.flagged:
+        return found
+    signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))
+    return replace(found, cause=likely_cause(signatures, found.unexplained), signatures=signatures)
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """Energies by tile of the sensor, or of all of it.
+
+    Attributes
+    ----------
+    residual, energy, expected
+        (rows, columns) of what a model leaves, of the measurements, and of what is expected to be left.
+    pixels
+        (rows, columns) of each tile.
+    stated
+        whether the noise of the factors was stated.
+    """
+
+    residual: FloatArray
+    energy: FloatArray
+    expected: FloatArray
+    pixels: FloatArray
+    stated: bool
+
+    def misfit(self, noise: FrameNoise, print_energy: float) -> tuple[Misfit, float]:
+        """How much is unexplained, of a cause that is not known, and its energy.
+
+        Parameters
+        ----------
+        noise
+            of the measurements.
+        print_energy
+            what print within a pixel may add.
+        """
+        beyond = self.residual - self.expected - print_energy * self.pixels / self.pixels.sum()
+        energy, excess = float(self.energy.sum()), float(beyond.sum())
+        unexplained = float(np.sqrt(max(excess, 0.0) / max(energy, _TINY)))
+        tiles = np.sqrt(np.maximum(beyond, 0.0) / np.maximum(self.energy, _TINY))
+        chi_square = float(self.residual.sum() / max(float(self.expected.sum()), _TINY))
+        chi_squares = self.residual / np.maximum(self.expected, _TINY)
+        stated = noise.stated and self.stated
+        if stated:
+            flagged = unexplained > UNEXPLAINED and chi_square > 1 + _chance(noise, float(self.pixels.sum()))
+            local = (tiles > UNEXPLAINED_TILE) & (chi_squares > 1 + _chance(noise, float(self.pixels.min())))
+            flagged = flagged or bool(local.any())
+        else:
+            flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
+        found = Misfit(
+            chi_square=chi_square,
+            unexplained=unexplained,
+            tiles=chi_squares,
+            worst_tile=float(tiles.max()),
+            stated=stated,
+            flagged=flagged,
+            cause=Cause.UNKNOWN if flagged else None,
+            signatures=None,
+        )
+        return found, excess
 
 
 def _chance(noise: FrameNoise, pixels: float) -> float:

@@ -4,177 +4,37 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.framefile import write_frame
-from mitsim.core.jsonfile import read_json, write_json
+from mitsim.core.errors import ArgumentError
 from mitsim.core.measurement import Measurement
-from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.pictures import card, png, scaled, span
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.depth import Depth, best_depth
+from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import focused
 from mitsim.reconstruct.misfit import Misfit, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
+from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
-from mitsim.reconstruct.status import Status, Verdict
-from mitsim.reconstruct.tv import solve_tv
-from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Propagation, Uncertainty, uncertainty
+from mitsim.reconstruct.status import Verdict
+from mitsim.reconstruct.tv import TVSolution, solve_tv
+from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
 METHODS = ("tikhonov", "tv")
-IMAGE_FILE, UNCERTAINTY_FILE, RESULT_FILE = "image.exr", "uncertainty.exr", "result.json"
 _BYTES_A_NUMBER = 32.0
 """Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
 _KEPT_NUMBERS = 1 << 24
 """Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reconstruction:
-    """An image and how far to trust it.
-
-    Attributes
-    ----------
-    image
-        (n, n') reflectance, 1 = the calibration's board, neither clipped nor normalised.
-    lam
-        lambda that was used, in the unit of (Phi_L Phi_R)^2; for ``tv`` the weight of the total variation.
-    rank
-        of the whole model, the product of ``rank_sides``.
-    condition
-        the larger of ``condition_sides``; that of the whole model is their product, ``condition_whole``.
-    rank_sides, condition_sides
-        of scene rows and of scene columns.
-    residual
-        ||Y - model|| / ||Y|| over all frames.
-    rounding
-        what rounding may have changed, ||error|| / ||image||; None for ``tv``.
-    misfit
-        what of the measurements fits no image; None where there are no more data than unknowns.
-    uncertainties
-        standard uncertainty of the image by source; None for ``tv``, which is not linear in the frames.
-    status
-        whether it can be trusted, what is wrong and what to do; misfit and flags of the capture and of the calibration
-        count.
-    seconds
-        by stage.
-    inputs
-        fingerprints of shots and factors, ``lam`` as it was asked for, and the method; the focus, where one was.
-    focus
-        the depth whose factors were used; None: the calibrated one's.
-    """
-
-    image: FloatArray
-    lam: float
-    rank: int
-    condition: float
-    rank_sides: tuple[int, int]
-    condition_sides: tuple[float, float]
-    residual: float
-    rounding: float | None
-    misfit: Misfit | None
-    uncertainties: Uncertainty | None
-    status: Status
-    seconds: dict[str, float]
-    inputs: dict[str, str | float]
-    focus: Depth | None = None
-
-    @property
-    def ok(self) -> bool:
-        """Whether the image can be used as it is."""
-        return self.status.ok
-
-    @property
-    def condition_whole(self) -> float:
-        """Condition of the whole model; inf when rank deficient."""
-        return self.condition_sides[0] * self.condition_sides[1]
-
-    @property
-    def uncertainty(self) -> FloatArray | None:
-        """(n, n') standard uncertainty of the image, random and systematic parts together."""
-        return self.uncertainties.total if self.uncertainties else None
-
-    @property
-    def trust(self) -> tuple[str, ...]:
-        """A line on the misfit, and one on the uncertainty by source, where these are known."""
-        return tuple(str(known) for known in (self.misfit, self.uncertainties) if known)
-
-    def summary(self) -> dict[str, Any]:
-        """What result.json and the command line's JSON say of it."""
-        return {
-            "lambda": self.lam,
-            "rank": self.rank,
-            "rank_sides": self.rank_sides,
-            "condition": self.condition,
-            "condition_whole": self.condition_whole,
-            "condition_sides": self.condition_sides,
-            "residual": self.residual,
-            "focus_mm": self.focus and self.focus.mm,
-            "focus_error_mm": self.focus and self.focus.error_mm,
-            "misfit": self.misfit and self.misfit.summary(),
-            **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
-            "status": str(self.status),
-            "seconds": {**self.seconds, "total": sum(self.seconds.values())},
-        }
-
-    def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:
-        """Write image.exr, image.png (for display), uncertainty.exr where it is known, and result.json.
-
-        Parameters
-        ----------
-        folder
-            new or empty, or with an earlier image of the same inputs, which is replaced.
-        overwrite
-            whether an earlier image of other inputs may be replaced, too.
-        more
-            entries of result.json beside :meth:`summary`.
-
-        Raises
-        ------
-        MitsimError
-            when the folder holds another image or something else, or cannot be written.
-        """
-        with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
-            return self.write(place, more)
-
-    def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
-        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`); ``more``
-        are further entries of result.json."""
-        write_frame(
-            folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
-        )
-        (folder / UNCERTAINTY_FILE).unlink(missing_ok=True)
-        if self.uncertainties:
-            write_frame(folder / UNCERTAINTY_FILE, self.uncertainties.channels(), {"method": self.inputs["method"]})
-        with whole_file(folder / "image.png") as part:
-            part.write_bytes(png(self.image))
-        write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
-        return folder
-
-    def __repr__(self) -> str:
-        rows, columns = self.image.shape
-        return f"Reconstruction({rows} x {columns}: {self.status.verdict.value}, residual {self.residual:.1e})"
-
-    def _repr_html_(self) -> str:
-        facts = f"lambda {self.lam:.3g}, residual {self.residual:.1e} of the frames"
-        pictures = {"reflectance 0 to 1": self.image}
-        if self.uncertainty is not None:
-            caption = f"standard uncertainty of each pixel\n{span(self.uncertainty, 'of reflectance')}"
-            pictures[caption] = scaled(self.uncertainty)
-        return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), *self.trust, facts))
 
 
 @single_threaded_blas()
@@ -183,7 +43,7 @@ def reconstruct(
     factors: Factors,
     lam: float | Literal["auto"] = "auto",
     method: str = "tikhonov",
-    focus: float | Literal["auto"] | None = None,
+    focus: float | Literal["auto", "map"] | None = None,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -200,7 +60,8 @@ def reconstruct(
         ``tikhonov`` (closed form) or ``tv`` (least total variation).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
-        least of the measurements unexplained.
+        least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
+        ``tikhonov``.
 
     Raises
     ------
@@ -211,19 +72,23 @@ def reconstruct(
     asked = inputs(shots, factors, lam, method, focus)
     factors.check_fit(shots)
     started = time.perf_counter()
-    depth = best_depth(shots, factors) if focus == "auto" else Depth(focus) if focus is not None else None
+    depth = _depth(shots, factors, lam, focus)
     found = time.perf_counter()
-    if depth is not None:
+    if isinstance(depth, Depth):
         of_depth = focused(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
     data = accumulated(shots, factors)
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
-    solution = prepared.solve(frames, lam) if method == "tikhonov" else solve_tv(prepared, frames, lam)
+    solution: DepthMap | Solution | TVSolution
+    if isinstance(depth, DepthMap) and not depth.doubt:
+        solution = depth
+    else:
+        solution = prepared.solve(frames, lam) if method == "tikhonov" else solve_tv(prepared, frames, lam)
     solved = time.perf_counter()
-    misfit = data.misfit(shots, factors, solution.image)
+    misfit = data.misfit(shots, factors, solution)
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
-    if method == "tikhonov" and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
+    if isinstance(solution, Solution) and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
         solution = prepared.solve(frames, lam, explained=False)
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
@@ -277,23 +142,26 @@ class Accumulated:
         """The factorised model."""
         return self.model.prepared
 
-    def misfit(self, shots: Capture, factors: Factors, image: FloatArray) -> Misfit | None:
+    def misfit(self, shots: Capture, factors: Factors, solution: DepthMap | Solution | TVSolution) -> Misfit | None:
         """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
 
         Parameters
         ----------
         shots, factors
             that these sums are of.
-        image
-            their reconstruction, for what the factors' noise adds to the frames.
+        solution
+            of them, for what the factors' noise adds to the frames.
         """
-        problem, stated = self.prepared.problem(self.frames), factors.manifest.noise
+        problem, stated, image = self.prepared.problem(self.frames), factors.manifest.noise, solution.image
+        added = factor_energy(self.prepared, shots.patterns, stated, image) if stated else None
+        if isinstance(solution, DepthMap):
+            return solution.misfit(self.noise, added, print_energy(self.model, image))
         return judge(
             self.prepared,
             np.where(problem.sigma > 0, problem.projected, 0.0),
             self.kept or shots.measured(),
             self.noise,
-            factor_energy(self.prepared, shots.patterns, stated, image) if stated else None,
+            added,
             print_energy(self.model, image),
             Evidence(factors, shots.patterns),
         )
@@ -361,43 +229,22 @@ def inputs(
         raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
     if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < np.inf):
         raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
-    if focus is not None and focus != "auto" and (isinstance(focus, str) or not 0 < focus < np.inf):
-        raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, or auto")
+    if focus is not None and focus not in ("auto", "map") and (isinstance(focus, str) or not 0 < focus < np.inf):
+        raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
+    if focus == "map" and method != "tikhonov":
+        raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
     asked = {"run": shots.fingerprint, "calibration": factors.fingerprint, "lambda": lam, "method": method}
     return asked if focus is None else {**asked, "focus": focus}
 
 
-def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:
-    """Whether a folder holds an image that may be replaced; False when it holds none.
-
-    Parameters
-    ----------
-    folder
-        that is to be written to.
-    asked
-        the :func:`inputs` of the new image.
-    overwrite
-        whether an image of other inputs may be replaced.
-
-    Raises
-    ------
-    MitsimError
-        when there is an image of other inputs, and ``overwrite`` is off.
-    """
-    if not (folder / IMAGE_FILE).is_file():
-        return False
-    if overwrite:
-        return True
-    result = read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}
-    earlier = result.get("inputs") if isinstance(result, dict) else None
-    earlier = earlier if isinstance(earlier, dict) else {}
-    changed = [name for name, value in asked.items() if earlier.get(name) != value]
-    if changed:
-        raise MitsimError(
-            f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); "
-            "choose another folder, or replace it with overwrite=True"
-        )
-    return True
+def _depth(
+    shots: Capture, factors: Factors, lam: float | Literal["auto"], focus: float | str | None
+) -> Depth | DepthMap | None:
+    if focus == "map":
+        return depth_map(shots, factors, lam)
+    if focus == "auto":
+        return best_depth(shots, factors)
+    return None if focus is None else Depth(float(focus))
 
 
 def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:

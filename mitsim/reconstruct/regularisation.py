@@ -167,7 +167,7 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
         return noise
     beyond = octave > int(np.argmax(doubtful))
     raised = noise.copy()
-    raised[measured] = np.where(beyond, found * np.maximum(data / level, 1.0)[octave], found)
+    raised[measured] = np.where(beyond, found * np.maximum(data[octave] / level[octave], 1.0), found)
     return raised
 
 

@@ -124,6 +124,28 @@ def window_at(
     return (float(top), float(bottom)), (float(left), float(right))
 
 
+def straightening(
+    where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
+) -> FloatArray:
+    """(3, 3) homography that takes tan-angles (row, column, 1) on the plane at ``depth`` to where the same projector
+    pixel would lie if the window filled its bounding box evenly: what takes a keystone out.
+
+    Parameters
+    ----------
+    where, projector, camera, grid, depth
+        as in :func:`window_at`.
+
+    Raises
+    ------
+    MitsimError
+        when the projector does not light the plane.
+    """
+    first = grid.first_row, grid.first_column
+    corners = _window_corners(where, projector, camera, grid.canvas, first, grid.n, depth)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return _homography(corners, np.where([[0, 0], [0, 1], [1, 0], [1, 1]], high, low))
+
+
 def _window_corners(
     where: str,
     projector: mi.Emitter,

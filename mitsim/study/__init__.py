@@ -17,33 +17,27 @@ if TYPE_CHECKING:
 STUDIES: Mapping[str, str] = MappingProxyType({"accuracy": "accuracy:measure", "diffraction": "diffraction:measure"})
 """Studies of one bench by name, as ``module:function``; the function takes (bench, request, job) and gives
 :class:`mitsim.study.runner.Findings`."""
-EXPERIMENTS = (
-    "patterns",
-    "distance",
-    "binning",
-    "exposure",
-    "resolution",
-    "ambient",
-    "reflectivity",
-    "regularisation",
-    "separation",
-    "sweep",
-)
-"""Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
-ALL = "all"
-"""What the study of all experiments of the paper is called."""
 PAPER = (
     "patterns",
     "distance",
     "binning",
+    "multishot",
     "exposure",
     "resolution",
     "ambient",
     "reflectivity",
     "regularisation",
+    "convolutional",
+    "depth",
     "separation",
+    "waterfall",
 )
-"""Those that `mitsim study all` puts on one page, in its order."""
+"""Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
+order."""
+EXPERIMENTS = (*PAPER, "sweep")
+"""Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
+ALL = "all"
+"""What the study of all experiments of the paper is called."""
 
 
 def find_study(name: str) -> Study:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -28,11 +29,13 @@ from mitsim.study.workers import in_processes, on_cluster
 
 @dataclass(frozen=True)
 class Where:
-    """Where points are measured: which part of them, by how many processes here, or by a Dask scheduler."""
+    """Where points are measured: which part of them, by how many processes here, or by a Dask scheduler; ``shared`` is
+    a folder of calibrations that studies share."""
 
     shard: Shard = field(default_factory=Shard)
     jobs: int | None = None
     scheduler: str | None = None
+    shared: str | None = None
 
     def __post_init__(self) -> None:
         if self.jobs is not None and self.jobs < 1:
@@ -42,7 +45,7 @@ class Where:
         """What the experiment ``name`` finds at ``points``, in any order."""
         if self.scheduler is not None:
             return on_cluster(name, batches(points), self.scheduler)
-        return in_processes(name, batches(points), self.jobs or workers())
+        return in_processes(name, batches(points), self.jobs or workers(), self.shared)
 
 
 @dataclass(frozen=True)
@@ -82,11 +85,7 @@ class CampaignResult:
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
-        said = [
-            f"{claim.verdict}: {claim.claim} ({claim.paper} in the paper; {claim.idealised} idealised, "
-            f"{claim.rendered} rendered)"
-            for claim in self.claims
-        ]
+        said = [f"{claim.verdict}: {claim.claim} ({claim.figures})" for claim in self.claims]
         return [*said, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
 
 
@@ -114,7 +113,9 @@ def run_experiment(
         for another name, an output that holds something else, and whatever a point refuses.
     """
     if study == ALL:
-        return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, where))
+        with tempfile.TemporaryDirectory(prefix="mitsim-study-") as shared:
+            together = replace(where or Where(), shared=shared)
+            return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, together))
     campaign, job, where = _Campaign(study, scope), job or Job(), where or Where()
     own, started = where.shard.part(campaign.points), time.perf_counter()
     with campaign.folder(output) as (folder, store):

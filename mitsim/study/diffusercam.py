@@ -6,21 +6,26 @@ Systems"), with the noise and the exposure conventions of :mod:`mitsim.study.exp
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from mitsim.capture.bench import Bench
 from mitsim.capture.request import Exposure
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.reconstruct.convolution import ConvolutionalCamera, ConvolutionSolution
-from mitsim.reconstruct.dots import Classes
+from mitsim.reconstruct.convolution import ConvolutionalCamera, ConvolutionSolution, solve_iteratively
+from mitsim.reconstruct.dots import Classes, FactorisedClasses
+from mitsim.reconstruct.solver import prepare
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
 from mitsim.study.exposures import CONVENTIONS
-from mitsim.study.metrics import psnr
+from mitsim.study.ideal import IdealCamera
+from mitsim.study.metrics import psnr, relative_error
 
 WHITE_W_M2, WAVELENGTH_NM = 0.3, 550.0
 """Irradiance where all light of a white, uniformly lit scene falls: the paper's projector (0.14 W over 120 mm square
@@ -30,6 +35,13 @@ _LEAST_LAMBDA = 1e-9
 """Lambda over the largest of S at which the search for the best one ends: shot noise of full wells calls for 1e-7."""
 _BEYOND_DB = 2.0
 """Fall of PSNR below the best so far at which the search, from large lambda to small, is over."""
+_EQUAL_ERROR, _EQUAL_ANSWER = 1.01, 1e-6
+"""Where iterations have come as far as a direct solution: an error against the truth within 1 % of its own, 0.09 dB;
+and their relative difference, of which no image shows anything."""
+_LOOSE, _TIGHT = 1e-6, 1e-12
+"""Residuals at which conjugate gradients within the direct solver end, for either."""
+_MOST_STEPS = 1000
+"""Iterations at most: 170 were seen to the equal answer."""
 _FINER = (0.5, 0.25)
 """Steps [decades] by which the search then moves: a quarter of a decade changes PSNR by 0.1 dB at most."""
 
@@ -135,3 +147,98 @@ def best_image(classes: Classes, shots: DiffuserShots, truth: FloatArray) -> tup
     """
     projected = classes.projected(shots.frames)
     return best_by_psnr(lambda lam: classes.factorise(lam).solve(projected), truth, classes.largest)
+
+
+@dataclass
+class _Marks:
+    """CPU seconds and iterations after which an image comes within the error of an ``exact`` one, and near it."""
+
+    exact: FloatArray
+    truth: FloatArray
+    start: float
+    steps: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    iterations: dict[str, int] = field(default_factory=dict)
+
+    def __call__(self, image: FloatArray) -> bool:
+        self.steps += 1
+        spent, truth = time.process_time() - self.start, self.truth
+        equal = {
+            "error": relative_error(image, truth) <= _EQUAL_ERROR * relative_error(self.exact, truth),
+            "answer": relative_error(image, self.exact) <= _EQUAL_ANSWER,
+        }
+        for name in (name for name, reached in equal.items() if reached and name not in self.seconds):
+            self.seconds[name], self.iterations[name] = spent, self.steps
+        return len(self.seconds) == len(equal)
+
+
+def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorModel, seed: int) -> dict[str, float]:
+    """CPU seconds of conjugate gradients on all frames, and of the direct solver, from the same frames at equal peak.
+
+    Parameters
+    ----------
+    classes
+        camera and period of dots.
+    whole
+        the same camera with a sensor that gets all light, whose best lambda both take.
+    truth, sensor, seed
+        the image, the electronics, and the seed of the noise.
+
+    Returns
+    -------
+    ``prepare_s`` once for a camera, dots and lambda; ``direct_s`` and ``iterative_s`` for every image, to equal error;
+    ``direct_exact_s`` and ``iterative_exact_s`` to equal answers; ``iterations`` and ``iterations_exact``; ``psnr_db``
+    of the direct one; ``difference`` of both, relative.
+
+    Raises
+    ------
+    MitsimError
+        where iterations do not come to the direct solution.
+    """
+    camera = classes.camera
+    family = parse_patterns(f"dots:{classes.k}", camera.n)
+    lam = best_image(whole, take(whole.camera, family, truth, sensor, seed=seed), truth)[0].lam
+    frames = take(camera, family, truth, sensor, seed=seed).frames
+    start = time.process_time()
+    factorised = Classes(camera, classes.k).factorise(lam)
+    prepare_s = time.process_time() - start
+    exact, direct_exact_s = _timed(factorised, frames, _TIGHT)
+    direct, direct_s = _timed(factorised, frames, _LOOSE)
+    marks = _Marks(exact.image, truth, time.process_time())
+    iterative = solve_iteratively(camera, family, frames, lam, 0.0, _MOST_STEPS, marks)
+    if len(marks.seconds) < len(("error", "answer")):
+        raise MitsimError(f"iterations did not come to the direct solution at lambda {lam:g}: {iterative.status}")
+    return {
+        "prepare_s": prepare_s,
+        "direct_s": direct_s,
+        "direct_exact_s": direct_exact_s,
+        "iterative_s": marks.seconds["error"],
+        "iterative_exact_s": marks.seconds["answer"],
+        "iterations": marks.iterations["error"],
+        "iterations_exact": marks.iterations["answer"],
+        "psnr_db": psnr(direct.image, truth),
+        "difference": relative_error(iterative.image, exact.image),
+    }
+
+
+def _timed(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[ConvolutionSolution, float]:
+    """Solution of frames, and its CPU seconds."""
+    start = time.process_time()
+    solution = factorised.solve(factorised.classes.projected(frames), tolerance)
+    return solution, time.process_time() - start
+
+
+def separable_seconds(bench: Bench, k: int) -> float:
+    """CPU seconds of the separable closed form for the frames of dots of period ``k`` with the camera of a ``bench``,
+    its factors prepared before; they hang on sizes alone."""
+    family, camera = bench.family(f"dots:{k}"), IdealCamera(bench, bench.geometry.mask)
+    left, right = camera.factors
+    model = prepare(left, right, family.left, family.right)
+    frames = stream(0, "separable frames").random((k, k, len(left), len(right)))
+    start = time.process_time()
+    sums = model.accumulator()
+    for row in range(k):
+        for column in range(k):
+            sums.add(frames[row, column], row, column)
+    model.solve(sums, model.problem(sums).scale * _LEAST_LAMBDA)
+    return time.process_time() - start

@@ -97,7 +97,8 @@ class Found:
 class Claim:
     """A claim of the paper, its number there, in the idealised model and rendered, and what becomes of it.
 
-    ``verdict`` is "confirmed", "confirmed only if ...", or "not confirmed".
+    ``verdict`` is "confirmed", "confirmed only if ...", or "not confirmed"; what the paper does not say, or the
+    idealised model does not have, is empty.
     """
 
     claim: str
@@ -105,6 +106,12 @@ class Claim:
     idealised: str
     rendered: str
     verdict: str
+
+    @property
+    def figures(self) -> str:
+        """All of them on a line."""
+        told = {"in the paper": self.paper, "idealised": self.idealised, "rendered": self.rendered}
+        return ", ".join(f"{figure} {whose}" for whose, figure in told.items() if figure)
 
 
 @dataclass(frozen=True)
@@ -188,3 +195,9 @@ class Experiment:
     measure: Callable[[Studio, Point], Found]
     claims: Callable[[Results], Sequence[Claim]]
     figures: Callable[[Results], Mapping[str, Figure]]
+
+
+def grouped(points: Sequence[Point]) -> list[Point]:
+    """The ``points``, those of one setup together: they share its light."""
+    order = {setup: index for index, setup in enumerate(dict.fromkeys(point.setup for point in points))}
+    return sorted(points, key=lambda point: order[point.setup])

@@ -29,7 +29,7 @@ from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.rig.patterns import PatternFamily
-from mitsim.study.ideal import IdealCamera
+from mitsim.study.ideal import IdealCamera, Plane
 from mitsim.study.metrics import Quality, psnr
 
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
@@ -61,11 +61,27 @@ class LitScene:
         """How near an ``image`` (n, n) is to the truth."""
         return Quality.of(image, self.truth, self.light.apparent.error)
 
-    def expected(self, model: str, family: PatternFamily) -> ExpectedFrames:
-        """Frames of a ``family`` in one ``model`` of :data:`MODELS`, without noise."""
+    def expected(
+        self, model: str, family: PatternFamily, plane: Plane | None = None, bench: Bench | None = None
+    ) -> ExpectedFrames:
+        """Frames without noise.
+
+        Parameters
+        ----------
+        model
+            one of :data:`MODELS`.
+        family
+            the patterns.
+        plane
+            where the idealised scene is; None: where the camera was calibrated.
+        bench
+            another mask in the same light; None: the scene's own.
+        """
         if model == RENDERED:
-            return self._merged.frames(family.lighting, self.light.seed)
-        return self._ideal.frames(family, self.truth * self._flux)
+            light = self._merged if bench is None else self._merged.behind(bench)
+            return light.frames(family.lighting, self.light.seed)
+        camera = self._ideal if bench is None else IdealCamera(bench, bench.geometry.mask)
+        return camera.frames(family, self.truth * self.board_flux, plane)
 
     def rendered(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
         """Rendered frames with calibrated factors.
@@ -80,16 +96,18 @@ class LitScene:
         sides = factors.left, factors.right
         return Unexposed(self, RENDERED, family, sides, factors.manifest.centre, seed)
 
-    def idealised(self, family: PatternFamily, seed: int) -> Unexposed:
+    def idealised(self, family: PatternFamily, seed: int, plane: Plane | None = None) -> Unexposed:
         """Frames of the paper's model, with its own factors.
 
         Parameters
         ----------
         family, seed
             the patterns, and seed of the noise, which is not that of rendered frames.
+        plane
+            where the scene is; None: where the factors are of.
         """
         camera = self._ideal
-        return Unexposed(self, IDEALISED, family, camera.calibrated(self._flux), camera.centre, seed + 1)
+        return Unexposed(self, IDEALISED, family, camera.calibrated(self.board_flux), camera.centre, seed + 1, plane)
 
     def _uniform_s(self, model: str) -> float:
         return peak_time(self.bench, self.expected(model, self.bench.family("uniform")))
@@ -103,7 +121,8 @@ class LitScene:
         return IdealCamera(self.bench, self.bench.geometry.mask)
 
     @property
-    def _flux(self) -> float:
+    def board_flux(self) -> float:
+        """That a projector pixel of a white board puts on the sensor without the mask [W m^-2], mean over pixels."""
         return float(self.light.apparent.board_flux.mean())
 
 
@@ -119,6 +138,8 @@ class Unexposed:
         left and right factor, and whether means are taken out of frames.
     seed
         of the sensor's noise.
+    plane
+        where an idealised scene is; None: where its factors are of.
     """
 
     lit: LitScene
@@ -127,11 +148,12 @@ class Unexposed:
     sides: tuple[FloatArray, FloatArray]
     centre: bool
     seed: int
+    plane: Plane | None = None
 
     @cached_property
     def expected(self) -> ExpectedFrames:
         """The frames, without noise."""
-        return self.lit.expected(self.model, self.family)
+        return self.lit.expected(self.model, self.family, self.plane)
 
     def seconds(self, exposure: str) -> float:
         """Exposure time [s] of each frame by the convention ``exposure``, one of :data:`CONVENTIONS`."""

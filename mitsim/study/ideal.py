@@ -35,6 +35,15 @@ Pair = tuple[FloatArray, FloatArray]
 """Left and right factor, (pixels, n) each."""
 
 
+@dataclass(frozen=True)
+class Plane:
+    """A plane scene at ``depth_mm``, lit from ``baseline_mm`` beside the camera, along rows and columns (index
+    coordinates)."""
+
+    depth_mm: float
+    baseline_mm: tuple[float, float]
+
+
 @dataclass(frozen=True, eq=False)
 class IdealCamera:
     """The idealised camera of a ``bench``, with one mask in one light (``spectrum`` None: the geometric shadow)."""
@@ -72,11 +81,29 @@ class IdealCamera:
         left, right = self.factors
         return left * np.sqrt(rate), right * np.sqrt(rate)
 
-    def frames(self, family: PatternFamily, flux: FloatArray) -> ExpectedFrames:
-        """Frames of a ``family`` when each projector pixel puts ``flux`` (n, n) [W m^-2] on the sensor without the
-        mask."""
+    def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
+        """Frames of a family.
+
+        Parameters
+        ----------
+        family
+            the patterns.
+        flux
+            (n, n) [W m^-2] that each projector pixel puts on the sensor without the mask.
+        plane
+            where the scene is; None: where the camera was calibrated.
+        """
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
-        return ExpectedFrames([Filed(self._optics, (light,))], family.lighting, seed=0)
+        optics = self._optics if plane is None else self._optics_at(plane)
+        return ExpectedFrames([Filed(optics, (light,))], family.lighting, seed=0)
+
+    def _optics_at(self, plane: Plane) -> FrameOptics:
+        shift = 1 / plane.depth_mm - 1 / self.bench.geometry.scene_distance
+        rows, columns = (
+            Directions(pixels.centres + baseline * shift, pixels.width)
+            for pixels, baseline in zip(self._pixels, plane.baseline_mm, strict=True)
+        )
+        return FrameOptics(self._geometry, rows, columns, (plane.depth_mm,), 1, self.spectrum)
 
     @property
     def _geometry(self) -> CameraGeometry:

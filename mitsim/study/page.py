@@ -52,7 +52,7 @@ class Section:
             what it came to.
         """
         prints = set(results.table.distinct("picture")) & set(TEST_IMAGES)
-        means = f", over {len(prints)} test images" if prints else ""
+        means = f", over {len(prints)} test images" if len(prints) > 1 else ""
         setup = scope.setup
         command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
         return cls(

@@ -10,8 +10,9 @@ from typing import Any, Literal
 from mitsim.core.output import output_folder
 from mitsim.core.runs import load_run
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruction import Reconstruction, inputs, may_replace
+from mitsim.reconstruct.reconstruction import inputs
 from mitsim.reconstruct.reconstruction import reconstruct as solve
+from mitsim.reconstruct.result import Reconstruction, may_replace
 from mitsim.study.metrics import Quality, truth_error_for, truth_for
 
 
@@ -37,7 +38,7 @@ def reconstruct(
     lam: float | Literal["auto"] = "auto",
     method: str = "tikhonov",
     overwrite: bool = False,
-    focus: float | Literal["auto"] | None = None,
+    focus: float | Literal["auto", "map"] | None = None,
 ) -> Judged:
     """Recover the image of a run with a calibration; writes image.exr, image.png and result.json.
 

@@ -11,19 +11,21 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+from filelock import FileLock
 from skimage import io
 
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.rig.patterns import PatternFamily
-from mitsim.study.experiment import Setup
+from mitsim.study.experiment import Point, Setup
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
 from mitsim.study.metrics import Quality
 from mitsim.study.pictures import picture
+from mitsim.study.sweepcam import Places, calibrated_places
 from mitsim.study.table import Value
 
 Kept = TypeVar("Kept")
@@ -89,9 +91,15 @@ class Studio:
     """Benches, their light and their factors, the last few of each; a temporary folder holds scenes with other prints.
 
     To be used as a context, which removes that folder.
+
+    Parameters
+    ----------
+    shared
+        folder of calibrations that several studios share; None: this one's are its own.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, shared: str | None = None) -> None:
+        self._shared = None if shared is None else Path(shared) / "calibrations"
         self._folder = tempfile.TemporaryDirectory(prefix="mitsim-study-")
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
 
@@ -107,16 +115,30 @@ class Studio:
 
         MitsimError as :func:`mitsim.open_bench`, and for another print on a scene that has none.
         """
-        return self._once("bench", 3, setup, lambda: self._opened(setup))
+        return self.once("bench", 3, setup, lambda: self._opened(setup))
 
     def lit(self, setup: Setup) -> LitScene:
         """The scene of a ``setup`` in its light."""
-        return self._once("light", 1, setup, lambda: LitScene(self.bench(setup).light(accuracy=setup.accuracy)))
+        return self.once("light", 1, setup, lambda: LitScene(self.bench(setup).light(accuracy=setup.accuracy)))
 
     def factors(self, setup: Setup, seed: int) -> Factors:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
         blank = setup.printed(None)
-        return self._once("factors", 4, (blank, seed), lambda: self.bench(blank).calibrate(seed))
+        return self.once("factors", 4, (blank, seed), lambda: self._calibrated(blank, seed))
+
+    def places(self, setup: Setup, places_mm: tuple[float, ...], seed: int) -> Places:
+        """Factors of the same camera with its mask moved.
+
+        Parameters
+        ----------
+        setup, seed
+            as for :meth:`factors`.
+        places_mm
+            how far it is moved along both axes.
+        """
+        blank = setup.printed(None)
+        key = blank, places_mm, seed
+        return self.once("places", 1, key, lambda: calibrated_places(self.bench(blank), places_mm, seed))
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
         """Frames of a family before any exposure.
@@ -134,7 +156,15 @@ class Studio:
             lit.rendered(self.factors(setup, seed), family, seed) if model == RENDERED else lit.idealised(family, seed)
         )
 
-    def image(self, setup: Setup, model: str, patterns: str, seed: int = 0, exposure: str = EQUAL_PEAK) -> Image:
+    def image(
+        self,
+        setup: Setup,
+        model: str,
+        patterns: str,
+        seed: int = 0,
+        exposure: str = EQUAL_PEAK,
+        focus: Literal["auto", "map"] | None = None,
+    ) -> Image:
         """A scene as it comes out: rendered, as a user's own frames are exposed and reconstructed.
 
         Parameters
@@ -149,13 +179,15 @@ class Studio:
             of the frames' noise, and of the calibration's.
         exposure
             one of :data:`mitsim.study.exposures.CONVENTIONS`.
+        focus
+            of rendered frames, as for :func:`mitsim.reconstruct`.
         """
         frames = self.frames(setup, model, patterns, seed)
         if model != RENDERED:
             return Image.of(frames, frames.seconds(exposure))
         seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
         shots = frames.lit.light.expose(patterns, seed=seed, exposure=seconds)
-        found = reconstruct(shots, self.factors(setup, seed))
+        found = reconstruct(shots, self.factors(setup, seed), focus=focus)
         misfit, told = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
@@ -164,6 +196,19 @@ class Studio:
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust)
+
+    def _calibrated(self, blank: Setup, seed: int) -> Factors:
+        """By this studio, or by another that was first: factors in memory are as a file has them."""
+        if self._shared is None:
+            return self.bench(blank).calibrate(seed)
+        place = self._shared / Point.of(blank, seed=seed).key
+        place.parent.mkdir(exist_ok=True)
+        with FileLock(place.with_suffix(".lock")):
+            if not place.exists():
+                part = place.with_suffix(".part")  # whole or not at all: this process may be ended
+                shutil.rmtree(part, ignore_errors=True)
+                self.bench(blank).calibrate(seed).save(part).rename(place)
+            return load_calibration(place)
 
     def _opened(self, setup: Setup) -> Bench:
         path = setup.scene if setup.picture is None else self._printed(setup.scene, setup.picture)
@@ -183,7 +228,16 @@ class Studio:
             io.imsave(place / _PRINT, picture(name), check_contrast=False)
         return place / own.name
 
-    def _once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
+    def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
+        """What is made once while neighbours share it.
+
+        Parameters
+        ----------
+        kind, most, key
+            what it is, how many of its kind are kept, and which of them it is.
+        make
+            makes it.
+        """
         kept = self._kept.setdefault(kind, OrderedDict())
         if key not in kept:
             while len(kept) >= most:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.reconstruct.reconstruction import Reconstruction
+from mitsim.reconstruct.result import Reconstruction
 
 COVERED = 1.96
 """Standard uncertainties on either side of a pixel within which the truth is expected with a chance of 95 %."""

@@ -27,28 +27,41 @@ _TRIES = 2
 """Times that a point is begun: what ended two processes would end the third."""
 
 
+@dataclass(frozen=True)
 class _Studio:
     """This process's own studio, opened when it is first asked for something: to load the renderer takes seconds."""
 
+    shared: str | None
+
     def __getattr__(self, name: str) -> Any:
-        return getattr(_opened(), name)
+        return getattr(_opened(self.shared), name)
 
 
 @cache
-def _opened() -> Any:
+def _opened(shared: str | None) -> Any:
     from mitsim.study.studio import Studio
 
-    return Studio()
+    return Studio(shared)
 
 
-def measured(name: str, point: Point) -> Found:
-    """What the experiment ``name`` finds at a ``point``, in this process's studio."""
+def measured(name: str, point: Point, shared: str | None = None) -> Found:
+    """What an experiment finds at a point, in this process's studio.
+
+    Parameters
+    ----------
+    name, point
+        of the experiment, and where it is measured.
+    shared
+        folder of calibrations that processes share; None: this process keeps its own.
+    """
     from mitsim.study import find_experiment
 
-    return find_experiment(name).measure(cast("Studio", _Studio()), point)
+    return find_experiment(name).measure(cast("Studio", _Studio(shared)), point)
 
 
-def in_processes(name: str, batches: Sequence[Batch], jobs: int) -> Iterator[tuple[Point, Found]]:
+def in_processes(
+    name: str, batches: Sequence[Batch], jobs: int, shared: str | None = None
+) -> Iterator[tuple[Point, Found]]:
     """Findings of all points, in any order.
 
     MitsimError for what a point refuses, and for one that ended two processes.
@@ -61,11 +74,14 @@ def in_processes(name: str, batches: Sequence[Batch], jobs: int) -> Iterator[tup
         points, those of a batch by one process one after the other.
     jobs
         processes at a time.
+    shared
+        folder of calibrations that they share with others; None: with each other alone.
     """
     waiting, tries = deque(batches), dict[Point, int]()
     # Processes are ended, not asked to end: what they leave in their temporary folder goes with it.
     scratch = tempfile.TemporaryDirectory(prefix="mitsim-study-")
-    crew = [_Worker.started(name, scratch.name) for _ in range(min(jobs, len(batches)))]
+    folders = scratch.name, shared or scratch.name
+    crew = [_Worker.started(name, folders) for _ in range(min(jobs, len(batches)))]
     try:
         while True:
             for worker in crew:
@@ -88,7 +104,7 @@ def in_processes(name: str, batches: Sequence[Batch], jobs: int) -> Iterator[tup
                             f"code {worker.process.exitcode}; finished points are kept. Is memory short? Try --jobs 1"
                         )
                     waiting.appendleft(tuple(worker.left))
-                    crew[crew.index(worker)] = _Worker.started(name, scratch.name)
+                    crew[crew.index(worker)] = _Worker.started(name, folders)
                 else:
                     yield worker.left.popleft(), answer
     finally:
@@ -146,10 +162,10 @@ class _Worker:
     left: deque[Point] = field(default_factory=deque)
 
     @classmethod
-    def started(cls, name: str, scratch: str) -> _Worker:
+    def started(cls, name: str, folders: tuple[str, str]) -> _Worker:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(name, scratch, theirs), daemon=True)
+        process = context.Process(target=_serve, args=(name, folders, theirs), daemon=True)
         process.start()
         theirs.close()  # so that its death ends the pipe
         return cls(process, ours)
@@ -177,14 +193,15 @@ class _Worker:
         self.process.join()
 
 
-def _serve(name: str, scratch: str, pipe: Connection) -> None:
-    """Measure every batch that comes, point by point, until the parent is gone."""
-    tempfile.tempdir = scratch
+def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
+    """Measure every batch that comes, point by point, until the parent is gone; ``folders`` are for temporary files and
+    for calibrations that are shared."""
+    tempfile.tempdir, shared = folders
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
             for point in pipe.recv():
                 try:
-                    pipe.send(measured(name, point))
+                    pipe.send(measured(name, point, shared))
                 except MitsimError as error:
                     pipe.send(str(error))
                     break

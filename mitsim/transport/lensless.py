@@ -25,6 +25,8 @@ parameter               unit      default     meaning
 ``mask_feature``        mm        0.06        feature size
 ``mask_distance``       mm        2           sensor to mask (the face next to the sensor)
 ``mask_thickness``      mm        0           mask thickness; 0 is a thin mask
+``mask_offset_row``     mm        0           the mask's centre off the axis, down the rows (toward -y)
+``mask_offset_column``  mm        0           the same along the columns (toward -x)
 ``scene_distance``      mm        400         plane to which the rig is aligned (calibration board, cell grid)
 ``fov``                 degrees   20          full angle of the square field stop, a baffle: no light beyond it
 ``pixel_fill_factor``   -         1           active part of a pixel, a centred square
@@ -146,8 +148,9 @@ def _sensor_class() -> type:
         def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
             """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""
             row, column = rows_columns(point.x, point.y)
-            row = dr.floor(row / self.geometry.mask_feature + 0.5 * self._features)
-            column = dr.floor(column / self.geometry.mask_feature + 0.5 * self._features)
+            row_centre, column_centre = self.geometry.mask_offset
+            row = dr.floor((row - row_centre) / self.geometry.mask_feature + 0.5 * self._features)
+            column = dr.floor((column - column_centre) / self.geometry.mask_feature + 0.5 * self._features)
             inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)
             inside &= active
             row, column = mi.UInt32(dr.maximum(row, 0)), mi.UInt32(dr.maximum(column, 0))

@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
-from mitsim.reconstruct.reconstruction import Reconstruction
+from mitsim.reconstruct.result import Reconstruction
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
 from mitsim.study.quality import reconstruct

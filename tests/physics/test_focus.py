@@ -1,5 +1,8 @@
 """Focus in rendered light: a print beside the calibrated distance is found, and comes out as if calibrated there.
 
+Cards at three depths, 369 to 430 mm, come out sharp together: parallax spans 9.7 projector pixels, and dots have a
+period of 14 along the baseline. 40.9 dB and a median error of 0.05 mm were seen.
+
 Rationale: at 380 mm, with the projector 60 mm beside the camera, parallax is 3.4 projector pixels and costs 30 dB.
 Expectation: depth within 0.1 mm (0.02 were seen), no misfit left, and at least 44 dB; calibrations at their own depth
 have 46 to 51.
@@ -9,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from mitsim.reconstruct.factors import Factors
@@ -32,3 +36,27 @@ def test_a_sheet_off_the_calibrated_distance(shipped_bench: Callable[..., object
     print(f"{z}: {image.focus}, {psnr(image.image, light.truth):.1f} dB", flush=True)
     assert image.ok and abs(image.focus.mm - z) < 0.1
     assert psnr(image.image, light.truth) > 44
+
+
+def test_cards_at_several_depths(shipped_bench: Callable[..., object], factors: Factors) -> None:
+    """Each projector pixel's depth against the point that its middle lights, found by the renderer itself."""
+    bench = shipped_bench("cards")
+    light = bench.light("dots:7x14", accuracy=3e-3)
+    image = reconstruct(light.expose("dots:7x14"), factors, focus="map")
+    true, seen = depths(bench), light.truth > 0.1
+    error = np.abs(image.depths.mm - true)[seen & np.isfinite(true)]
+    print(f"{image.focus}; {psnr(image.image, light.truth):.1f} dB, median {np.median(error):.3f} mm", flush=True)
+    assert np.median(error) < 0.5 and (error < 2).mean() > 0.97
+    assert psnr(image.image, light.truth) > 37
+
+
+def depths(bench: object) -> np.ndarray:
+    """(n, n) depth [mm] of what each projector pixel's middle lights; the projector's foot is at (60, 0, 0)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    n = bench.n
+    row, column = np.mgrid[:n, :n].reshape(2, -1)
+    direction = mi.Vector3f(-120 * (column + 0.5) / n, 60 - 120 * (row + 0.5) / n, np.full(row.size, 400.0))
+    hit = bench.loaded.scene.ray_intersect(mi.Ray3f(mi.Point3f(60, 0, 0), dr.normalize(direction)))
+    return np.where(np.array(hit.is_valid()), np.array(hit.p)[2], np.nan).reshape(n, n)

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.study.charts import curves, image_grid
+from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.exposures import EQUAL_PEAK, MODELS
 from mitsim.study.paper.measure import by_patterns, by_print, found, judged, panels, pictured
@@ -77,7 +78,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     pixels = table.distinct("pixels")
     for family in _SHOWN:
         if grid := pictured(results, by_print(table.where(patterns=family)), "pixels", pixels):
-            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(grid, [f"{each} x {each}" for each in pixels])
+            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
+                grid, [f"{each} x {each}" for each in pixels], f"{label(family)}, {EQUAL_PEAK}, by sensor pixels"
+            )
     return drawn
 
 

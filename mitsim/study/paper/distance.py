@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.study.charts import curves, image_grid
+from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, MODELS
 from mitsim.study.paper.measure import by_patterns, by_print, imaged, judged, panels, pictured, stated
@@ -73,7 +74,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     for family in _SHOWN:
         lines = by_print(table.where(patterns=family, exposure=EQUAL_FRAME))
         if grid := pictured(results, lines, "mask_distance", distances):
-            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(grid, [f"{each} mm" for each in distances])
+            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
+                grid, [f"{each} mm" for each in distances], f"{label(family)}, {EQUAL_FRAME}, by sensor to mask"
+            )
     return drawn
 
 

@@ -90,7 +90,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     drawn["singular_values.png"] = singular_values(spectra)
     grid = pictured(results, by_print(table.where(exposure=EQUAL_FRAME)), "patterns", _SHOWN)
     if grid:
-        drawn["images.png"] = image_grid(grid, [label(family) for family in _SHOWN])
+        drawn["images.png"] = image_grid(grid, [label(family) for family in _SHOWN], EQUAL_FRAME)
     return drawn
 
 

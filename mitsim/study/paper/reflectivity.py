@@ -125,7 +125,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     def claim(text: str, paper: str, holds: Callable[[Mapping[str, float]], bool]) -> Claim:
         at = [exposure for exposure, levels in found.items() if holds(levels)]
         decided = f"confirmed only exposed at {at[0]}" if len(at) == 1 else verdict(bool(at))
-        return Claim(f"{text} (artefacts of gloss, 49 dots)", paper, "not simulated", "; ".join(told), decided)
+        return Claim(f"{text} (artefacts of gloss, 49 dots)", paper, "", "; ".join(told), decided)
 
     def well(levels: Mapping[str, float]) -> bool:
         return min(level for name, level in levels.items() if name != DISC) > _PLAIN_DB

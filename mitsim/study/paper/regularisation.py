@@ -108,7 +108,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         drawn[f"psnr_{which}.png"] = quality_bars(bars(lines, column))
     for family in _SHOWN:
         if grid := pictured(results, by_print(table.where(patterns=family)), "method", METHODS):
-            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(grid, ["Tikhonov", "total variation"])
+            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
+                grid, ["Tikhonov", "total variation"], f"{label(family)}, {EQUAL_FRAME}, automatic weight"
+            )
     return drawn
 
 

@@ -127,7 +127,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     names = [name for name in table.distinct("picture") if name.startswith("bars")]
     both = {f"{name}, {model}": rows.where(model=model) for name, rows in lines.items() for model in MODELS}
     grid = pictured(results, both, "picture", names, "contrast {contrast:.2f}")
-    drawn["images.png"] = image_grid(grid, [name.replace("bars ", "") for name in names])
+    drawn["images.png"] = image_grid(
+        grid, [name.replace("bars ", "") for name in names], f"by line pairs a mm of the print, {EQUAL_FRAME}"
+    )
     return drawn
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from mitsim.core.errors import MitsimError
 from mitsim.study.charts import curves
-from mitsim.study.experiment import Claim, Experiment, Point, Results, Scope, Setup
+from mitsim.study.experiment import Claim, Experiment, Point, Results, Scope, Setup, grouped
 from mitsim.study.exposures import CONVENTIONS, EQUAL_PEAK, RENDERED
 from mitsim.study.paper.measure import imaged
 from mitsim.study.table import Value
@@ -84,9 +84,7 @@ def _points(scope: Scope) -> Sequence[Point]:
             found.append(Point.of(setup, model=RENDERED, **{**knobs, "seed": _whole(knobs["seed"]), **light}))
     if len(found) > _MOST:
         raise MitsimError(f"study sweep: {len(found)} points; give at most {_MOST}")
-    # Those of one setup together: they share its light.
-    order = {setup: index for index, setup in enumerate(dict.fromkeys(point.setup for point in found))}
-    return sorted(found, key=lambda point: order[point.setup])
+    return grouped(found)
 
 
 def _setup(setup: Setup, setting: Mapping[str, str]) -> Setup:

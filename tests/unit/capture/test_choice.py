@@ -19,6 +19,7 @@ from tests.unit.capture.invented_evidence import (
     SIZES,
     changes,
     plan,
+    rows,
     stages,
     with_occluded,
 )
@@ -239,6 +240,8 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     narrow = predicted(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
     assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
     assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
+    wide_ones, narrow_ones = (rows(each)["followed-anchors"].reason for each in (plan(5e-4, found), plan(1e-4)))
+    assert "8x8 in cells of 2x2 pixels leave" in wide_ones and ": 2x2 leave" in narrow_ones
 
 
 def test_doubt_about_coarse_cells_names_them() -> None:

@@ -21,7 +21,8 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import focused, moved
-from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
+from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.result import Reconstruction
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
 from tests.ideal_sessions import PITCH, PIXELS, Bench, picture
@@ -43,9 +44,9 @@ PARALLAX = Parallax(
 )
 
 
-def shadow(depth: float, axis: int, n: int = N) -> np.ndarray:
+def shadow(depth: float, axis: int, n: int = N, baseline: tuple[float, float] = BASELINE) -> np.ndarray:
     """(PIXELS, n) closed-form factor of a plane at ``depth``."""
-    edges = centred_edges(n, WINDOW / n) + BASELINE[axis] * (1 / depth - 1 / 400)
+    edges = centred_edges(n, WINDOW / n) + baseline[axis] * (1 / depth - 1 / 400)
     return scene_factor(mls_mask().terms[0][1], 0.06, centred_edges(PIXELS, PITCH), depth * edges, 2.0, depth)
 
 
@@ -137,7 +138,7 @@ def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("focus", "fragment"), [(0.0, "above 0"), (-5.0, "above 0"), ("near", "or auto"), (np.nan, "above 0")]
+    ("focus", "fragment"), [(0.0, "above 0"), (-5.0, "above 0"), ("near", "auto or map"), (np.nan, "above 0")]
 )
 def test_a_focus_that_is_none_is_refused(focus: object, fragment: str) -> None:
     with pytest.raises(ArgumentError, match=fragment) as caught:

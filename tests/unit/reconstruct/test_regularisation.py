@@ -176,6 +176,16 @@ def test_the_larger_noise_counts_unless_the_model_fails(within, level):
     np.testing.assert_allclose(coefficient_noise(problem), level)
 
 
+def test_noise_is_found_behind_an_octave_without_data():
+    """Singular values of 1 with a faint scene, none in the next octave, then data of 1.9 times the stated noise:
+    as an image they would be brighter than all before, so there is more noise. (Planted: 0 / 0 in the empty octave.)"""
+    sigma = np.concatenate([np.ones(64), np.full(64, 0.15)]).reshape(8, 16)
+    data = np.sqrt(np.where(sigma == 1, 1.1, 1.9))
+    halves = SimpleNamespace(typical=1.0, excess=np.zeros(sigma.shape))
+    problem = DiagonalProblem(sigma, data, float(np.square(data).sum()) + 1000.0, 1128, halves)
+    np.testing.assert_allclose(coefficient_noise(problem), np.where(sigma == 1, 1.0, 1.9))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("patterns", ["uniform", "dots:2"])
 def test_a_mask_near_the_sensor_leaves_an_image(patterns):

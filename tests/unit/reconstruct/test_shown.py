@@ -10,7 +10,8 @@ import re
 import numpy as np
 from PIL import Image
 
-from mitsim.reconstruct.reconstruction import Reconstruction, reconstruct
+from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.result import Reconstruction
 from tests.ideal_sessions import Bench, N, bench, picture
 
 

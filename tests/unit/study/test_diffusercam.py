@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.convolution import ConvolutionalCamera
 from mitsim.reconstruct.dots import Classes
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.sensor import load_sensor
-from mitsim.study.diffusercam import best_image, take
+from mitsim.study.diffusercam import best_image, race, take
 from mitsim.study.exposures import CONVENTIONS
 from mitsim.study.metrics import psnr
 
@@ -53,3 +54,22 @@ def test_the_best_lambda_is_found_to_a_tenth_of_a_decibel() -> None:
     ]
     assert db == psnr(solution.image, TRUTH) and max(fine) - 0.1 < db <= max(fine) + 0.05
     assert fine[0] < max(fine) - 0.5 and fine[-1] < max(fine) - 0.5
+
+
+@pytest.mark.parametrize("sensor", [None, (22, 25)])
+def test_both_solvers_come_to_one_image(sensor: tuple[int, int] | None) -> None:
+    """On all light, where the direct solver iterates on small grids, and cropped, where it factorises. (Planted: frames
+    of another noise for one of them, lambda doubled for one.)"""
+    camera = ConvolutionalCamera(CAMERA.psf, N, sensor)
+    whole = ConvolutionalCamera(CAMERA.psf, N)
+    found = race(Classes(camera, 3), Classes(whole, 3), TRUTH, SENSOR, 0)
+    assert found["difference"] <= 1e-6
+    assert 0 < found["iterations"] <= found["iterations_exact"] < 200
+    assert 0 < found["iterative_s"] <= found["iterative_exact_s"]
+    assert found["direct_s"] > 0 and found["psnr_db"] > 30
+
+
+def test_iterations_that_do_not_arrive_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mitsim.study.diffusercam._MOST_STEPS", 2)
+    with pytest.raises(MitsimError, match=r"^iterations did not come to the direct solution at lambda [^\n]+$"):
+        race(Classes(CAMERA, 3), Classes(CAMERA, 3), TRUTH, SENSOR, 0)

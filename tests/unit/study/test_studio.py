@@ -8,8 +8,11 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
+from mitsim.optics.shadow import scene_factor
+from mitsim.rig.mask import mls_mask
 from mitsim.study.experiment import Setup
 from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
+from mitsim.study.ideal import Plane
 from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
 from mitsim.study.studio import Image, Studio
 
@@ -83,6 +86,24 @@ def test_light_and_factors_are_made_once(studio: Studio, setup: Setup) -> None:
     assert studio.factors(setup, 3) is not studio.factors(setup, 4)
 
 
+def test_studios_share_their_calibrations(studio: Studio, setup: Setup, tmp_path: Path) -> None:
+    """One studio's session serves another, to the last bit what it would have found itself; an unfinished one does not.
+    (Planted: seeds taken for one.)"""
+    own = studio.factors(setup, 3)
+    with Studio(str(tmp_path)) as first, Studio(str(tmp_path)) as second:
+        found = first.factors(setup, 3)
+        (place,) = [path for path in (tmp_path / "calibrations").iterdir() if path.is_dir()]
+        before = place.stat().st_mtime_ns
+        again = second.factors(setup, 3)
+        assert place.stat().st_mtime_ns == before
+        second.factors(setup, 4)
+    for other in (found, again):
+        assert np.array_equal(other.left, own.left) and np.array_equal(other.right, own.right)
+        assert other.manifest.noise == own.manifest.noise and other.ok == own.ok
+        assert other.manifest.parallax == own.manifest.parallax
+    assert len([path for path in (tmp_path / "calibrations").iterdir() if path.is_dir()]) == 2
+
+
 def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[..., Path], variant: str) -> None:
     """Its truth is the picture, averaged over pixels; the scene's own files are as they were."""
     path = shared_scene("printed", reflectance=np.full((48, 48), 100))
@@ -116,3 +137,25 @@ def test_binned_frames_are_those_of_larger_pixels(studio: Studio, setup: Setup, 
         assert automatic - 0.05 < best[patterns, 1] < automatic + 6
     assert best["dots:4", 4] > best["dots:4", 1] - 1
     assert best["uniform", 4] < best["uniform", 1] - 1
+
+
+def test_an_idealised_plane_casts_the_shadow_of_its_depth(studio: Studio, setup: Setup) -> None:
+    """Frames of 16 dots at 370 mm, lit from 60 mm beside, against factors of that plane in closed form; at the
+    calibrated distance they are those without a plane, whatever the baseline. (Planted: light moved the other way.)"""
+    lit = studio.lit(setup)
+    bench, family = lit.bench, lit.bench.family("dots:4")
+    camera, z = bench.geometry, 370.0
+    own, there = (
+        [frame.irradiance for frame in lit.expected(IDEALISED, family, plane)]
+        for plane in (None, Plane(camera.scene_distance, (25.0, -60.0)))
+    )
+    assert np.allclose(own, there, rtol=1e-12)
+    profile = mls_mask(camera.mask, camera.mask_feature, camera.mask_order).terms[0][1]
+    sides = []
+    for window, baseline in zip(bench.windows, (25.0, -60.0), strict=True):
+        edges = z * (np.linspace(*window, bench.n + 1) + baseline * (1 / z - 1 / camera.scene_distance))
+        sides.append(scene_factor(profile, camera.mask_feature, camera.pixel_edges, edges, camera.mask_distance, z))
+    for shot, frame in zip(family.shots, lit.expected(IDEALISED, family, Plane(z, (25.0, -60.0))), strict=True):
+        expected = sides[0] @ (family.light(shot) * lit.truth) @ sides[1].T
+        scale = np.vdot(expected, frame.irradiance) / np.vdot(expected, expected)
+        assert np.linalg.norm(frame.irradiance - scale * expected) < 1e-6 * np.linalg.norm(frame.irradiance)

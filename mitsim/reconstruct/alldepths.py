@@ -1,0 +1,112 @@
+"""Shots and factors in; out come the measurements and the factors of all depths, on bases that these depths share.
+
+Columns of neighbouring depths are much alike: a few hundred vectors span all of them, and what of a frame lies outside
+is not explained at any depth. So frames are read once and kept small.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.measurement import Measurement
+from mitsim.core.runs import Capture
+from mitsim.reconstruct.accumulator import centred, centred_columns
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.focus import moved, pixels_of_parallax, stated_parallax
+
+RANGE = 0.25
+"""Depths that are looked for, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm moves light by an eighth of
+a window of 0.3 rad."""
+_LEFT_OUT = 1e-6
+"""Part of the factors' energy that the common basis of all depths may leave out: below their noise's."""
+
+
+class AllDepths:
+    """Frames of a capture, and factors of any depth within a range.
+
+    Parameters
+    ----------
+    shots, factors
+        of the same camera; MitsimError for factors without parallax.
+    limit
+        largest change of 1/z [1/mm], either way.
+
+    Attributes
+    ----------
+    parallax, patterns
+        of the factors and the shots.
+    frames
+        measurements on the bases.
+    energy, outside
+        squared norm of the measurements on the part of the sensor where all depths are known, and what of it no depth
+        explains.
+    data, part
+        their number, and what part of the sensor they are of.
+    """
+
+    def __init__(self, shots: Capture, factors: Factors, limit: float) -> None:
+        self.parallax, self.patterns = stated_parallax(factors), shots.patterns
+        self._sides, self._centre = (factors.left, factors.right), factors.manifest.centre
+        self._parts, self._bases = [], list[FloatArray]()
+        for axis, side in enumerate(self._sides):
+            shifts = np.linspace(-limit, limit, 2 * int(np.ceil(limit * self.reach(axis))) + 1)
+            found = [moved(side, self.parallax, axis, shift) for shift in (*shifts, -limit, limit)]
+            part = slice(max(each.start for _, each in found), min(each.stop for _, each in found))
+            self._parts.append(part)
+            self._bases.append(_basis([self._own(columns[part]) for columns, _ in found]))
+        self.energy, kept = 0.0, list[Measurement]()
+        for each in shots.measured((len(factors.left), len(factors.right))):
+            frame = each.frame[self._parts[0], self._parts[1]]
+            frame = centred(frame) if self._centre else frame
+            self.energy += float(np.square(frame).sum())
+            small = self._bases[0].T @ frame @ self._bases[1]
+            kept.append(Measurement(small, each.row, each.column, small, each.shots, 0))
+        self.frames = tuple(kept)
+        self.outside = self.energy - sum(float(np.square(each.frame).sum()) for each in kept)
+        sizes = [part.stop - part.start for part in self._parts]
+        self.data = len(kept) * sizes[0] * sizes[1]
+        self.part = sizes[0] * sizes[1] / (len(factors.left) * len(factors.right))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Scene pixels along both axes."""
+        return self._sides[0].shape[1], self._sides[1].shape[1]
+
+    def side(self, axis: int, shift: float | FloatArray) -> FloatArray:
+        """(r, n) factor of an ``axis`` on its basis, 1/z changed by ``shift`` [1/mm] for all pixels or for each."""
+        return np.asarray(self._bases[axis].T @ self._own(self._moved(axis, shift)))
+
+    def widened(self, axis: int, pixels: int) -> FloatArray:
+        """(r, ``pixels`` + n + ``pixels``) columns of an ``axis`` on its basis, with those that light beside the window
+        has: of the outermost pixels, moved there by their depth."""
+        edges = self.edges(axis)
+        before, beyond = (self._moved(axis, offset / edges) for offset in (-pixels, pixels))
+        count = before.shape[1]
+        columns = np.hstack([before[:, :pixels], self._moved(axis, 0.0), beyond[:, count - pixels :]])
+        return np.asarray(self._bases[axis].T @ self._own(columns))
+
+    def edges(self, axis: int) -> FloatArray:
+        """(n,) projector pixels along an ``axis`` that a change of 1/z by 1/mm moves the light of each."""
+        count = self._sides[axis].shape[1]
+        first, last, _ = pixels_of_parallax(self.parallax, axis, count)
+        return np.asarray(np.linspace(first, last, 2 * count + 1)[1::2])
+
+    def reach(self, axis: int) -> float:
+        """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees, along an ``axis``."""
+        rows, count = self._sides[axis].shape
+        first, last, by_place = pixels_of_parallax(self.parallax, axis, count)
+        return float(max(abs(first), abs(last), by_place * rows * self.parallax.pixel_pitch_mm / 2))
+
+    def _moved(self, axis: int, shift: float | FloatArray) -> FloatArray:
+        return moved(self._sides[axis], self.parallax, axis, shift)[0][self._parts[axis]]
+
+    def _own(self, columns: FloatArray) -> FloatArray:
+        return centred_columns(columns) if self._centre else columns
+
+
+def _basis(factors: list[FloatArray]) -> FloatArray:
+    """(m, r) orthonormal columns that span those of all ``factors``, but for a part of their energy."""
+    energies, vectors = np.linalg.eigh(sum(factor @ factor.T for factor in factors))
+    lost = np.cumsum(np.maximum(energies, 0.0))
+    return np.asarray(vectors[:, lost > _LEFT_OUT * lost[-1]])

@@ -1,0 +1,180 @@
+"""What depth costs, by distance, baseline and patterns; and what is left once it is found, for all pixels or for each.
+
+Paper, section V-A and its limitations: "our method is robust to small variations in depth", camera and projector being
+co-located. Parallax moves each projector pixel's light by B (1/z - 1/z_0), B being the distance between them.
+
+Idealised: a plane beside the calibrated distance, any baseline. Rendered: the shipped rig, 60 mm, its sheet moved; the
+depth given by nothing, found for the sheet, or of a calibration at the sheet's own distance; and scenes of many depths,
+whose depth is found for each projector pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from matplotlib.figure import Figure
+
+from mitsim.study.charts import curves, image_grid
+from mitsim.study.compare import label
+from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope, grouped
+from mitsim.study.exposures import EQUAL_PEAK, IDEALISED, RENDERED
+from mitsim.study.ideal import Plane
+from mitsim.study.paper.measure import by_patterns, found, pictured, verdict
+from mitsim.study.studio import Image, Studio
+from mitsim.study.table import Table, Value
+
+CALIBRATED_MM = 400.0
+"""The paper's distance."""
+DEPTHS_MM = (360.0, 380.0, 395.0, 400.0, 405.0, 420.0, 440.0)
+"""A tenth of the distance either way, as the shipped scenes with depth have, and what a bag's folds are."""
+BASELINES_MM = (0.0, 15.0, 60.0, 150.0, 300.0)
+"""From co-located, over a pico projector that touches the camera, to one on the other side of a bench."""
+FAMILIES = ("uniform", "dots:4", "dots:7")
+ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.5**0.5))}
+"""Unit vectors of the baseline; the shipped rig's is along the columns."""
+DEEP = {"cards": ("dots:7", "dots:7x14"), "cookie_bag": ("dots:7", "dots:7x16")}
+"""Scenes of many depths, and patterns whose period is too short for them, and long enough."""
+NONE, AUTO, MAP, OWN = FOCUS = ("none", "auto", "map", "own calibration")
+_SMALL_MM = 5.0
+"""What a small variation of depth is taken for: the bag's folds."""
+_ROBUST_DB = 3.0
+"""What an image may lose and still be called robust: half of its squared error is then as before."""
+
+
+def _points(scope: Scope) -> Sequence[Point]:
+    setup, seed, depths = (
+        scope.setup.printed(scope.pictures[0]),
+        scope.seeds[0],
+        scope.chosen(DEPTHS_MM, (380.0, 400.0)),
+    )
+    families = scope.chosen(FAMILIES, ("uniform", "dots:7"))
+    planes = [("columns", baseline) for baseline in scope.chosen(BASELINES_MM, (0.0, 60.0))]
+    planes += [(along, 60.0) for along in scope.chosen(("rows", "both"), ())]
+    ideal = [
+        Point.of(setup, model=IDEALISED, patterns=family, seed=seed, depth=depth, baseline=baseline, along=along)
+        for along, baseline in planes
+        for depth in depths
+        for family in families
+    ]
+    moved = [
+        Point.of(
+            setup.changed(sheet_z=depth, **({"scene_distance": depth} if focus == OWN else {})),
+            model=RENDERED, patterns=family, seed=seed, depth=depth, focus=focus,
+        )
+        for focus in (NONE, AUTO, OWN)
+        for depth in depths
+        for family in families
+    ]  # fmt: skip
+    deep = [
+        Point.of(replace(scope.setup, scene=scene), model=RENDERED, patterns=family, seed=seed, focus=focus)
+        for scene, both in scope.chosen(tuple(DEEP.items()), tuple(DEEP.items())[:1])
+        for family in both
+        for focus in (NONE, MAP)
+    ]
+    return grouped([*ideal, *moved, *(deep if scope.setup.scene == "photograph" else [])])
+
+
+def _measure(studio: Studio, point: Point) -> Found:
+    setup, values = point.setup, dict(point.values)
+    patterns, seed = str(values["patterns"]), int(point["seed"])
+    if point["model"] == IDEALISED:
+        lit = studio.lit(setup)
+        baseline = tuple(float(point["baseline"]) * part for part in ALONG[point["along"]])
+        frames = lit.idealised(
+            lit.bench.family(patterns, seed), seed, Plane(point["depth"], (baseline[0], baseline[1]))
+        )
+        image = Image.of(frames, frames.seconds(EQUAL_PEAK))
+    else:
+        focus = point["focus"] if point["focus"] in (AUTO, MAP) else None
+        # Frames of the sheet elsewhere, factors of the rig as it was aligned.
+        image = studio.image(setup, RENDERED, patterns, seed, focus=focus)
+    return found(point, image.image, scene=setup.scene, **image.row())
+
+
+def _claims(results: Results) -> Sequence[Claim]:
+    table = results.table
+    near = min(abs(depth - CALIBRATED_MM) for depth in table.distinct("depth") if depth != CALIBRATED_MM)
+    small = max(near, _SMALL_MM)
+
+    def lost(rows: Table) -> float:
+        there = rows.where(depth=CALIBRATED_MM).mean("psnr_db").value
+        beside = [depth for depth in rows.distinct("depth") if abs(depth - CALIBRATED_MM) == small]
+        return max(there - rows.where(depth=depth).mean("psnr_db").value for depth in beside)
+
+    ideal = table.where(model=IDEALISED, patterns="dots:7", along="columns")
+    losses = {baseline: lost(ideal.where(baseline=baseline)) for baseline in ideal.distinct("baseline")}
+    rendered = lost(table.where(model=RENDERED, patterns="dots:7", focus=NONE))
+    robust = [baseline for baseline, loss in losses.items() if loss <= _ROBUST_DB]
+    told = ", ".join(f"{loss:.1f} dB at {baseline:g} mm" for baseline, loss in losses.items())
+    everywhere = rendered <= _ROBUST_DB and len(robust) == len(losses)
+    apart = f"at most {max(robust):g} mm apart" if any(robust) else "co-located"
+    only = f"confirmed only if camera and projector are {apart}" if robust else "not confirmed"
+    claims = [
+        Claim(
+            f"Robust to small variations in depth: 49 dots, {small:g} mm beside the calibrated distance", "robust",
+            f"lost by baseline: {told}", f"lost at 60 mm: {rendered:.1f} dB",
+            "confirmed" if everywhere else only,
+        )
+    ]  # fmt: skip
+    own, auto = (table.where(focus=focus, patterns="dots:7").means("psnr_db", "depth") for focus in (OWN, AUTO))
+    worst = min(auto[depth].value - own[depth].value for depth in own)
+    claims.append(
+        Claim(
+            "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
+            "", "", f"{worst:+.1f} dB at worst, of {len(own)} depths", verdict(worst > -_ROBUST_DB),
+        )
+    )  # fmt: skip
+    return [*claims, *(_mapped(table.where(scene=scene), scene) for scene in DEEP if len(table.where(scene=scene)))]
+
+
+def _mapped(rows: Table, scene: str) -> Claim:
+    short, long = DEEP[scene]
+    means = {
+        (family, focus): rows.mean("psnr_db", patterns=family, focus=focus).value
+        for family in (short, long)
+        for focus in (NONE, MAP)
+    }
+    flagged = all(row["flagged"] for row in rows.where(patterns=short, focus=MAP).rows)
+    gains = ", ".join(f"{label(name)} {means[name, NONE]:.1f} to {means[name, MAP]:.1f} dB" for name in (short, long))
+    better = means[long, MAP] > means[long, NONE] + _ROBUST_DB and flagged
+    return Claim(
+        f"A depth for each pixel (--focus map) mends {scene}, and is flagged where dots are too near to each other",
+        "", "", gains, verdict(better),
+    )  # fmt: skip
+
+
+def _figures(results: Results) -> Mapping[str, Figure]:
+    table = results.table
+    ideal, rendered = table.where(model=IDEALISED), table.where(model=RENDERED, scene=table.rows[0]["scene"])
+    by_baseline = {
+        f"{baseline:g} mm": ideal.where(patterns="dots:7", along="columns", baseline=baseline).means("psnr_db", "depth")
+        for baseline in ideal.distinct("baseline")
+    }
+    drawn = {"baseline.png": curves({"idealised, 49 dots, by baseline": by_baseline}, "depth of the plane [mm]")}
+    own = {
+        name: rows.where(along="columns", baseline=60.0).means("psnr_db", "depth")
+        for name, rows in by_patterns(ideal).items()
+    }
+    drawn["patterns.png"] = curves({"idealised, 60 mm, by patterns": own}, "depth of the plane [mm]")
+    focus = {
+        name: rendered.where(patterns="dots:7", focus=name).means("psnr_db", "depth") for name in (NONE, AUTO, OWN)
+    }
+    drawn["focus.png"] = curves({"rendered, 60 mm, 49 dots, by focus": focus}, "depth of the sheet [mm]")
+    lines = {
+        f"{scene}, {label(family)}": table.where(scene=scene, patterns=family)
+        for scene in DEEP
+        for family in DEEP[scene]
+    }
+    shown: list[Value] = [NONE, MAP]
+    if grid := pictured(results, lines, "focus", shown):
+        drawn["images.png"] = image_grid(grid, ["one depth", "a depth for each pixel"], "rendered, 60 mm")
+    return drawn
+
+
+EXPERIMENT = Experiment(
+    "depth",
+    "Depth",
+    "What does a scene beside the calibrated distance cost, and what is left once its depth is found?",
+    _points, _measure, _claims, _figures,
+)  # fmt: skip

@@ -1,0 +1,196 @@
+"""A lit scene and places of its camera's mask in; the image that uniform frames through the mask at all places come to,
+out.
+
+SweepCam (Hua, Nakamura, Asif & Sankaranarayanan, TPAMI 2020) moves the mask instead of the light. Moved by a along the
+rows and by b along the columns, a separable mask casts Y_ab = Phi_L(a) X Phi_R(b)^T. Of places on a grid, all frames
+side by side are one frame of a separable camera whose factors are those of the places on top of each other,
+
+    [Y_ab]_ab = [Phi_L(a)]_a X [Phi_R(b)]_b^T,
+
+so :mod:`mitsim.reconstruct.solver` solves them exactly, as it does one frame. Light is traced up to the mask, so one
+scene's light serves all places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from mitsim.capture.ambient import taken_off
+from mitsim.capture.bench import Bench
+from mitsim.capture.calibrate import estimate
+from mitsim.capture.exposer import Exposer, peak_irradiance
+from mitsim.capture.light import Light
+from mitsim.capture.request import Exposure
+from mitsim.capture.session import Session
+from mitsim.core.arrays import FloatArray
+from mitsim.core.job import Job
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer, stream
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.reconstruct.accumulator import centred, centred_columns
+from mitsim.reconstruct.solver import Solution, prepare
+from mitsim.rig.recipe import load_recipe
+from mitsim.study.exposures import EQUAL_PEAK, EQUAL_TOTAL, RENDERED, LitScene
+from mitsim.study.ideal import IdealCamera, Pair
+
+Places = Mapping[float, Pair]
+"""Left and right factor, (pixels, n) each, of the camera with its mask moved so far [mm], along both axes."""
+
+
+def moved(bench: Bench, row_mm: float, column_mm: float) -> Bench:
+    """A bench with its mask elsewhere, for all that is made of traced light.
+
+    Parameters
+    ----------
+    bench
+        what is changed.
+    row_mm, column_mm
+        the mask's centre off the axis.
+    """
+    offset = {"mask_offset_row": row_mm, "mask_offset_column": column_mm}
+    return replace(bench, rig=replace(bench.rig, camera=bench.geometry.model_copy(update=offset)))
+
+
+def ideal_places(bench: Bench, places_mm: Iterable[float], board_flux: float) -> Places:
+    """Factors of the paper's model.
+
+    Parameters
+    ----------
+    bench, places_mm
+        whose mask is moved, and how far along both axes.
+    board_flux
+        that each pixel of a white board puts on the sensor [W m^-2].
+    """
+    cameras = {place: IdealCamera(moved(bench, place, place), bench.geometry.mask) for place in places_mm}
+    return {place: camera.calibrated(board_flux) for place, camera in cameras.items()}
+
+
+def calibrated_places(bench: Bench, places_mm: Sequence[float], seed: int, accuracy: float = 1e-3) -> Places:
+    """Factors as sessions with the mask at each place estimate them, all of one board's light.
+
+    One place a side needs one session, not each frame: a mask that has moved along both axes tells the left factor of
+    its row and the right one of its column. How a product is shared between left and right is open; cameras that are
+    alike along both axes share it alike at all places.
+
+    The sessions are rendered without the sensor's noise, and what it does to factors is added in closed form
+    (:func:`mitsim.reconstruct.calibration.predicted_error`): seven times 512 noisy frames take four times as long.
+
+    Parameters
+    ----------
+    bench, places_mm
+        whose mask is moved, and how far along both axes.
+    seed, accuracy
+        as for :meth:`mitsim.capture.bench.Bench.calibrate`; every place has noise of its own.
+    """
+    recipe, job = load_recipe(), Job()
+    session = Session(bench, recipe, seed)
+    light = session.trace(session.plan(accuracy, job), job)
+    return {place: _calibrated(Session(moved(bench, place, place), recipe, seed), light, place) for place in places_mm}
+
+
+def _calibrated(session: Session, light: Light, place: float) -> Pair:
+    """Both factors of a ``session`` before the board's ``light``, its noise found by the ``place``."""
+    lit = session.lit(light.behind(session.board), Job())
+    clean, _ = estimate(lit, Job(), noise_free=True)
+    count = np.sqrt(session.signs.shape[1])
+    sides = {"left": (clean.left, clean.right), "right": (clean.right, clean.left)}
+    noisy = {}
+    for name, (side, other) in sides.items():
+        deviation = lit.response_noise / (count * np.linalg.norm(other.sum(axis=1)))
+        noise = stream(session.seed, "mask", name, f"{place:g}").standard_normal(side.shape)
+        noisy[name] = side + deviation * noise
+    return noisy["left"], noisy["right"]
+
+
+@dataclass(frozen=True, eq=False)
+class MovedMask:
+    """Uniform frames of a scene through a mask at several places.
+
+    Attributes
+    ----------
+    lit, model
+        the scene, and one of :data:`mitsim.study.exposures.MODELS`.
+    factors
+        of the places.
+    seed
+        of the noise.
+    """
+
+    lit: LitScene
+    model: str
+    factors: Places
+    seed: int
+    _formed: dict[tuple[float, float], ExpectedFrames] = field(default_factory=dict)
+
+    def expected(self, row_mm: float, column_mm: float) -> ExpectedFrames:
+        """The frame through the mask at one place, without noise.
+
+        Parameters
+        ----------
+        row_mm, column_mm
+            the mask's centre off the axis.
+        """
+        place = row_mm, column_mm
+        if place not in self._formed:
+            bench = moved(self.lit.bench, *place)
+            self._formed[place] = self.lit.expected(self.model, bench.family("uniform"), bench=bench)
+        return self._formed[place]
+
+    def seconds(self, rows_mm: Sequence[float], columns_mm: Sequence[float], exposure: str) -> float:
+        """Exposure time [s] of each frame.
+
+        Parameters
+        ----------
+        rows_mm, columns_mm
+            places of the frames.
+        exposure
+            one of :data:`mitsim.study.exposures.CONVENTIONS`.
+        """
+        places = list(product(rows_mm, columns_mm))
+        if exposure == EQUAL_PEAK:
+            brightest = max(peak_irradiance(self.expected(*place)) for place in places)
+            return Exposure().choose(self.lit.bench.rig, brightest)
+        return self.lit.uniform_s(self.model) / (len(places) if exposure == EQUAL_TOTAL else 1)
+
+    def solve(self, rows_mm: Sequence[float], columns_mm: Sequence[float], seconds: float) -> Solution:
+        """The image of one exposure at each place of a grid, at automatic lambda.
+
+        Parameters
+        ----------
+        rows_mm, columns_mm
+            the grid.
+        seconds
+            exposure time of each frame.
+        """
+        left = np.concatenate([self._side(0, place) for place in rows_mm])
+        right = np.concatenate([self._side(1, place) for place in columns_mm])
+        uniform = np.ones((self.lit.bench.n, 1))
+        model = prepare(left, right, uniform, uniform)
+        sums = model.accumulator()
+        with single_threaded_blas():
+            frames = [[self._measured(row, column, seconds) for column in columns_mm] for row in rows_mm]
+            sums.add(np.block(frames), 0, 0)
+            return model.solve(sums)
+
+    @property
+    def _centre(self) -> bool:
+        """Whether every frame and factor loses its means, which stacked ones must lose one by one."""
+        return self.lit.bench.geometry.mask == "flatcam"
+
+    def _side(self, axis: int, place: float) -> FloatArray:
+        factor = self.factors[place][axis]
+        return centred_columns(factor) if self._centre else factor
+
+    def _measured(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
+        """Noisy electrons a second at one place, of ambient light what a user takes off."""
+        bench, expected = self.lit.bench, self.expected(row_mm, column_mm)
+        speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
+        exposer = Exposer(bench.rig, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
+        family = bench.family("uniform")
+        ((frame, _, _),) = exposer.measurements(family, expected)
+        frame = frame - taken_off(exposer, family, expected)
+        return centred(frame) if self._centre else frame

@@ -1,0 +1,215 @@
+"""Effects taken out of a light: without all it is the paper's model, and each one is what a formula says it is."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.capture import partial
+from mitsim.capture.evidence import SharpPixels
+from mitsim.capture.light import Light, traced_again
+from mitsim.capture.partial import Anatomy
+from mitsim.capture.simulation import TRAYS, Simulation
+from mitsim.core.arrays import FloatArray
+from mitsim.study.exposures import IDEALISED, LitScene
+from mitsim.transport.histogram import DIRECT, Deposits
+
+FAMILY = "dots:4"
+PRINT = np.random.default_rng(4).integers(20, 230, (48, 48))
+TURNED = '<rotate y="1" angle="-9"/>'
+PROJECTOR = """name = "contrast 100, blurred, with speckle"
+effective_wavelength_nm = 562.0
+contrast_ratio = 100.0
+blur_pixels = 0.6
+speckle_contrast = 0.05
+"""
+
+
+def frames(light: Light) -> FloatArray:
+    lighting = light.bench.family(FAMILY).lighting
+    return np.stack([frame.irradiance for frame in light.frames(lighting, 0)])
+
+
+def apart(found: FloatArray, wanted: FloatArray) -> float:
+    return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
+
+
+@pytest.fixture(scope="module")
+def far(shared_scene: Callable[..., Path], variant: str) -> Light:
+    """A print 20 mm before the aligned plane, whose texels are thirds of projector pixels, under a projector of low
+    contrast."""
+    path = shared_scene("far", reflectance=PRINT, sheet_z=380, fov=30)
+    device = path.parent / "device.toml"
+    device.write_text(PROJECTOR)
+    return ms.open_bench(path, variant, projector=device).light(FAMILY, accuracy=5e-3)
+
+
+@pytest.fixture(scope="module")
+def turned(shared_scene: Callable[..., Path], variant: str) -> Light:
+    """A print that a turned projector lights."""
+    path = shared_scene("turned", reflectance=PRINT, projector_turn=TURNED, fov=40)
+    return ms.open_bench(path, variant).light(FAMILY, accuracy=5e-3)
+
+
+def test_nothing_taken_out_is_the_light_itself(far: Light) -> None:
+    anatomy = Anatomy.of(far)
+    assert anatomy.without(frozenset()) is far
+    assert anatomy.without(frozenset({"ambient", partial.KEYSTONE, partial.GLOSS})) is far, "which it does not have"
+    assert anatomy.effects == (
+        partial.FALLOFF,
+        partial.DIFFRACTION,
+        partial.DEPTH,
+        partial.DETAIL,
+        partial.BLACK_LEVEL,
+        partial.DEFOCUS,
+        partial.SPECKLE,
+        partial.RENDER_NOISE,
+    )
+
+
+def test_the_same_paths_are_traced_again(far: Light) -> None:
+    """To the renderer's float32. (Planted: another purpose's streams.)"""
+    again = traced_again(far, partial._Filing(far.bench, far.simulation.settings, True, frozenset()))
+    for own, other in zip(far.groups, again.groups, strict=True):
+        for tray in TRAYS:
+            assert abs(getattr(own, tray) - getattr(other, tray)).sum() <= 1e-6 * own.fine.sum()
+    assert np.allclose(again.flux, far.flux, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scene", ["far", "turned"])
+def test_without_all_it_is_the_idealised_model(scene: str, request: pytest.FixtureRequest) -> None:
+    """An even sheet at the aligned distance that shows the truth, pixel by pixel, though the traced one lies elsewhere,
+    blurred, under a keystone. (Planted: each effect left in.)"""
+    light = request.getfixturevalue(scene)
+    anatomy, lit = Anatomy.of(light), LitScene(light)
+    wanted = np.stack([frame.irradiance for frame in lit.expected(IDEALISED, light.bench.family(FAMILY))])
+    whole = frozenset(anatomy.effects)
+    assert apart(frames(anatomy.without(whole)), wanted) < 5e-5
+    for effect in whole - {partial.SPECKLE, partial.DETAIL}:
+        assert apart(frames(anatomy.without(whole - {effect})), wanted) > 1e-4, effect
+    assert apart(frames(light), wanted) > 0.05
+
+
+def test_a_turned_projector_has_a_keystone(turned: Light) -> None:
+    anatomy = Anatomy.of(turned)
+    assert partial.KEYSTONE in anatomy.effects and partial.DEPTH not in anatomy.effects
+    assert not partial._off_plane(turned)
+
+
+def sharp_deposits(light: Light) -> Deposits:
+    """A ray from each projector pixel, without blur."""
+    settings = light.simulation.settings
+    settings = replace(settings, effects=settings.effects - {"blur"})
+    return Simulation(light.bench, settings).direct.trace(1, 0, 1)
+
+
+def pixel_of(light: Light, deposits: Deposits) -> FloatArray:
+    """Where ``deposits`` lie on the aligned plane, by projector pixels that fill the window's bounding box."""
+    n = light.bench.n
+    places = [
+        np.floor((tangents - first) / (last - first) * n)
+        for tangents, (first, last) in zip((deposits.row, deposits.column), light.bench.windows, strict=True)
+    ]
+    return np.asarray(places[0] * n + places[1])
+
+
+def test_depth_is_parallax(far: Light) -> None:
+    """The projector, 60 mm aside (x = 60, column -60), 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside,
+    0.35 pixels, and without depth in its pixel on the plane. (Planted: the projector on the other side.)"""
+    deposits, place = sharp_deposits(far), partial._Place(far.bench)
+    aside = place.parallax(deposits)
+    assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
+    assert (pixel_of(far, deposits) != deposits.pixel).mean() > 0.2
+    back = place.moved(deposits, frozenset({partial.DEPTH}))
+    assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), deposits.pixel)
+    assert partial._off_plane(far)
+
+
+def test_without_keystone_light_lies_in_its_pixel(turned: Light) -> None:
+    """(Planted: the homography the other way round.)"""
+    deposits = sharp_deposits(turned)
+    assert (pixel_of(turned, deposits) != deposits.pixel).mean() > 0.2
+    straight = partial._Place(turned.bench).moved(deposits, frozenset({partial.KEYSTONE}))
+    assert np.array_equal(pixel_of(turned, straight), deposits.pixel)
+    assert np.array_equal(straight.inverse_depth, deposits.inverse_depth)
+
+
+def test_falloff_over_pixels_is_that_of_a_matt_sheet(turned: Light) -> None:
+    """A sheet that faces the camera, evenly lit from z = 0: E r^4 / z^2 is the same for all points, and pixels of a
+    shifted lens are of one size. What is taken out is the flux over the board, in units of its mean."""
+    truth = turned.apparent
+    even, lit = Anatomy.of(turned)._even, truth.board_flux > 0
+    assert lit.mean() > 0.9 and np.allclose((even * truth.board_flux)[lit], truth.board_flux.mean())
+
+
+def test_falloff_is_the_fourth_power_of_the_cosine(far: Light) -> None:
+    """Of a shifted lens, seen from the sensor's centre: (1 + tan^2)^-2. (Planted: the square root.)"""
+    rows, columns = (np.linspace(*window, far.bench.n + 1) for window in far.bench.windows)
+    middles = [(edges[1:] + edges[:-1]) / 2 for edges in (rows, columns)]
+    wanted = (1 + middles[0][:, None] ** 2 + middles[1][None, :] ** 2) ** -2.0
+    brightness = (1 / Anatomy.of(far)._even).reshape(wanted.shape)
+    # The mean over a small sensor is that of its centre to (half-width / distance)^2 = 1e-6; pixels of 7.5 mm: 2e-4.
+    assert np.allclose(brightness, wanted / wanted.mean(), rtol=2e-3)
+
+
+def test_black_level_adds_a_part_of_uniform_light(far: Light) -> None:
+    """b + (1 - b) w of every pixel: frames are (1 - b) of those without, and b of the uniform frame. (Planted: 1 for
+    1 - b.)"""
+    anatomy, leak = Anatomy.of(far), 1 / 100
+    without = anatomy.without(frozenset({partial.BLACK_LEVEL}))
+    (uniform,) = without.frames(far.bench.family("uniform").lighting, 0)
+    assert apart(frames(far), (1 - leak) * frames(without) + leak * uniform.irradiance) < 1e-9
+
+
+def test_detail_is_what_cells_of_a_pixel_differ_in(far: Light) -> None:
+    """The same flux of each pixel, spread evenly over its cells: c x c of them have the same light. (Planted: the mean
+    over all pixels.)"""
+    anatomy = Anatomy.of(far)
+    off = frozenset({partial.DETAIL, partial.DEFOCUS, partial.DEPTH})
+    even = anatomy.without(off)
+    cells = sum(group.fine for group in even.groups)[:-1]
+    per_pixel = even.simulation.settings.subdivision**2
+    assert per_pixel > 1
+    for pixel in (0, 37, 255):
+        lit = np.sort(cells[[pixel]].toarray()[0])[::-1][:per_pixel]
+        assert lit.min() > 0.9 * lit.max() and lit.sum() > 0.999 * cells[[pixel]].sum()
+    uneven = sum(group.fine for group in anatomy.without(off - {partial.DETAIL}).groups)[:-1]
+    assert np.allclose(uneven.sum(axis=1), cells.sum(axis=1), rtol=1e-9)
+    spread = [np.ptp(np.sort(light[[37]].toarray()[0])[::-1][:per_pixel]) for light in (cells, uneven)]
+    assert spread[1] > 10 * spread[0]
+
+
+def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..., Path], variant: str) -> None:
+    """A glossy sheet: without gloss all points of the sensor see the mean over it; all light is as much."""
+    path = shared_scene("glossy", reflectance=PRINT)
+    matt, glossy = '<bsdf type="diffuse">', '<bsdf type="roughplastic"><float name="alpha" value="0.05"/>'
+    text = path.read_text().replace(matt, glossy)
+    path.write_text(text.replace('name="reflectance" type="bitmap"', 'name="diffuse_reflectance" type="bitmap"'))
+    light = ms.open_bench(path, variant).light(FAMILY, accuracy=1e-3)
+    anatomy = Anatomy.of(light)
+    assert partial.GLOSS in anatomy.effects
+    plain = anatomy.without(frozenset({partial.GLOSS}))
+    assert plain.simulation.settings.anchors == 1
+    whole, mean = frames(light), frames(plain)
+    assert 1e-4 < apart(mean, whole) < 0.1
+    assert mean.sum() == pytest.approx(whole.sum(), rel=2e-3)
+
+
+def test_lobes_are_averaged_over_anchors_with_their_weights(far: Light) -> None:
+    """Light of the first anchor alone comes to all, times its weight in the mean over the sensor."""
+    sharp = SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05))
+    simulation = Simulation(far.bench, replace(far.simulation.settings, sharp=sharp))
+    one, zero = np.ones(1), np.zeros(1, np.int64)
+    deposits = Deposits(zero + 5, zero + 2, zero, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16))
+    labels = np.arange(far.bench.n**2)
+    filed = simulation.sharp.file(deposits, labels, 1)
+    mean = partial._even_lobes(filed, simulation)
+    weight = simulation.sharp_weights[2] * simulation.sharp_weights[0]
+    again = simulation.sharp.bundle.repeated(
+        replace(simulation.sharp.bundle, anchors=1).file(deposits.averaged(simulation.sharp_weights), labels, 1)
+    )
+    assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
+    assert partial._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"

@@ -1,0 +1,169 @@
+"""A depth for each projector pixel, held against scenes of several depths in closed form (tests/ideal_sessions.py).
+
+The camera is that of test_focus.py: 40 x 40 pixels of 3 mm at 400 mm, the projector beside it along the columns alone
+or above it, too. At 370 mm light lies 1.6 pixels beside where it was calibrated, at 430 mm 1.4 on the other side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.runs import Capture
+from mitsim.reconstruct.alldepths import AllDepths
+from mitsim.reconstruct.depthmap import depth_map
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.pixeldepths import PixelDepths
+from mitsim.reconstruct.reconstruction import reconstruct
+from tests.ideal_sessions import Bench, picture
+from tests.unit.reconstruct.test_focus import BASELINE, PARALLAX, N, shadow
+
+BESIDE = (0.0, BASELINE[1])
+"""Baseline [mm] along the columns alone."""
+PRINT = picture(n=N)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layers(Bench):
+    """Surfaces at several depths: which pixels (n, n) are of each, and its factors."""
+
+    surfaces: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]
+
+    def light(self, shown: np.ndarray) -> np.ndarray:
+        return np.asarray(sum(left @ (shown * where) @ right.T for where, left, right in self.surfaces))
+
+
+def sides(depth: float, baseline: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    return shadow(depth, 0, baseline=baseline), shadow(depth, 1, baseline=baseline)
+
+
+def shots(depths: np.ndarray, patterns: str, baseline: tuple[float, float] = BESIDE) -> Capture:
+    """Of surfaces at ``depths`` (n, n)."""
+    parts = tuple((depths == depth, *sides(depth, baseline)) for depth in np.unique(depths))
+    return Layers(*sides(400.0, baseline), surfaces=parts).run(patterns, PRINT, 0)
+
+
+def calibrated(baseline: tuple[float, float] = BESIDE) -> Factors:
+    factors = Bench(*sides(400.0, baseline)).calibrated(0)
+    parallax = PARALLAX.model_copy(update={"row_mm": (baseline[0],) * 2, "column_mm": (baseline[1],) * 2})
+    return replace(factors, manifest=factors.manifest.model_copy(update={"parallax": parallax}))
+
+
+def cards() -> np.ndarray:
+    """A board at 430 mm, before it a card at 370."""
+    depths = np.full((N, N), 430.0)
+    depths[10:30, 8:26] = 370.0
+    return depths
+
+
+def psnr(image: np.ndarray) -> float:
+    return -10 * float(np.log10(np.mean(np.square(image - PRINT))))
+
+
+@pytest.mark.parametrize(
+    ("patterns", "baseline"),
+    [("dots:4x10", BESIDE), ("dots:4x8", BESIDE), ("dots:8", BASELINE), ("dots:5x8", BASELINE)],
+)
+def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> None:
+    """Both depths are found, and the image is within 2.5 dB of that at the true depths, 15 above that at one depth.
+    (Planted: light looked for on the other side; the derivative's sign; edges left as pooled, 12 dB.)"""
+    run, factors, true = shots(cards(), patterns, baseline), calibrated(baseline), 1 / cards() - 1 / 400
+    found, one = depth_map(run, factors), reconstruct(run, factors)
+    depths = AllDepths(run, factors, 4e-4)
+    known = PixelDepths(depths, 4e-4, 5e-6)
+    ideal = known.final(true, known.solve(true)).image
+    error = np.abs(found.mm - cards())
+    print(psnr(one.image), psnr(found.image), psnr(ideal), np.median(error), found.told.mean())
+    assert not found.doubt and np.median(error) < 2 and (error < 5).mean() > 0.95
+    assert psnr(found.image) > psnr(ideal) - 2.5 and psnr(found.image) > psnr(one.image) + 15
+    assert found.told.mean() > 0.9
+
+
+@pytest.mark.parametrize(("depth", "patterns"), [(400.0, "dots:4x8"), (380.0, "dots:4x8"), (360.0, "dots:4")])
+def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
+    """And the image that its own depth gives, less 1.5 dB: twice as many unknowns. At 360 mm light lies half a period
+    of 4 beside. (Planted: depths looked for about the calibrated one alone.)"""
+    run, factors = shots(np.full((N, N), depth), patterns), calibrated()
+    image, given = reconstruct(run, factors, focus="map"), reconstruct(run, factors, focus=depth)
+    assert image.depths is not None and np.abs(image.depths.mm - depth).max() < 6
+    assert np.median(np.abs(image.depths.mm - depth)) < 1
+    assert psnr(image.image) > psnr(given.image) - 1.5
+    assert image.misfit is not None and given.misfit is not None
+    assert image.misfit.chi_square == pytest.approx(given.misfit.chi_square, rel=0.1)
+    assert image.uncertainties is None
+
+
+@pytest.mark.parametrize(("near", "far", "patterns"), [(330.0, 500.0, "dots:4x5"), (370.0, 430.0, "dots:4")])
+def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: float, far: float, patterns: str) -> None:
+    """Parallax of 8.2 pixels under dots 5 apart, and of 3 under dots 4 apart. (Planted: nothing spared; no rivals.)"""
+    run, factors = shots(np.where(cards() < 400, near, far), patterns), calibrated()
+    image, before = reconstruct(run, factors, focus="map"), reconstruct(run, factors)
+    assert "off by a whole period" in str(image.status) and "longer period along the baseline" in str(image.status)
+    assert not image.ok and image.depths is None and np.array_equal(image.image, before.image)
+    assert image.summary()["depths"] is None and "no depths are told" in str(image.focus)
+
+
+def test_dark_pixels_have_no_confidence() -> None:
+    dark = np.where(np.arange(N) < 12, 0.0, 1.0)
+    bench = Layers(*sides(400.0, BESIDE), surfaces=((dark * np.ones((N, 1)), *sides(380.0, BESIDE)),))
+    found = depth_map(bench.run("dots:4x8", PRINT, 0), calibrated())
+    assert np.median(found.confidence[:, :8]) < 0.5 < np.quantile(found.confidence[:, 16:], 0.1)
+
+
+def test_the_step_is_the_derivative() -> None:
+    """X o d from the true image is the change of depth that is missing: within a tenth at a twentieth of a pixel.
+
+    (Planted: one half of the derivative of u v^T.)"""
+    run, factors = shots(np.full((N, N), 400.0), "dots:4x8"), calibrated()
+    depths = AllDepths(run, factors, 4e-4)
+    model, pixel = PixelDepths(depths, 4e-4, 5e-6), 0.3 / N / 60
+    bright = PRINT > 0.5
+    for part in (-0.05, 0.05):
+        image, moved = model.step(np.full((N, N), part * pixel), pixel)
+        change = (moved * image)[bright].sum() / np.square(image)[bright].sum()
+        assert change == pytest.approx(-part, rel=0.1)
+
+
+def test_files_and_the_summary_have_the_depths(tmp_path: object) -> None:
+    from pathlib import Path
+
+    from mitsim.core.framefile import read_frame
+
+    run, factors = shots(cards(), "dots:4x8"), calibrated()
+    image = reconstruct(run, factors, focus="map")
+    folder = image.save(Path(str(tmp_path)) / "image")
+    channels, _ = read_frame(folder / "depth.exr")
+    assert image.depths is not None and set(channels) == {"depth_mm", "confidence"}
+    np.testing.assert_allclose(channels["depth_mm"], image.depths.mm, rtol=1e-6)
+    said = image.summary()["depths"]
+    assert said["least_mm"] < 380 and said["most_mm"] > 420 and 0.9 < said["told_part"] <= 1
+    assert "mm, median" in str(image.focus) and "depth of each pixel" in image._repr_html_()
+    reconstruct(run, factors).save(folder, overwrite=True)
+    assert not (folder / "depth.exr").exists()
+
+
+@pytest.mark.parametrize(
+    ("patterns", "changes", "fragment"),
+    [
+        ("hadamard:2", {}, "needs shifting dots"),
+        ("random:3", {}, "needs shifting dots"),
+        ("dots:4", {"row_mm": (0.0, 0.0), "column_mm": (0.0, 0.0)}, "have no baseline"),
+    ],
+)
+def test_what_cannot_tell_depths_is_refused(patterns: str, changes: dict[str, object], fragment: str) -> None:
+    run, factors = shots(np.full((N, N), 400.0), patterns), calibrated()
+    assert factors.manifest.parallax is not None
+    parallax = factors.manifest.parallax.model_copy(update=changes)
+    factors = replace(factors, manifest=factors.manifest.model_copy(update={"parallax": parallax}))
+    with pytest.raises(MitsimError, match=fragment):
+        depth_map(run, factors)
+
+
+def test_other_methods_have_no_depths() -> None:
+    with pytest.raises(ArgumentError, match="tikhonov alone"):
+        reconstruct(shots(np.full((N, N), 400.0), "dots:4"), calibrated(), method="tv", focus="map")
+    with pytest.raises(MitsimError, match="does not state its parallax"):
+        depth_map(shots(cards(), "dots:4"), Bench(*sides(400.0, BESIDE)).calibrated(0))

@@ -1,0 +1,27 @@
+"""Figures of studies: curves by numbers in order, grids with their own titles."""
+
+import numpy as np
+
+from mitsim.study.charts import curves, image_grid
+from mitsim.study.table import Mean
+
+
+def test_curves_are_in_the_order_of_their_numbers() -> None:
+    """Also where these are text, and a single value has no standard error. (Planted: text in its own order.)"""
+    nan = float("nan")
+    shown = {"10": Mean(3.0, 0.5, 2), "2.5": Mean(1.0, nan, 1), "4": Mean(2.0, 0.5, 2)}
+    figure = curves({"left": {"a": shown}, "right": {"a": {}}}, "x [mm]")
+    line = figure.axes[0].containers[0].lines[0]
+    assert np.array_equal(line.get_xdata(), [2.5, 4, 10]) and np.array_equal(line.get_ydata(), [1, 2, 3])
+    assert [axes.get_title() for axes in figure.axes] == ["left", "right"]
+    assert figure.axes[0].get_xlabel() == "x [mm]" and figure.axes[0].get_ylabel() == "PSNR [dB]"
+
+
+def test_a_grid_has_a_title_of_its_own_and_one_for_each_column() -> None:
+    """(Planted: the last column's for the whole.)"""
+    cells = [(np.full((4, 4), value), f"{value} dB") for value in (0.2, 0.8)]
+    figure = image_grid({"one": cells, "two": cells}, ["a", "b"], "all of them")
+    assert figure.get_suptitle() == "all of them"
+    assert [axes.get_title() for axes in figure.axes] == ["a", "b", "", ""]
+    assert [axes.get_xlabel() for axes in figure.axes] == ["0.2 dB", "0.8 dB"] * 2
+    assert [axes.get_ylabel() for axes in figure.axes] == ["one", "", "two", ""]
