@@ -141,7 +141,7 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table, drawn = results.table.where(patterns=_DRAWN[0]), {}
-    peak = table.where(exposure=_DRAWN[1])
+    peak = table.where(exposure=_DRAWN[1], seed=table.distinct("seed")[0])
     swept = [name for name in SHAPES if name in table.distinct("subject")]
     if swept:
         for exposure in EXPOSURES:

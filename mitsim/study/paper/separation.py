@@ -152,13 +152,8 @@ def _claims(results: Results) -> Sequence[Claim]:
         gains = {name: rows.mean("gain_db", subject=name, patterns="dots:7") for name in table.distinct("subject")}
         told = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
         gained = all(gain.value > 0 for gain in gains.values())
-        return Claim(
-            f"49 dots tell global light apart, {depth}: gain",
-            "Nayar et al. 2006",
-            "not simulated",
-            told,
-            verdict(gained),
-        )
+        text = f"49 dots tell global light apart, {depth}: the image gains (Nayar et al. 2006)"
+        return Claim(text, "", "", told, verdict(gained))
 
     return [claim(depth) for depth in table.distinct("depth")]
 
