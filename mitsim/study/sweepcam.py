@@ -13,7 +13,7 @@ scene's light serves all places.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -30,7 +30,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.accumulator import centred, centred_columns
 from mitsim.reconstruct.solver import Solution, prepare
 from mitsim.rig.recipe import load_recipe
@@ -65,16 +65,22 @@ def ideal_places(bench: Bench, places_mm: Iterable[float], board_flux: float) ->
     board_flux
         that each pixel of a white board puts on the sensor [W m^-2].
     """
-    cameras = {place: IdealCamera(moved(bench, place, place), bench.geometry.mask) for place in places_mm}
-    return {place: camera.calibrated(board_flux) for place, camera in cameras.items()}
+
+    def camera(row: float, column: float) -> IdealCamera:
+        return IdealCamera(moved(bench, row, column), bench.geometry.mask)
+
+    def white(row: float, column: float) -> Frame:
+        (frame,) = camera(row, column).frames(bench.family("uniform"), np.full((bench.n, bench.n), board_flux))
+        return frame
+
+    return _consistent({place: camera(place, place).calibrated(board_flux) for place in places_mm}, bench, white)
 
 
 def calibrated_places(bench: Bench, places_mm: Sequence[float], seed: int, accuracy: float = 1e-3) -> Places:
     """Factors as sessions with the mask at each place estimate them, all of one board's light.
 
     One place a side needs one session, not each frame: a mask that has moved along both axes tells the left factor of
-    its row and the right one of its column. How a product is shared between left and right is open; cameras that are
-    alike along both axes share it alike at all places.
+    its row and the right one of its column.
 
     The sessions are rendered without the sensor's noise, and what it does to factors is added in closed form
     (:func:`mitsim.reconstruct.calibration.predicted_error`): seven times 512 noisy frames take four times as long.
@@ -89,7 +95,38 @@ def calibrated_places(bench: Bench, places_mm: Sequence[float], seed: int, accur
     recipe, job = load_recipe(), Job()
     session = Session(bench, recipe, seed)
     light = session.trace(session.plan(accuracy, job), job)
-    return {place: _calibrated(Session(moved(bench, place, place), recipe, seed), light, place) for place in places_mm}
+
+    def at(row: float, column: float) -> Session:
+        return Session(moved(bench, row, column), recipe, seed)
+
+    def white(row: float, column: float) -> Frame:
+        return at(row, column).lit(light.behind(at(row, column).board), Job()).white
+
+    return _consistent({place: _calibrated(at(place, place), light, place) for place in places_mm}, bench, white)
+
+
+def _consistent(factors: Places, bench: Bench, white: Callable[[float, float], Frame]) -> Places:
+    """Factors whose products hold between places as well.
+
+    A session leaves open how its product is shared between left and right, even their sign. One frame of the board
+    through the mask at each place's row and the first one's column tells.
+
+    Parameters
+    ----------
+    factors, bench
+        as the sessions of each place left them, and the rig.
+    white
+        the board in uniform light through the mask at a row and a column [mm].
+    """
+    first, found = next(iter(factors)), {}
+    for place, (left, right) in factors.items():
+        told = np.outer(left.sum(axis=1), factors[first][1].sum(axis=1))
+        seen = Exposer(bench.rig, 1.0, 0).electrons(white(place, first))
+        if bench.geometry.mask == "flatcam":
+            told, seen = centred(told), centred(seen)
+        share = float(np.vdot(told, seen) / np.vdot(seen, seen))
+        found[place] = left / share, right * share
+    return found
 
 
 def _calibrated(session: Session, light: Light, place: float) -> Pair:

@@ -13,12 +13,14 @@ import pytest
 from mitsim.capture.calibrate import estimate
 from mitsim.capture.session import Session
 from mitsim.core.job import Job
+from mitsim.optics.frames import Frame
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.study.experiment import Setup
-from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED, LitScene
+from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, LitScene
+from mitsim.study.ideal import IdealCamera
 from mitsim.study.studio import Studio
-from mitsim.study.sweepcam import MovedMask, calibrated_places, ideal_places, moved
+from mitsim.study.sweepcam import MovedMask, _consistent, calibrated_places, ideal_places, moved
 
 PLACES = (-0.6, 0.0, 0.42)
 """Ten features one way, seven the other [mm]."""
@@ -66,17 +68,21 @@ def test_traced_light_through_a_moved_mask_is_that_of_a_scene_that_states_it(
     assert np.linalg.norm(swapped.irradiance - frame.irradiance) > 0.3 * size
 
 
-@pytest.mark.parametrize(("model", "kind"), [(IDEALISED, "separable"), (IDEALISED, "flatcam"), (RENDERED, "separable")])
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+@pytest.mark.parametrize("model", MODELS)
 def test_factors_of_the_diagonal_explain_every_place(lit: dict[str, LitScene], model: str, kind: str) -> None:
-    """Without noise, Y_ab = Phi_L(a) X Phi_R(b)^T, means taken off for a FlatCam mask. Idealised: to 1e-7, because the
-    window's edges come in single precision, so that rows and columns differ by as much. Rendered: 2 %, twice what
-    noise of factors, falloff and three lines leave at each place, the calibrated ones among them. (Planted: left and
-    right factors swapped; a factor of another place.)"""
+    """Without noise, Y_ab = Phi_L(a) X Phi_R(b)^T, means taken off for a FlatCam mask.
+
+    Idealised: to 1e-7, because the window's edges come in single precision. Rendered: 2 %, twice what noise of factors,
+    falloff and three lines leave at each place, the calibrated ones among them; 25 % for a FlatCam mask, whose 12
+    features over this sensor leave 10 to 16 % at calibrated places. (Planted: left and right factors swapped; a factor
+    of another place; the sign that a session leaves open.)
+    """
     scene = lit[kind]
     ideal = ideal_places(scene.bench, PLACES, scene.board_flux)
     factors = ideal if model == IDEALISED else calibrated_places(scene.bench, PLACES, 3)
     mask = MovedMask(scene, model, factors, 0)
-    allowed = 0.02 if model != IDEALISED else 1e-7
+    allowed = 1e-7 if model == IDEALISED else 0.02 if kind == "separable" else 0.25
     for row, column in product(PLACES, repeat=2):
         told, seen = factors[row][0] @ scene.truth @ factors[column][1].T, rate(mask, row, column)
         if kind == "flatcam":
@@ -135,3 +141,22 @@ def test_factors_have_the_noise_of_a_session(lit: dict[str, LitScene]) -> None:
     noisy, clean = (estimate(frames, Job(), noise_free=free)[0] for free in (False, True))
     for ours, theirs, exact in ((left, noisy.left, clean.left), (right, noisy.right, clean.right)):
         assert np.std(ours - exact) == pytest.approx(np.std(theirs - exact), rel=0.1)
+
+
+def test_how_a_session_shares_its_product_does_not_matter(lit: dict[str, LitScene]) -> None:
+    """Factors times -3 and over -3 at one place, whose products hold between places once more. (Planted: the ratio's
+    other way round.)"""
+    scene = lit["separable"]
+    sound = ideal_places(scene.bench, PLACES, scene.board_flux)
+    odd = {place: (-3 * left, right / -3) if place else (left, right) for place, (left, right) in sound.items()}
+    mask = MovedMask(scene, IDEALISED, sound, 0)
+
+    def white(row: float, column: float) -> Frame:
+        camera = IdealCamera(moved(scene.bench, row, column), "separable")
+        (frame,) = camera.frames(scene.bench.family("uniform"), np.full((16, 16), scene.board_flux))
+        return frame
+
+    found = _consistent(odd, scene.bench, white)
+    for row, column in product(PLACES, repeat=2):
+        told = found[row][0] @ scene.truth @ found[column][1].T
+        np.testing.assert_allclose(told, rate(mask, row, column), rtol=1e-6)
