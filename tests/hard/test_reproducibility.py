@@ -29,7 +29,7 @@ from mitsim.transport.direct import DirectTracer
 from tests.robustness import Recorder
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.robustness("Reproducibility")]
-THREADS = (1, 2, 3, 8)
+THREADS = (1, 3, 8)
 EFFECTS = {"interreflection": True, "ambient": True}
 LAMP_AND_BOX = """
 <shape type="sphere"><point name="center" x="-150" y="150" z="100"/><float name="radius" value="20"/>

@@ -127,6 +127,7 @@ def test_falloff_costs_what_it_takes_from_the_truth(levels: Levels) -> None:
     assert found - noise == pytest.approx(wanted, rel=0.1) and wanted > 3 * noise
 
 
+@pytest.mark.slow
 def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, levels: Levels) -> None:
     """The same draws, rounded or not, of eight bits: images differ by 1/12 DN^2 a datum through the solver, the sum of
     1 / s^2 over the singular values of the idealised model. 3 seeds of 256 pixels tell that to 5 %; three of them are
