@@ -74,7 +74,10 @@ def curves(
             axes.xaxis.set_major_locator(FixedLocator(measured))
             axes.xaxis.set_minor_locator(NullLocator())
             axes.xaxis.set_major_formatter("{x:g}")
-    handles, labels = places[0][0].get_legend_handles_labels()
+    shown_by_name: dict[str, Any] = {}
+    for axes in places[0]:  # a panel may lack curves that another has
+        shown_by_name |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    labels, handles = names, [shown_by_name[name] for name in names]
     figure.legend(
         handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=min(len(labels), 4)
     )
