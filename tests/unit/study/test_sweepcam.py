@@ -16,11 +16,13 @@ from mitsim.core.job import Job
 from mitsim.optics.frames import Frame
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.study.experiment import Setup
+from mitsim.study import find_experiment
+from mitsim.study.experiment import Results, Setup
 from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, LitScene
 from mitsim.study.ideal import IdealCamera
 from mitsim.study.studio import Studio
 from mitsim.study.sweepcam import MovedMask, _consistent, calibrated_places, ideal_places, moved
+from mitsim.study.table import Table
 
 PLACES = (-0.6, 0.0, 0.42)
 """Ten features one way, seven the other [mm]."""
@@ -160,3 +162,22 @@ def test_how_a_session_shares_its_product_does_not_matter(lit: dict[str, LitScen
     for row, column in product(PLACES, repeat=2):
         told = found[row][0] @ scene.truth @ found[column][1].T
         np.testing.assert_allclose(told, rate(mask, row, column), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("gain", "verdict"), [(0.2, "not confirmed"), (0.9, "confirmed")])
+def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
+    """(Planted: any gain above 0.)"""
+    experiment = find_experiment("multishot")
+    frames = {("uniform frames", 1): 22.0, ("uniform frames", 49): 25.0, ("SweepCam", 49): 25.0 + gain}
+    frames |= {("shifting dots", 49): 34.0, ("SweepCam, along rows alone", 49): 25.0}
+    rows = [
+        {"model": model, "exposure": exposure, "patterns": name, "frames": count, "psnr_db": decibels}
+        for (name, count), decibels in frames.items()
+        for model in MODELS
+        for exposure in (EQUAL_PEAK, EQUAL_FRAME)
+    ]
+    *others, moved_or_not = experiment.claims(Results(Table(tuple(rows))))
+    assert moved_or_not.verdict == verdict
+    assert [claim.verdict for claim in others] == [
+        "confirmed", "confirmed", "confirmed only idealised", "confirmed", "confirmed"
+    ]  # fmt: skip
