@@ -17,7 +17,7 @@ from mitsim.reconstruct.alldepths import AllDepths
 from mitsim.reconstruct.depthmap import depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.pixeldepths import PixelDepths
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from tests.ideal_sessions import Bench, picture
 from tests.unit.reconstruct.test_focus import BASELINE, PARALLAX, N, shadow
 
@@ -96,9 +96,12 @@ def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
     assert image.uncertainties is None
 
 
-@pytest.mark.parametrize(("near", "far", "patterns"), [(330.0, 500.0, "dots:4x5"), (370.0, 430.0, "dots:4")])
+@pytest.mark.parametrize(
+    ("near", "far", "patterns"), [(330.0, 500.0, "dots:4x5"), (370.0, 430.0, "dots:4"), (345.0, 470.0, "dots:4x8")]
+)
 def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: float, far: float, patterns: str) -> None:
-    """Parallax of 8.2 pixels under dots 5 apart, and of 3 under dots 4 apart. (Planted: nothing spared; no rivals.)"""
+    """Parallax of 8.2 pixels under dots 5 apart, of 3 under 4 and of 6.2 under 8. (Planted: nothing spared; no
+    rivals.)"""
     run, factors = shots(np.where(cards() < 400, near, far), patterns), calibrated()
     image, before = reconstruct(run, factors, focus="map"), reconstruct(run, factors)
     assert "off by a whole period" in str(image.status) and "longer period along the baseline" in str(image.status)
@@ -113,6 +116,20 @@ def test_dark_pixels_have_no_confidence() -> None:
     assert np.median(found.confidence[:, :8]) < 0.5 < np.quantile(found.confidence[:, 16:], 0.1)
 
 
+def test_misfit_leaves_noise_and_print_to_the_scene() -> None:
+    """Half of what is left beyond the noise may be print: 0.7 of the unexplained part stays, and none if all is.
+    (Planted: the sensor's part over the print's energy.)"""
+    run, factors = shots(cards(), "dots:4x8"), calibrated()
+    found, noise = depth_map(run, factors), accumulated(run, factors).noise
+    plain = found.misfit(noise, 0.0, 0.0)
+    excess = plain.unexplained**2 * found.energy / found.part
+    assert plain.unexplained > 3.5e-3 and plain.flagged and plain.stated
+    assert found.misfit(noise, 0.0, excess / 2).unexplained == pytest.approx(plain.unexplained / 2**0.5, rel=1e-6)
+    assert found.misfit(noise, 0.0, 1.01 * excess).unexplained == 0
+    assert found.misfit(noise, excess, 0.0).unexplained == pytest.approx(0, abs=1e-6)
+    assert not found.misfit(noise, None, 0.0).stated
+
+
 def test_the_step_is_the_derivative() -> None:
     """X o d from the true image is the change of depth that is missing: within a tenth at a twentieth of a pixel.
 
@@ -121,6 +138,12 @@ def test_the_step_is_the_derivative() -> None:
     depths = AllDepths(run, factors, 4e-4)
     model, pixel = PixelDepths(depths, 4e-4, 5e-6), 0.3 / N / 60
     bright = PRINT > 0.5
+    # Columns between those that are computed, 5e-6 apart, and their slopes against differences over a tenth of that.
+    places, shift = np.arange(8, 32), (np.arange(24) - 11.6) * 5e-6
+    for axis in (0, 1):
+        ahead, behind = (model._columns(axis, places, shift + change) for change in (2.5e-7, -2.5e-7))
+        slope = model._columns(axis, places, shift, slope=True)
+        np.testing.assert_allclose(slope * 5e-7, ahead - behind, atol=5e-3 * np.abs(ahead - behind).max())
     for part in (-0.05, 0.05):
         image, moved = model.step(np.full((N, N), part * pixel), pixel)
         change = (moved * image)[bright].sum() / np.square(image)[bright].sum()
