@@ -1,6 +1,6 @@
 """Entry point of the program: the worker process first, and in it the command line, which takes time to import."""
 
-from mitsim.core.worker import end_stopped, enter_worker
+from mitsim.core.worker import end_stopped, enter_worker, stopped
 
 
 def main() -> None:
@@ -12,6 +12,10 @@ def main() -> None:
         run()
     except KeyboardInterrupt:  # before the command line is there to take it
         end_stopped()
+    except Exception:
+        if not stopped():
+            raise
+        end_stopped()  # what an interrupt became on its way, as of a class that was being made
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
@@ -65,6 +66,7 @@ def enter_worker() -> None:
     threading.Thread(target=_end_with_parent, args=(reading,), daemon=True).start()
     for number in _heeded():
         signal.signal(number, _stop)
+    signal.signal(signal.SIGALRM, _again)
     sys.unraisablehook = _unraisable
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
 
@@ -73,6 +75,11 @@ def advise(text: str) -> None:
     """Note what to do, ``text`` without a full stop, should the running command be cut short; empty for nothing."""
     if _advice is not None:
         _advice[:] = text.encode()[:_LONGEST_ADVICE].ljust(_LONGEST_ADVICE, b"\0")
+
+
+def stopped() -> bool:
+    """Whether a signal asked this process to end."""
+    return _stopped_by is not None
 
 
 def end_stopped() -> NoReturn:
@@ -120,13 +127,17 @@ def _stop(number: int, _: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def _again(_: int, __: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
 def _unraisable(lost: sys.UnraisableHookArgs) -> None:
-    """An interrupt that fell into a callback or a destructor, where Python drops it with a traceback, comes again."""
-    if lost.exc_type is not KeyboardInterrupt or _stopped_by is None:
+    """An interrupt that fell into a callback or a destructor, where Python drops it with a traceback, comes again; what
+    else goes wrong while the process is stopped is not told, as that a second signal came too late."""
+    if not stopped():
         sys.__unraisablehook__(lost)
-        return
-    signal.signal(_stopped_by, _stop)
-    threading.Timer(_AGAIN_S, os.kill, (os.getpid(), _stopped_by)).start()
+    elif lost.exc_type is KeyboardInterrupt:
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
 
 
 def _end_with_parent(reading: int) -> None:
@@ -139,13 +150,15 @@ def _watch(child: int) -> NoReturn:
     asked: list[int] = []
 
     def forward(number: int, _: FrameType | None) -> None:
-        os.kill(child, signal.SIGKILL if asked else number)
+        with suppress(ProcessLookupError):  # it ended between the two
+            os.kill(child, signal.SIGKILL if asked else number)
         asked.append(number)
 
     for number in _heeded():
         signal.signal(number, forward)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
     _, status = os.waitpid(child, 0)
+    sys.unraisablehook = lambda _: None  # a signal that comes between the lines that follow came too late
     for number in _STOPS:
         signal.signal(number, signal.SIG_IGN)
     if os.WIFEXITED(status):

@@ -215,7 +215,7 @@ def test_control_c_during_start_up_is_one_line(moment: float, gap: float) -> Non
     with contextlib.suppress(ProcessLookupError):  # it may be over
         os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=20)
-    assert (process.returncode, out) == (130, "")
+    assert (process.returncode, out) == (130, ""), err
     assert set(err.splitlines()) <= {"mitsim: interrupted", "mitsim: stopped at once"} and err
 
 
