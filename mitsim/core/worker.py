@@ -27,6 +27,8 @@ _SPACE_BYTES = 0.7e9
 """Address space in which a command comes to its own check of memory; measured: below, LLVM ends the process."""
 _SPACE_BYTES_PER_PROCESSOR = 85e6
 """What each processor adds, buffers and stacks of two OpenBLAS; measured."""
+_AGAIN_S = 0.01
+"""After which an interrupt that was dropped comes again: the callback that dropped it is over by then."""
 _LONGEST_ADVICE = 256
 """Bytes; chosen so that any sentence fits."""
 
@@ -63,6 +65,7 @@ def enter_worker() -> None:
     threading.Thread(target=_end_with_parent, args=(reading,), daemon=True).start()
     for number in _heeded():
         signal.signal(number, _stop)
+    sys.unraisablehook = _unraisable
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
 
 
@@ -115,6 +118,15 @@ def _stop(number: int, _: FrameType | None) -> None:
     for heeded in _heeded():  # a terminal sends Control-C to both processes, and the parent passes it on
         signal.signal(heeded, signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def _unraisable(lost: sys.UnraisableHookArgs) -> None:
+    """An interrupt that fell into a callback or a destructor, where Python drops it with a traceback, comes again."""
+    if lost.exc_type is not KeyboardInterrupt or _stopped_by is None:
+        sys.__unraisablehook__(lost)
+        return
+    signal.signal(_stopped_by, _stop)
+    threading.Timer(_AGAIN_S, os.kill, (os.getpid(), _stopped_by)).start()
 
 
 def _end_with_parent(reading: int) -> None:

@@ -166,6 +166,27 @@ def test_a_process_with_threads_of_drjit_is_not_split() -> None:
     assert late.returncode == 1 and "do not survive a fork" in late.stderr
 
 
+DROPPED = """
+class Callback:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+try:
+    Callback()
+    time.sleep(30)
+except KeyboardInterrupt:
+    end_stopped()
+"""
+
+
+def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
+    """Python prints a traceback and goes on; so did a program that was stopped while it imported. (Planted: the hook
+    left out.)"""
+    process = start(DROPPED)
+    out, err = process.communicate(timeout=20)
+    assert (out, err, process.returncode) == ("", "mitsim: interrupted\n", 130)
+
+
 MITSIM = [sys.executable, "-m", "mitsim"]
 
 
