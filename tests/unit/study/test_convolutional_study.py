@@ -43,6 +43,15 @@ def test_a_slow_direct_solver_and_dim_dots_are_told() -> None:
     assert EXPERIMENT.claims(results(("rendered",), dots_db=50.0))[1].verdict == "not confirmed"
 
 
+def test_a_cropped_sensor_is_told_apart() -> None:
+    """(Planted: races of both sensors in one ratio.)"""
+    whole = results(("rendered",))
+    cropped = {**whole.table.where(part="speed", patterns=49).rows[0], "sensor": "cropped", "direct_s": 2.0}
+    _, _, _, direct, at_the_edge, _ = EXPERIMENT.claims(Results(Table((*whole.table.rows, cropped))))
+    assert direct.verdict == "confirmed" and at_the_edge.verdict == "not confirmed"
+    assert at_the_edge.rendered == "rendered psf: 2 times as long"
+
+
 def test_a_measured_point_spread_function_is_a_parameter_of_the_study_alone() -> None:
     """No scene is given it, or Mitsuba would refuse it."""
     points = EXPERIMENT.points(Scope(Setup(parameters=(("psf", "psf.tif"), ("sheet_z", "400"))), ("page",), quick=True))
