@@ -76,6 +76,7 @@ def test_a_small_scene_keeps_its_accuracy(small: Bench, small_answer: np.ndarray
     check(small, "dots:4", accuracy, small_answer)
 
 
+@pytest.mark.slow
 def test_a_wrong_plan_is_seen(small: Bench, small_answer: np.ndarray) -> None:
     """The judge itself: without diffraction, or with one layer and anchor, the frames are off by what they change."""
     family = small.family("dots:4").lighting
