@@ -114,12 +114,12 @@ def _claims(results: Results) -> Sequence[Claim]:
     lost = calibrated.first.value - calibrated.last.value
     return [
         Claim(
-            "A calibrated camera gives what the idealised model promises, within 2 dB", "-",
+            "A calibrated camera gives what the idealised model promises, within 2 dB", "",
             f"{calibrated.first} dB", f"{calibrated.last} dB; largest step: {dearest.name}, {dearest.in_order} dB",
             verdict(lost < TOLERANCE_DB),
         ),
         Claim(
-            "A calibrated model is better than the idealised one", "-", f"{assumed.last} dB assumed",
+            "A calibrated model is better than the idealised one", "", f"{assumed.last} dB assumed",
             f"{calibrated.last} dB calibrated", verdict(calibrated.last.value > assumed.last.value),
         ),
     ]  # fmt: skip
