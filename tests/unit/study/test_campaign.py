@@ -112,6 +112,7 @@ def test_a_killed_worker_loses_its_point_only(run: Run, tmp_path: Path, monkeypa
     """And nothing that processes leave in their temporary folders stays. (Planted: their folder the parent's.)"""
     scratch = tmp_path / "scratch"
     scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))  # for the processes
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     (tmp_path / "fatal b2").write_text("once")
     assert not run().missing
