@@ -36,8 +36,13 @@ def found(point: Point, image: FloatArray | None = None, **measured: Value) -> F
 
 
 def shown(image: FloatArray) -> dict[str, FloatArray]:
-    """An ``image`` as findings keep it: single precision shows all that a page can."""
-    return {IMAGE: image.astype("float32")}
+    """An ``image`` as findings keep it: a page shows no more than single precision."""
+    return single({IMAGE: image})
+
+
+def single(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Named ``arrays`` as findings keep them, in single precision."""
+    return {name: array.astype("float32") for name, array in arrays.items()}
 
 
 def imaged(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:

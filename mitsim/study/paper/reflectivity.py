@@ -22,7 +22,7 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, peak_time
 from mitsim.study.gloss import CAUSES, INTERREFLECTION, PIXELS, REST, SATURATION, SENSOR, split
 from mitsim.study.metrics import psnr
-from mitsim.study.paper.measure import verdict
+from mitsim.study.paper.measure import single, verdict
 from mitsim.study.studio import Studio
 from mitsim.study.table import Mean, Table, Value
 
@@ -96,7 +96,7 @@ def _measure(studio: Studio, point: Point) -> Found:
             images[f"{label(name)}, {exposure}"] = image
             if (name, exposure) == _DRAWN:
                 images |= found.parts
-    return Found(tuple(rows), {name: each.astype("float32") for name, each in images.items()})
+    return Found(tuple(rows), single(images))
 
 
 def _factors(studio: Studio, setup: Setup, seed: int) -> Factors:

@@ -27,7 +27,7 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
 from mitsim.study.gloss import direct_of
 from mitsim.study.metrics import psnr
-from mitsim.study.paper.measure import verdict
+from mitsim.study.paper.measure import single, verdict
 from mitsim.study.studio import Studio
 
 SCENES = ("corner", "cookie_bag")
@@ -76,7 +76,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         gain = levels[f"{SEPARATED}_db"] - levels[f"{ALL}_db"]
         rows.append(point.row(depth=depth, gain_db=gain, told=told, **levels))
         arrays |= {f"{depth} {name}": image for name, image in images.items()}
-    return Found(tuple(rows), {name: image.astype("float32") for name, image in arrays.items()})
+    return Found(tuple(rows), single(arrays))
 
 
 def _images(

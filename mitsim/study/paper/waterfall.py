@@ -17,7 +17,7 @@ from mitsim.study.charts import Fall, Step, image_grid, waterfall
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.levels import ASSUMED, CALIBRATED, EFFECTS, MODELS, Levels, Sessions
 from mitsim.study.metrics import psnr
-from mitsim.study.paper.measure import TOLERANCE_DB, verdict
+from mitsim.study.paper.measure import TOLERANCE_DB, single, verdict
 from mitsim.study.pictures import QUICK_IMAGES
 from mitsim.study.studio import Studio
 from mitsim.study.table import Table
@@ -77,7 +77,7 @@ def _kept(
 ) -> dict[str, FloatArray]:
     """Images of the two ends, by model, as findings keep them."""
     ends_of = {EFFECTS[0]: without, EFFECTS[-1]: having} if way == IN_ORDER else {}
-    return {model: image.astype("float32") for model, image in ends_of.get(effect, {}).items()}
+    return single(ends_of.get(effect, {}))
 
 
 def ends(way: str, effect: str) -> tuple[frozenset[str], frozenset[str]]:
