@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import mitsim
-from mitsim.cli.screen import progress_bar
+from mitsim.cli.screen import showing_progress
 from mitsim.core.errors import ArgumentError, MitsimError
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_fi
 
 Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="no progress")]
 Variant = Annotated[
     str,
     typer.Option(
@@ -190,12 +190,12 @@ def number_of(argument: str, text: str, words: Sequence[str] = ("auto",)) -> Any
 
 @contextmanager
 def job_of(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
-    """A job with limits, and a progress bar on stderr while the context lasts.
+    """A job with limits, and progress on stderr while the context lasts.
 
     Parameters
     ----------
     silent_progress
-        no bar.
+        no progress.
     seconds, gibibytes
         longest time [s]; most memory [GiB], nine tenths of what is free if None.
     """
@@ -203,7 +203,7 @@ def job_of(silent_progress: bool, seconds: float = DAY, gibibytes: float | None 
     from mitsim.core.resources import Limits, running_seconds
 
     limits = Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
-    with progress_bar(silent_progress) as progress:
+    with showing_progress(silent_progress) as progress:
         yield Job(Clock(running_seconds()), progress, limits)
 
 

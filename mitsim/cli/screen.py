@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -13,22 +14,42 @@ if TYPE_CHECKING:
     from mitsim.core.arrays import Progress
 
 
+SECONDS_A_LINE = 60.0
+"""Least time between two lines of progress in a log [s]: a run of an hour leaves a page of them, a short one none."""
+
+
 @contextmanager
-def progress_bar(hidden: bool) -> Iterator[Progress]:
-    """A progress bar on stderr; nothing when ``hidden``, or when stderr is no terminal."""
-    if hidden or not sys.stderr.isatty():
+def showing_progress(hidden: bool) -> Iterator[Progress]:
+    """Progress on stderr: a bar on a terminal, else a line a minute; nothing when ``hidden``."""
+    if hidden:
         from mitsim.core.arrays import silent
 
         yield silent
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
+    elif not sys.stderr.isatty():
+        yield _logged()
+    else:
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bar
 
-    columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("starting", total=1.0)
-        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+        columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
+        with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task("starting", total=1.0)
+            yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+
+
+def _logged() -> Progress:
+    """Progress as lines of a log on stderr, the first after :data:`SECONDS_A_LINE`."""
+    written = time.monotonic()
+
+    def line(stage: str, fraction: float) -> None:
+        """Write ``stage``, its finished ``fraction``, if the last line is old enough."""
+        nonlocal written
+        if time.monotonic() - written >= SECONDS_A_LINE:
+            written = time.monotonic()
+            print(f"mitsim: {stage} ({fraction:.0%})", file=sys.stderr, flush=True)
+
+    return line
 
 
 def print_plan(plan: Plan) -> None:
