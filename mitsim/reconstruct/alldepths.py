@@ -13,7 +13,7 @@ from mitsim.core.measurement import Measurement
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import centred, centred_columns
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import moved, pixels_of_parallax, stated_parallax
+from mitsim.reconstruct.focus import Side, stated_parallax
 
 RANGE = 0.25
 """Depths that are looked for, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm moves light by an eighth of
@@ -47,11 +47,12 @@ class AllDepths:
 
     def __init__(self, shots: Capture, factors: Factors, limit: float) -> None:
         self.parallax, self.patterns = stated_parallax(factors), shots.patterns
-        self._sides, self._centre = (factors.left, factors.right), factors.manifest.centre
+        self._sides = tuple(Side(side, self.parallax, axis) for axis, side in enumerate((factors.left, factors.right)))
+        self._centre = factors.manifest.centre
         self._parts, self._bases = [], list[FloatArray]()
-        for axis, side in enumerate(self._sides):
-            shifts = np.linspace(-limit, limit, 2 * int(np.ceil(limit * self.reach(axis))) + 1)
-            found = [moved(side, self.parallax, axis, shift) for shift in (*shifts, -limit, limit)]
+        for side in self._sides:
+            shifts = np.linspace(-limit, limit, 2 * int(np.ceil(limit * side.reach)) + 1)
+            found = [side.at(shift) for shift in (*shifts, -limit, limit)]
             part = slice(max(each.start for _, each in found), min(each.stop for _, each in found))
             self._parts.append(part)
             self._bases.append(_basis([self._own(columns[part]) for columns, _ in found]))
@@ -71,7 +72,7 @@ class AllDepths:
     @property
     def shape(self) -> tuple[int, int]:
         """Scene pixels along both axes."""
-        return self._sides[0].shape[1], self._sides[1].shape[1]
+        return self._sides[0].factor.shape[1], self._sides[1].factor.shape[1]
 
     def side(self, axis: int, shift: float | FloatArray) -> FloatArray:
         """(r, n) factor of an ``axis`` on its basis, 1/z changed by ``shift`` [1/mm] for all pixels or for each."""
@@ -88,18 +89,14 @@ class AllDepths:
 
     def edges(self, axis: int) -> FloatArray:
         """(n,) projector pixels along an ``axis`` that a change of 1/z by 1/mm moves the light of each."""
-        count = self._sides[axis].shape[1]
-        first, last, _ = pixels_of_parallax(self.parallax, axis, count)
-        return np.asarray(np.linspace(first, last, 2 * count + 1)[1::2])
+        return self._sides[axis].edges
 
     def reach(self, axis: int) -> float:
         """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees, along an ``axis``."""
-        rows, count = self._sides[axis].shape
-        first, last, by_place = pixels_of_parallax(self.parallax, axis, count)
-        return float(max(abs(first), abs(last), by_place * rows * self.parallax.pixel_pitch_mm / 2))
+        return self._sides[axis].reach
 
     def _moved(self, axis: int, shift: float | FloatArray) -> FloatArray:
-        return moved(self._sides[axis], self.parallax, axis, shift)[0][self._parts[axis]]
+        return self._sides[axis].at(shift)[0][self._parts[axis]]
 
     def _own(self, columns: FloatArray) -> FloatArray:
         return centred_columns(columns) if self._centre else columns

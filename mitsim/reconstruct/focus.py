@@ -6,7 +6,11 @@ one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_
 Columns change slowly (a mask feature is some ten pixels wide), so values between them are interpolated. Beyond the
 window no column was calibrated; but sensor pixels further on saw the same part of the mask in a column within, at u + v
 and tau - v (1/d - 1/z_0), for any v. Only at the sensor's own edge there is nothing left to see, and these few rows are
-left out, of frames and factors alike. Brightness stays that of the board where it was calibrated.
+left out, of frames and factors alike.
+
+What moves is the shadow, not the light: an image is light relative to the board's, pixel by pixel, so each pixel keeps
+the brightness that it had at z_0, while values are taken from columns that fall off more or less than its own. Sensor
+pixels that see one part of the mask in two columns tell how much.
 """
 
 from __future__ import annotations
@@ -28,6 +32,12 @@ from mitsim.reconstruct.factors import Factors
 _NEIGHBOURS = 4
 """Columns that a cubic takes: of 2 to 8 it leaves least (a sheet at 360 mm, 128 pixels: 3.1e-3, 2.1e-3, 2.1e-3, 2.1e-3
 of the measurements); more neighbours add noise."""
+_DEGREES = (1, 2, 3, 4)
+"""Of the polynomial that brightness over columns is: cos^4 of 8.5 degrees is a parabola to 1e-4."""
+_PAIRS = 32
+"""Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
+_LIT, _BRIGHTEST = 0.6, 0.98
+"""Lit values, which tell brightness: more than so much of the brightest, without a few of noise."""
 _LEAST_PART = 0.5
 """Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
 
@@ -59,8 +69,8 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
             "focus", f"{depth_mm:g}: give a depth above {parallax.mask_distance_mm:g} mm, where the mask is"
         )
     shift = 1 / depth_mm - 1 / parallax.depth_mm
-    left, rows = moved(factors.left, parallax, 0, shift)
-    right, columns = moved(factors.right, parallax, 1, shift)
+    left, rows = Side(factors.left, parallax, 0).at(shift)
+    right, columns = Side(factors.right, parallax, 1).at(shift)
     for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
         if known.stop - known.start < _LEAST_PART * size:
             raise ArgumentError(
@@ -107,34 +117,81 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
     return edges[0] / pixel, edges[1] / pixel, 1 / pixel
 
 
-def moved(factor: FloatArray, parallax: Parallax, axis: int, shift: float | FloatArray) -> tuple[FloatArray, slice]:
-    """The columns of another depth, and the sensor rows where all of them are known.
+@dataclass(frozen=True, eq=False)
+class Side:
+    """A calibrated ``factor`` (m, n), the left one (``axis`` 0) or the right one (1), and how it moves with depth."""
 
-    Parameters
-    ----------
-    factor
-        (m, n) of the calibrated depth.
-    parallax
-        of its calibration.
-    axis
-        0 for the left factor, 1 for the right one.
-    shift
-        1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
-    """
-    rows, count = factor.shape
-    first, last, by_place = pixels_of_parallax(parallax, axis, count)
-    place = (np.arange(rows) - (rows - 1) / 2) * parallax.pixel_pitch_mm
-    edges = np.linspace(first, last, 2 * count + 1)[1::2]  # of pixel centres
-    column = np.arange(count) + (edges - by_place * place[:, None]) * shift
-    # Columns that one sensor pixel's step along the sensor makes up for.
-    step = parallax.pixel_pitch_mm * (1 / parallax.mask_distance_mm - 1 / parallax.depth_mm) * by_place
-    before, beyond = np.ceil(np.maximum(1 - column, 0) / step), np.ceil(np.maximum(column - count + 2, 0) / step)
-    steps = np.where(column < 0, -before, np.where(column > count - 1, beyond, 0)).astype(np.intp)
-    column, row = column - steps * step, np.arange(rows)[:, None] + steps
-    known = ((row >= 0) & (row < rows) & (column >= 0) & (column <= count - 1)).all(axis=1)
-    inside = np.flatnonzero(known)
-    part = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
-    return _cubic(factor, np.clip(row, 0, rows - 1), column), part
+    factor: FloatArray
+    parallax: Parallax
+    axis: int
+
+    def at(self, shift: float | FloatArray) -> tuple[FloatArray, slice]:
+        """The columns of another depth, and the sensor rows where all of them are known.
+
+        Parameters
+        ----------
+        shift
+            1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
+        """
+        rows, count = self.factor.shape
+        place = (np.arange(rows) - (rows - 1) / 2) * self.parallax.pixel_pitch_mm
+        column = np.arange(count) + (self.edges - self._parallax_pixels[2] * place[:, None]) * shift
+        # Columns that one sensor pixel's step along the sensor makes up for.
+        step = self._step
+        before, beyond = np.ceil(np.maximum(1 - column, 0) / step), np.ceil(np.maximum(column - count + 2, 0) / step)
+        steps = np.where(column < 0, -before, np.where(column > count - 1, beyond, 0)).astype(np.intp)
+        column, row = column - steps * step, np.arange(rows)[:, None] + steps
+        known = ((row >= 0) & (row < rows) & (column >= 0) & (column <= count - 1)).all(axis=1)
+        inside = np.flatnonzero(known)
+        part = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+        own = self.brightness / np.interp(column, np.arange(count), self.brightness)
+        return _cubic(self.factor, np.clip(row, 0, rows - 1), column) * own, part
+
+    @property
+    def edges(self) -> FloatArray:
+        """(n,) projector pixels that a change of 1/z by 1/mm moves the light of each."""
+        first, last, _ = self._parallax_pixels
+        return np.asarray(np.linspace(first, last, 2 * self.factor.shape[1] + 1)[1::2])
+
+    @property
+    def reach(self) -> float:
+        """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees."""
+        first, last, by_place = self._parallax_pixels
+        return float(max(abs(first), abs(last), by_place * len(self.factor) * self.parallax.pixel_pitch_mm / 2))
+
+    @cached_property
+    def brightness(self) -> FloatArray:
+        """(n,) how bright each column is, the mask's shadow apart: a polynomial, 1 in the middle of the window."""
+        rows, count = self.factor.shape
+        across = np.linspace(-1, 1, count)
+        powers = np.stack([across**degree for degree in _DEGREES], axis=1)
+        unlike, changes = [np.zeros(1)], [np.zeros((1, len(_DEGREES)))]
+        lit = _LIT * float(np.quantile(self.factor, _BRIGHTEST))
+        apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
+        for offset in (*apart, *-apart):
+            column = np.arange(count) - offset * self._step
+            to = np.flatnonzero((column >= 0) & (column <= count - 1))
+            row = np.arange(max(0, -offset), min(rows, rows - offset))[:, None]
+            own, same = self.factor[row, to], _cubic(self.factor, row + offset, column[to])
+            light = np.where(own + same > 2 * lit, (own + same) / 2, 0.0)
+            weight = np.sqrt(light.sum(axis=0))
+            there = np.interp(column[to], np.arange(count), across)[:, None] ** np.array(_DEGREES)
+            difference = np.where(light > 0, own - same, 0.0).sum(axis=0)
+            unlike.append(np.divide(difference, weight, out=np.zeros(to.size), where=weight > 0))
+            changes.append(weight[:, None] * (powers[to] - there))
+        falloff = np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0]
+        return np.asarray(np.exp(powers @ falloff))
+
+    @property
+    def _parallax_pixels(self) -> tuple[float, float, float]:
+        return pixels_of_parallax(self.parallax, self.axis, self.factor.shape[1])
+
+    @property
+    def _step(self) -> float:
+        """Columns that one pixel's step along the sensor sees the mask's shadow move."""
+        parallax = self.parallax
+        inverse = 1 / parallax.mask_distance_mm - 1 / parallax.depth_mm
+        return parallax.pixel_pitch_mm * inverse * self._parallax_pixels[2]
 
 
 def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from mitsim.core.runs import Capture
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import focused, moved
+from mitsim.reconstruct.focus import Side, focused
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.rig.camera import centred_edges
@@ -72,7 +72,7 @@ def psnr(image: Reconstruction) -> float:
 def test_moved_columns_are_those_of_the_depth(depth: float, axis: int) -> None:
     """Within 0.8 %: a cubic leaves 0.2 to 0.6 % between columns of 5 um. Unmoved ones are 2 to 100 % off."""
     factor, truth = shadow(400.0, axis, FINE), shadow(depth, axis, FINE)
-    found, known = moved(factor, PARALLAX, axis, 1 / depth - 1 / 400)
+    found, known = Side(factor, PARALLAX, axis).at(1 / depth - 1 / 400)
 
     def error(columns: np.ndarray) -> float:
         return float(np.linalg.norm((columns - truth)[known]) / np.linalg.norm(truth[known]))
@@ -83,12 +83,34 @@ def test_moved_columns_are_those_of_the_depth(depth: float, axis: int) -> None:
     assert 0 < PIXELS - (known.stop - known.start) <= 5
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_each_pixel_keeps_its_own_brightness(axis: int) -> None:
+    """Seen from its own column, not from that which lends the shadow. (Planted: brightness moves with the shadow, 1.7 %
+    at the window's edges; half of the falloff.)"""
+    across = np.linspace(-1, 1, FINE)
+    falloff = 1 - 0.05 * across**2 + 0.04 * across
+    noise = np.random.default_rng(axis).normal(0, 2e-3, (PIXELS, FINE))
+    side = Side(shadow(400.0, axis, FINE) * falloff + noise, PARALLAX, axis)
+    np.testing.assert_allclose(side.brightness / side.brightness.mean() * falloff.mean(), falloff, rtol=2e-3)
+    found, known = side.at(1 / 360 - 1 / 400)
+    truth = (shadow(360.0, axis, FINE) * falloff)[known]
+    gain = (found[known] * truth).sum(axis=0) / np.square(truth).sum(axis=0)
+    assert gain == pytest.approx(1.0, abs=4e-3)
+
+
+def test_columns_without_falloff_are_found_even() -> None:
+    """Also where there are few, or next to no light. (Planted: unlit values are compared, too.)"""
+    noise = np.random.default_rng(1).normal(0, 5e-3, (PIXELS, N))
+    assert Side(shadow(400.0, 0) + noise, PARALLAX, 0).brightness == pytest.approx(1.0, abs=5e-3)
+    assert np.array_equal(Side(np.zeros((PIXELS, N)), PARALLAX, 0).brightness, np.ones(N))
+
+
 def test_without_a_baseline_both_sides_of_the_sensor_are_alike() -> None:
     """Only the place on the sensor moves columns then, from its middle. (Planted: half a sensor pixel off it.)"""
     shared = PARALLAX.model_copy(update={"row_mm": (0.0, 0.0)})
     factor = np.random.default_rng(3).random((PIXELS, N))
-    found, known = moved(factor, shared, 0, 1 / 360 - 1 / 400)
-    turned, same = moved(factor[::-1, ::-1], shared, 0, 1 / 360 - 1 / 400)
+    found, known = Side(factor, shared, 0).at(1 / 360 - 1 / 400)
+    turned, same = Side(factor[::-1, ::-1], shared, 0).at(1 / 360 - 1 / 400)
     assert (known.start, known.stop) == (PIXELS - same.stop, PIXELS - same.start)
     np.testing.assert_allclose(turned[::-1, ::-1][known], found[known], rtol=1e-9)
 
@@ -96,9 +118,9 @@ def test_without_a_baseline_both_sides_of_the_sensor_are_alike() -> None:
 def test_depth_may_differ_from_pixel_to_pixel() -> None:
     factor = shadow(400.0, 1)
     shifts = 1 / np.linspace(360, 440, N) - 1 / 400
-    found, known = moved(factor, PARALLAX, 1, shifts)
+    found, known = Side(factor, PARALLAX, 1).at(shifts)
     for pixel in (0, 17, N - 1):
-        alone, _ = moved(factor, PARALLAX, 1, float(shifts[pixel]))
+        alone, _ = Side(factor, PARALLAX, 1).at(float(shifts[pixel]))
         assert np.array_equal(found[known, pixel], alone[known, pixel])
 
 
