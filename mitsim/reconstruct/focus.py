@@ -36,8 +36,6 @@ _DEGREES = (1, 2, 3, 4)
 """Of the polynomial that brightness over columns is: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
 """Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
-_LIT, _BRIGHTEST = 0.6, 0.98
-"""Lit values, which tell brightness: more than so much of the brightest, without a few of noise."""
 _LEAST_PART = 0.5
 """Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
 
@@ -166,17 +164,15 @@ class Side:
         across = np.linspace(-1, 1, count)
         powers = np.stack([across**degree for degree in _DEGREES], axis=1)
         unlike, changes = [np.zeros(1)], [np.zeros((1, len(_DEGREES)))]
-        lit = _LIT * float(np.quantile(self.factor, _BRIGHTEST))
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
         for offset in (*apart, *-apart):
             column = np.arange(count) - offset * self._step
             to = np.flatnonzero((column >= 0) & (column <= count - 1))
             row = np.arange(max(0, -offset), min(rows, rows - offset))[:, None]
             own, same = self.factor[row, to], _cubic(self.factor, row + offset, column[to])
-            light = np.where(own + same > 2 * lit, (own + same) / 2, 0.0)
-            weight = np.sqrt(light.sum(axis=0))
+            weight = np.sqrt(np.maximum((own + same).sum(axis=0) / 2, 0.0))
             there = np.interp(column[to], np.arange(count), across)[:, None] ** np.array(_DEGREES)
-            difference = np.where(light > 0, own - same, 0.0).sum(axis=0)
+            difference = (own - same).sum(axis=0)
             unlike.append(np.divide(difference, weight, out=np.zeros(to.size), where=weight > 0))
             changes.append(weight[:, None] * (powers[to] - there))
         falloff = np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0]

@@ -99,7 +99,7 @@ def test_each_pixel_keeps_its_own_brightness(axis: int) -> None:
 
 
 def test_columns_without_falloff_are_found_even() -> None:
-    """Also where there are few, or next to no light. (Planted: unlit values are compared, too.)"""
+    """Also where there are few, or next to no light. (Planted: compared one way along the sensor only.)"""
     noise = np.random.default_rng(1).normal(0, 5e-3, (PIXELS, N))
     assert Side(shadow(400.0, 0) + noise, PARALLAX, 0).brightness == pytest.approx(1.0, abs=5e-3)
     assert np.array_equal(Side(np.zeros((PIXELS, N)), PARALLAX, 0).brightness, np.ones(N))
