@@ -20,6 +20,8 @@ _CELL = 1.5
 """Inches of an image in a grid, at most: six stand on a page."""
 _LABEL = 1.1
 """Inches beside a grid for the names of its rows."""
+_LETTER = 0.085
+"""Inches of a letter of such a name, on the average."""
 
 _ROW = 0.27
 """Inches of a row of a waterfall: a line of text, and a third of one between two."""
@@ -42,7 +44,7 @@ def curves(
     Parameters
     ----------
     panels
-        curves by name, by the panels' titles.
+        curves by name, by the panels' titles; one without points has its colour all the same.
     x, y
         names of the axes, with units.
     log
@@ -55,7 +57,7 @@ def curves(
     places: Any = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
     for axes, (title, shown) in zip(places[0], panels.items(), strict=True):
-        for name, curve in shown.items():
+        for name, curve in ((name, curve) for name, curve in shown.items() if curve):
             points = sorted((float(number), mean.value, np.nan_to_num(mean.error)) for number, mean in curve.items())
             numbers, means, errors = np.array(points).reshape(-1, 3).T
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
@@ -77,7 +79,8 @@ def curves(
     shown_by_name: dict[str, Any] = {}
     for axes in places[0]:  # a panel may lack curves that another has
         shown_by_name |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-    labels, handles = names, [shown_by_name[name] for name in names]
+    labels = [name for name in names if name in shown_by_name]
+    handles = [shown_by_name[name] for name in labels]
     figure.legend(
         handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=min(len(labels), 4)
     )
@@ -109,7 +112,8 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
             axes.set_xlabel(caption, fontsize=FONT - 2)
             if index == 0:
                 axes.set_title(column, fontsize=FONT - 1)
-        line[0].set_ylabel(name, fontsize=FONT - 1)
+        fits = len(name) * _LETTER <= size + 0.3
+        line[0].set_ylabel(name if fits else name.replace(", ", ",\n"), fontsize=FONT - 1)
     if title:
         figure.suptitle(title, fontsize=FONT)
     return figure

@@ -80,10 +80,7 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     """
     loader = PackageLoader("mitsim.study")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    claims = [claim for section in sections for claim in section.claims]
-    text = environment.get_template("study.html").render(
-        title=title, sections=sections, claims=claims, versions=versions()
-    )
+    text = environment.get_template("study.html").render(title=title, sections=sections, versions=versions())
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
     return path

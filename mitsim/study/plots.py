@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitsim.core.arrays import FloatArray
+from mitsim.study.table import Mean
 
 if TYPE_CHECKING:
     from mitsim.study.solver_cost import SolverRow
@@ -92,14 +93,26 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     return figure
 
 
-def quality_bars(quality: Mapping[str, tuple[float, float]]) -> Figure:
-    """PSNR [dB] by family, a pair of bars each: ``quality`` of the idealised model, and of the rendered light."""
+def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
+    """PSNR [dB] by family, a pair of bars each, with one standard error where there is one.
+
+    Parameters
+    ----------
+    quality
+        of the idealised model, and of the rendered light.
+    title
+        of both.
+    """
     figure, axes = figure_of(0.36 * WIDTH)
     place = np.arange(len(quality), dtype=np.float64)
     looks = (-0.2, "#c7d2de", "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
-    for values, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
-        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label)
+    for means, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
+        values, errors = (np.array([getattr(mean, part) for mean in means]) for part in ("value", "error"))
+        known = None if np.isnan(errors).all() else errors
+        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=known, capsize=3)
         axes.bar_label(bars, fmt="%.1f", fontsize=FONT - 1, padding=2)
+    if title:
+        figure.suptitle(title, fontsize=FONT)
     axes.set_xticks(place, list(quality), fontsize=FONT)
     axes.margins(y=0.14)
     label_axes(axes, "", "PSNR [dB]", grid="y")

@@ -25,6 +25,7 @@ from mitsim.core.pictures import data_uri, grey_png, lightness
 from mitsim.reconstruct.misfit import shown
 from mitsim.study import plots
 from mitsim.study.metrics import Quality
+from mitsim.study.table import Mean
 from mitsim.study.trust import Trust
 
 _DASH = "\N{EN DASH}"
@@ -202,7 +203,7 @@ def _figures(report: ReportData) -> dict[str, Any]:
     if curves:
         figures["singular_values"] = _picture(plots.singular_values(curves))
     both = {
-        f.label: (f.idealised.quality.psnr_db, f.rendered.quality.psnr_db)
+        f.label: (Mean(f.idealised.quality.psnr_db, math.nan, 1), Mean(f.rendered.quality.psnr_db, math.nan, 1))
         for f in report.families
         if f.idealised is not None and f.rendered is not None
     }

@@ -18,7 +18,7 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, Unexposed
 from mitsim.study.paper.measure import by_patterns, found, pictured, verdict
 from mitsim.study.studio import Studio
-from mitsim.study.table import Value
+from mitsim.study.table import Table, Value
 
 RADIANCES = (1.17, 11.7, 117.0, 1170.0, 11700.0)
 """Of the scene's lamp [W m^-2 sr^-1]: that of lamp_bench lights its sheet a hundredth as the projector does, to a
@@ -31,13 +31,16 @@ _SPREAD = (1.0, 99.0)
 def _points(scope: Scope) -> Sequence[Point]:
     own = scope.pictures == (None,)
     setup = scope.setup if own else replace(scope.setup, scene="lamp_bench")
-    seeds = scope.seeds if scope.quick else (*scope.seeds, scope.seeds[0] + 1, scope.seeds[0] + 2)
     return [
-        Point.of(setup.changed(lamp=f"{radiance:g}"), model=RENDERED, patterns=family, exposure=EQUAL_PEAK, seed=seed)
+        Point.of(
+            setup.printed(name).changed(lamp=f"{radiance:g}"),
+            model=RENDERED, patterns=family, exposure=EQUAL_PEAK, seed=seed,
+        )
+        for name in (scope.pictures[:1] if scope.quick else scope.pictures)
         for radiance in scope.chosen(RADIANCES, RADIANCES[::2])
-        for seed in seeds
+        for seed in scope.seeds
         for family in FAMILIES
-    ]
+    ]  # fmt: skip
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -49,10 +52,16 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _ratio(uniform: Unexposed) -> float:
-    """Light of the lamp over the projector's in frames of ``uniform`` light, on the whole sensor, to two digits."""
+    """Light of the lamp over the projector's in frames of ``uniform`` light, on the whole sensor."""
     (white,) = uniform.expected
     lamp = uniform.expected.projector_off.irradiance.sum()
-    return float(f"{lamp / (white.irradiance.sum() - lamp):.2g}")
+    return float(lamp / (white.irradiance.sum() - lamp))
+
+
+def _by_lamp(table: Table) -> Table:
+    """Rows with the lamp's ratio a mean over prints, which differ by a tenth, to two digits."""
+    ratios = {lamp: float(f"{table.mean('ratio', lamp=lamp).value:.2g}") for lamp in table.distinct("lamp")}
+    return Table(tuple({**row, "ratio": ratios[row["lamp"]]} for row in table.rows))
 
 
 def _range(frames: Unexposed) -> tuple[float, float]:
@@ -65,7 +74,7 @@ def _range(frames: Unexposed) -> tuple[float, float]:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    table = results.table
+    table = _by_lamp(results.table)
     ratios = table.distinct("ratio")
     least, most = ratios[0], ratios[-1]
     strong = next((ratio for ratio in ratios if ratio >= 1), most)
@@ -106,7 +115,7 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table = results.table
+    table = _by_lamp(results.table)
     axis, lines = "lamp's light over the projector's [1]", by_patterns(table)
 
     def panel(title: str, column: str, said: str) -> Figure:

@@ -11,7 +11,7 @@ from mitsim.study.experiment import IMAGE, Claim, Found, Point, Results
 from mitsim.study.exposures import EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.study.pictures import QUICK_IMAGES
 from mitsim.study.studio import Studio
-from mitsim.study.table import Table, Value
+from mitsim.study.table import Mean, Table, Value
 
 TOLERANCE_DB = 2.0
 """How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""
@@ -176,10 +176,9 @@ def verdict(holds: bool) -> str:
     return "confirmed" if holds else "not confirmed"
 
 
-def bars(lines: Lines, column: str = "psnr_db") -> Mapping[str, tuple[float, float]]:
+def bars(lines: Lines, column: str = "psnr_db") -> Mapping[str, tuple[Mean, Mean]]:
     """Means of a ``column`` in both models, by the names of ``lines``."""
-    means = {
-        name: [rows.where(model=model).mean(column).value for model in (IDEALISED, RENDERED)]
-        for name, rows in lines.items()
+    both = {
+        name: [rows.where(model=model).mean(column) for model in (IDEALISED, RENDERED)] for name, rows in lines.items()
     }
-    return {name: (idealised, rendered) for name, (idealised, rendered) in means.items()}
+    return {name: (idealised, rendered) for name, (idealised, rendered) in both.items()}

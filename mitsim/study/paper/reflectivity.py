@@ -173,7 +173,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
 def _curves(rows: Table) -> dict[str, dict[Value, Mean]]:
     """PSNR of the image, and of an image with the errors of one cause alone, by roughness."""
     columns = {"psnr_matt_db": "image", **{f"{cause}_db": f"{name} alone" for cause, name in _NAMES.items()}}
-    return {name: rows.means(column, "roughness") for column, name in columns.items() if rows.numbers(column)}
+    return {name: rows.means(column, "roughness") for column, name in columns.items()}
 
 
 def _truths(results: Results, row: Mapping[str, Value]) -> list[tuple[FloatArray, str]]:

@@ -93,15 +93,21 @@ def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
 
     def rises(rows: Table) -> tuple[str, bool]:
-        finest = {name: _limit(of_family) for name, of_family in by_patterns(rows).items()}
-        said = ", ".join(f"{name.lower()} {limit:g}" for name, limit in finest.items())
-        return said, all(fewer <= more for fewer, more in pairwise(finest.values()))
+        limits = {name: _limit(of_family) for name, of_family in by_patterns(rows).items()}
+        fine = by_patterns(rows.where(pairs_a_mm=_FINEST))
+        kept = {name: of_family.mean("contrast").value for name, of_family in fine.items()}
+        said = ", ".join(f"{name.lower()} {limits[name]:g} ({kept[name]:.2f})" for name in limits)
+        one, *_, most = kept.values()
+        return said, all(fewer <= more for fewer, more in pairwise(limits.values())) and one < most
 
     def apart(rows: Table) -> tuple[str, bool]:
         dots = rows.where(patterns="dots:7")
         return f"contrast {dots.mean('contrast', pairs_a_mm=_FINEST).value:.2f}", _limit(dots) >= _FINEST
 
-    resolution = "Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm)"
+    resolution = (
+        f"Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; contrast at "
+        f"{_FINEST})"
+    )
     return [
         judged(table, resolution, "rises", rises),
         judged(table, f"49 patterns tell {_FINEST} line pairs a mm apart", "told apart", apart),

@@ -10,6 +10,7 @@ import numpy as np
 
 from mitsim.study import plots
 from mitsim.study.solver_cost import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
+from mitsim.study.table import Mean
 
 SOLVER_ROWS = [
     SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
@@ -24,7 +25,7 @@ def test_every_axis_has_a_unit() -> None:
         plots.singular_values({"a": np.ones(3)}),
         plots.error_bars({"a": 1e-3}, 1e-2),
         plots.seconds_by_stage({"a": 1.0}),
-        plots.quality_bars({"a": (20.0, 10.0)}),
+        plots.quality_bars({"a": (Mean(20.0, 1.0, 8), Mean(10.0, float("nan"), 1))}),
         plots.pareto({"a": [(1.0, 0.1)]}),
         plots.error_bars({"a": 1e-3}, None, {"a": 0.1}),
         plots.solver_costs(SOLVER_ROWS),
