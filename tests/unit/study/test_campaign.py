@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.study import campaign
 from mitsim.study.campaign import CampaignResult, Where, merge, run_experiment
 from mitsim.study.experiment import Scope, Setup
+from mitsim.study.page import build_page
 from mitsim.study.points import Shard
 
 TOY = "tests.unit.study.toy_study"
@@ -106,6 +108,17 @@ def test_all_studies_are_sharded_and_merged_too(run: Run, tmp_path: Path, monkey
     assert "Two squared is four" in (tmp_path / "whole" / "all.html").read_text()
     run("alone")
     assert contents(tmp_path / "whole" / TOY) == contents(tmp_path / "alone")
+
+
+def test_a_page_of_several_has_each_claim_under_its_command(run: Run, tmp_path: Path) -> None:
+    """(Planted: one table without commands.)"""
+    section = run("one").section
+    assert section
+    page = build_page([section, replace(section, command="mitsim study other")], tmp_path / "page.html", "Two")
+    summary = page.read_text().split("<h2")[1]
+    first, second = (summary.index(f"<code>{each}</code>") for each in (section.command, "mitsim study other"))
+    claim = summary.index("Two squared is four")
+    assert first < claim < second < summary.index("Two squared is four", claim + 1)
 
 
 def test_a_killed_worker_loses_its_point_only(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,23 @@ def test_curves_are_in_the_order_of_their_numbers() -> None:
     assert figure.axes[0].get_xlabel() == "x [mm]" and figure.axes[0].get_ylabel() == "PSNR [dB]"
 
 
+def test_a_curve_without_points_keeps_its_colour_from_others() -> None:
+    """So that a cause looks alike in two figures, of which one lacks another; and it has no line in the legend.
+    (Planted: colours by the curves that there are.)"""
+    there = {"1": Mean(1.0, 0.1, 2)}
+    with_all, without = (curves({"": {"a": there, "b": middle, "c": there}}, "x [mm]") for middle in (there, {}))
+    colours = [figure.axes[0].containers[-1].lines[0].get_color() for figure in (with_all, without)]
+    assert colours[0] == colours[1]
+    assert [text.get_text() for text in without.legends[0].get_texts()] == ["a", "c"]
+
+
+def test_long_names_of_rows_take_two_lines() -> None:
+    """(Planted: one; "49 dots, idealised" then ran into the next row's beside small images.)"""
+    cells = [(np.zeros((4, 4)), "")] * 8
+    figure = image_grid({"49 dots, idealised": cells, "card": cells}, [""] * 8)
+    assert [axes.get_ylabel() for axes in figure.axes[::8]] == ["49 dots,\nidealised", "card"]
+
+
 def test_a_grid_has_a_title_of_its_own_and_one_for_each_column() -> None:
     """(Planted: the last column's for the whole.)"""
     cells = [(np.full((4, 4), value), f"{value} dB") for value in (0.2, 0.8)]
