@@ -13,7 +13,7 @@ from mitsim.core.measurement import Measurement
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import centred, centred_columns
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import Side, stated_parallax
+from mitsim.reconstruct.focus import FactorOfDepths, stated_parallax
 
 RANGE = 0.25
 """Depths that are looked for, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm moves light by an eighth of
@@ -47,7 +47,9 @@ class AllDepths:
 
     def __init__(self, shots: Capture, factors: Factors, limit: float) -> None:
         self.parallax, self.patterns = stated_parallax(factors), shots.patterns
-        self._sides = tuple(Side(side, self.parallax, axis) for axis, side in enumerate((factors.left, factors.right)))
+        self._sides = tuple(
+            FactorOfDepths(side, self.parallax, axis) for axis, side in enumerate((factors.left, factors.right))
+        )
         self._centre = factors.manifest.centre
         self._parts, self._bases = [], list[FloatArray]()
         for side in self._sides:

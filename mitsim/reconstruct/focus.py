@@ -67,8 +67,8 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
             "focus", f"{depth_mm:g}: give a depth above {parallax.mask_distance_mm:g} mm, where the mask is"
         )
     shift = 1 / depth_mm - 1 / parallax.depth_mm
-    left, rows = Side(factors.left, parallax, 0).at(shift)
-    right, columns = Side(factors.right, parallax, 1).at(shift)
+    left, rows = FactorOfDepths(factors.left, parallax, 0).at(shift)
+    right, columns = FactorOfDepths(factors.right, parallax, 1).at(shift)
     for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
         if known.stop - known.start < _LEAST_PART * size:
             raise ArgumentError(
@@ -116,7 +116,7 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class FactorOfDepths:
     """A calibrated ``factor`` (m, n), the left one (``axis`` 0) or the right one (1), and how it moves with depth."""
 
     factor: FloatArray
@@ -134,16 +134,31 @@ class Side:
         rows, count = self.factor.shape
         place = (np.arange(rows) - (rows - 1) / 2) * self.parallax.pixel_pitch_mm
         column = np.arange(count) + (self.edges - self._parallax_pixels[2] * place[:, None]) * shift
+        shadows, known = self._seen(column, np.arange(count))
+        inside = np.flatnonzero(known.all(axis=1))
+        return shadows, slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+
+    def beyond(self, margin: int) -> FloatArray:
+        """(m, ``margin`` + n + ``margin``) columns at the calibrated depth, with those beside the window, which no
+        projector pixel lights; what there is to see beyond the sensor's edge is taken from the last pixel."""
+        rows, count = self.factor.shape
+        column = np.arange(-margin, count + margin)
+        return self._seen(np.broadcast_to(column, (rows, column.size)), column)[0]
+
+    def _seen(
+        self, column: npt.NDArray[np.floating | np.integer], own: npt.NDArray[np.integer]
+    ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """Shadows (m, k) of places between columns, also beside the window, with the brightness of the columns ``own``
+        (k,); and whether the sensor sees them."""
+        rows, count = self.factor.shape
         # Columns that one sensor pixel's step along the sensor makes up for.
         step = self._step
-        before, beyond = np.ceil(np.maximum(1 - column, 0) / step), np.ceil(np.maximum(column - count + 2, 0) / step)
-        steps = np.where(column < 0, -before, np.where(column > count - 1, beyond, 0)).astype(np.intp)
-        column, row = column - steps * step, np.arange(rows)[:, None] + steps
-        known = ((row >= 0) & (row < rows) & (column >= 0) & (column <= count - 1)).all(axis=1)
-        inside = np.flatnonzero(known)
-        part = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
-        own = self.brightness / np.interp(column, np.arange(count), self.brightness)
-        return _cubic(self.factor, np.clip(row, 0, rows - 1), column) * own, part
+        before, after = np.ceil(np.maximum(1 - column, 0) / step), np.ceil(np.maximum(column - count + 2, 0) / step)
+        steps = np.where(column < 0, -before, np.where(column > count - 1, after, 0)).astype(np.intp)
+        within, row = column - steps * step, np.arange(rows)[:, None] + steps
+        known = (row >= 0) & (row < rows) & (within >= 0) & (within <= count - 1)
+        brightness = self._brightness(own) / self._brightness(within)
+        return _cubic(self.factor, np.clip(row, 0, rows - 1), within) * brightness, known
 
     @property
     def edges(self) -> FloatArray:
@@ -157,12 +172,23 @@ class Side:
         first, last, by_place = self._parallax_pixels
         return float(max(abs(first), abs(last), by_place * len(self.factor) * self.parallax.pixel_pitch_mm / 2))
 
-    @cached_property
+    @property
     def brightness(self) -> FloatArray:
-        """(n,) how bright each column is, the mask's shadow apart: a polynomial, 1 in the middle of the window."""
+        """(n,) how bright each column is, the mask's shadow apart; 1 in the middle of the window."""
+        return self._brightness(np.arange(self.factor.shape[1]))
+
+    def _brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
+        return np.asarray(np.exp(self._powers(column) @ self._falloff))
+
+    def _powers(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
+        """(..., degrees) of places from the window's middle, its edges being 1 away."""
+        middle = (self.factor.shape[1] - 1) / 2
+        return np.asarray(((column - middle) / middle)[..., None] ** np.array(_DEGREES))
+
+    @cached_property
+    def _falloff(self) -> FloatArray:
+        """Coefficients of the polynomial that the logarithm of brightness is."""
         rows, count = self.factor.shape
-        across = np.linspace(-1, 1, count)
-        powers = np.stack([across**degree for degree in _DEGREES], axis=1)
         unlike, changes = [np.zeros(1)], [np.zeros((1, len(_DEGREES)))]
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
         for offset in (*apart, *-apart):
@@ -171,12 +197,10 @@ class Side:
             row = np.arange(max(0, -offset), min(rows, rows - offset))[:, None]
             own, same = self.factor[row, to], _cubic(self.factor, row + offset, column[to])
             weight = np.sqrt(np.maximum((own + same).sum(axis=0) / 2, 0.0))
-            there = np.interp(column[to], np.arange(count), across)[:, None] ** np.array(_DEGREES)
             difference = (own - same).sum(axis=0)
             unlike.append(np.divide(difference, weight, out=np.zeros(to.size), where=weight > 0))
-            changes.append(weight[:, None] * (powers[to] - there))
-        falloff = np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0]
-        return np.asarray(np.exp(powers @ falloff))
+            changes.append(weight[:, None] * (self._powers(to) - self._powers(column[to])))
+        return np.asarray(np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0])
 
     @property
     def _parallax_pixels(self) -> tuple[float, float, float]:

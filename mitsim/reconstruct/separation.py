@@ -32,10 +32,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import Parallax
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.focus import pixels_of_parallax
-from mitsim.reconstruct.sides import IndexArray, Side
+from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
 
 _LEAST_TOLD = 1e-3
@@ -77,7 +75,8 @@ def separate(
     model
         the factorised model of these patterns.
     seen
-        Phi_L (m, n + 2 w) and Phi_R (m', n' + 2 w'): factors with w columns of :func:`widened` on either side, or none.
+        Phi_L (m, n + 2 w) and Phi_R (m', n' + 2 w'): factors with w columns beside the window on either side, as
+        :meth:`mitsim.reconstruct.focus.FactorOfDepths.beyond` makes them, or none.
     patterns
         P_L (n, K) and P_R (n', K'), shifting dots.
     weights, total
@@ -109,45 +108,6 @@ def separate(
     )
     part = float(np.prod([side.mean() for side in patterns]))
     return Separation(bases[0] @ found @ bases[1].T, left @ found @ right.T / part, told)
-
-
-def widened(factor: FloatArray, parallax: Parallax, axis: int, margin: int) -> FloatArray:
-    """A calibrated ``factor`` (m, n) with ``margin`` columns more on either side, which no projector pixel lights.
-
-    A sensor pixel sees them through the part of the mask that another, further on, sees the window's last column
-    through; what there is to see beyond the sensor's own edge is taken from the last pixel.
-
-    Parameters
-    ----------
-    factor, parallax
-        of a calibration.
-    axis
-        0 for the left factor, 1 for the right one.
-    margin
-        columns, w.
-    """
-    rows, count = factor.shape
-    step = (
-        parallax.pixel_pitch_mm
-        * (1 / parallax.mask_distance_mm - 1 / parallax.depth_mm)
-        * pixels_of_parallax(parallax, axis, count)[2]
-    )
-    beyond = np.arange(1, margin + 1)
-    steps = np.ceil(beyond / step).astype(np.intp)
-    # Whole sensor pixels lead to places between columns within.
-    inside = np.stack([beyond[::-1] * -1 + steps[::-1] * step, count - 1 + beyond - steps * step])
-    sides = [
-        _between(factor, np.clip(np.arange(rows)[:, None] + sign * move, 0, rows - 1), place)
-        for sign, move, place in zip((-1, 1), (steps[::-1], steps), inside, strict=True)
-    ]
-    return np.concatenate([sides[0], factor, sides[1]], axis=1)
-
-
-def _between(factor: FloatArray, row: IndexArray, place: FloatArray) -> FloatArray:
-    """``factor`` at rows (m, w) and at ``place`` (w,) between columns, linearly."""
-    first = np.clip(np.floor(place).astype(np.intp), 0, factor.shape[1] - 2)
-    part = place - first
-    return np.asarray((1 - part) * factor[row, first] + part * factor[row, first + 1])
 
 
 def _inside(hats: FloatArray, pixels: int) -> FloatArray:

@@ -18,8 +18,8 @@ from mitsim.capture.light import Light
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.accumulator import Accumulator
-from mitsim.reconstruct.focus import stated_parallax
-from mitsim.reconstruct.separation import separate, widened
+from mitsim.reconstruct.focus import FactorOfDepths, stated_parallax
+from mitsim.reconstruct.separation import separate
 from mitsim.reconstruct.solver import Prepared
 from mitsim.rig.patterns import Shot
 from mitsim.study.charts import image_grid
@@ -63,7 +63,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         raise MitsimError(f"study separation: light over several surfaces is not worth following in {point['subject']}")
     parallax = stated_parallax(studio.factors(point.setup, int(point["seed"])))
     margin = _MARGIN * max(frames.family.left.shape[1], frames.family.right.shape[1])
-    seen = widened(frames.sides[0], parallax, 0, margin), widened(frames.sides[1], parallax, 1, margin)
+    left, right = (FactorOfDepths(factor, parallax, axis).beyond(margin) for axis, factor in enumerate(frames.sides))
     electrons = frames.exposer(1.0).electrons
     direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected(RENDERED, frames.family)]
     bounced = [electrons(frame) - own for frame, own in zip(frames.expected, direct, strict=True)]
@@ -71,7 +71,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     rows, arrays = [], {"direct, true": lit.truth, "global, true": known}
     for depth in DEPTHS:
         own = direct if depth == AS_IT_IS else [_modelled(frames, shot) for shot in frames.family.shots]
-        images, told = _images(frames, own, bounced, seen)
+        images, told = _images(frames, own, bounced, (left, right))
         levels = {f"{name}_db": psnr(image, known if name == GLOBAL else lit.truth) for name, image in images.items()}
         gain = levels[f"{SEPARATED}_db"] - levels[f"{ALL}_db"]
         rows.append(point.row(depth=depth, gain_db=gain, told=told, **levels))

@@ -11,14 +11,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import Parallax
-from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.separation import Separation, separate, widened
+from mitsim.reconstruct.separation import Separation, separate
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
 from mitsim.rig.patterns import PatternFamily, parse_patterns
-from tests.ideal_sessions import PITCH, PIXELS, picture, shadow
+from tests.ideal_sessions import picture, shadow
 
 N = 32
 FACTOR = shadow(n=N)
@@ -93,19 +89,3 @@ def test_uniform_light_tells_nothing() -> None:
         weights = np.ones((N, N))
         with pytest.raises(MitsimError, match=said):
             separate(model, (FACTOR, FACTOR), sides_of(family), weights, np.sum(frames, axis=0))
-
-
-def test_columns_beyond_the_window_are_the_shadow_there() -> None:
-    """Against the shadow worked out for a wider window, away from the sensor's own ends. Columns of 3.75 mm are
-    interpolated linearly, which leaves up to 4 % of a feature's contrast. (Planted: left and right exchanged.)"""
-    margin = 6
-    edges = centred_edges(N + 2 * margin, 120 / N)
-    wide = scene_factor(mls_mask().terms[0][1], 0.06, centred_edges(PIXELS, PITCH), edges, 2.0, 400.0)
-    parallax = Parallax(
-        depth_mm=400.0, row_tan=(-0.15, 0.15), column_tan=(-0.15, 0.15), row_mm=(0.0, 0.0), column_mm=(0.0, 0.0),
-        pixel_pitch_mm=PITCH, mask_distance_mm=2.0,
-    )  # fmt: skip
-    found = widened(wide[:, margin:-margin], parallax, 1, margin)
-    inner = slice(8, -8)
-    np.testing.assert_allclose(found[:, margin:-margin], wide[:, margin:-margin])
-    assert rms((found - wide)[inner]) < 0.05 * float(wide.std())
