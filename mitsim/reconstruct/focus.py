@@ -32,7 +32,7 @@ from mitsim.reconstruct.factors import Factors
 _NEIGHBOURS = 4
 """Columns that a cubic takes: of 2 to 8 it leaves least (a sheet at 360 mm, 128 pixels: 3.1e-3, 2.1e-3, 2.1e-3, 2.1e-3
 of the measurements); more neighbours add noise."""
-_DEGREES = (1, 2, 3, 4)
+_DEGREE = 4
 """Of the polynomial that brightness over columns is: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
 """Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
@@ -178,18 +178,18 @@ class FactorOfDepths:
         return self._brightness(np.arange(self.factor.shape[1]))
 
     def _brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        return np.asarray(np.exp(self._powers(column) @ self._falloff))
+        return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
 
-    def _powers(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        """(..., degrees) of places from the window's middle, its edges being 1 away."""
+    def _across(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
+        """Places from the window's middle, its edges being 1 away."""
         middle = (self.factor.shape[1] - 1) / 2
-        return np.asarray(((column - middle) / middle)[..., None] ** np.array(_DEGREES))
+        return np.asarray((column - middle) / middle)
 
     @cached_property
     def _falloff(self) -> FloatArray:
-        """Coefficients of the polynomial that the logarithm of brightness is."""
+        """(degrees + 1,) coefficients of the polynomial that the logarithm of brightness is; that of degree 0 is 0."""
         rows, count = self.factor.shape
-        unlike, changes = [np.zeros(1)], [np.zeros((1, len(_DEGREES)))]
+        unlike, changes = [np.zeros(1)], [np.zeros((1, _DEGREE + 1))]
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
         for offset in (*apart, *-apart):
             column = np.arange(count) - offset * self._step
@@ -199,7 +199,8 @@ class FactorOfDepths:
             weight = np.sqrt(np.maximum((own + same).sum(axis=0) / 2, 0.0))
             difference = (own - same).sum(axis=0)
             unlike.append(np.divide(difference, weight, out=np.zeros(to.size), where=weight > 0))
-            changes.append(weight[:, None] * (self._powers(to) - self._powers(column[to])))
+            powers = [np.polynomial.polynomial.polyvander(self._across(place), _DEGREE) for place in (to, column[to])]
+            changes.append(weight[:, None] * (powers[0] - powers[1]))
         return np.asarray(np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0])
 
     @property

@@ -106,7 +106,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     losses = {baseline: lost(ideal.where(baseline=baseline)) for baseline in ideal.distinct("baseline")}
     rendered = lost(table.where(model=RENDERED, patterns="dots:7", focus=NONE))
     robust = [baseline for baseline, loss in losses.items() if loss <= _ROBUST_DB]
-    told = ", ".join(f"{loss:.1f} dB at {baseline:g} mm" for baseline, loss in losses.items())
+    told = ", ".join(f"{round(loss, 1) + 0:.1f} dB at {baseline:g} mm" for baseline, loss in losses.items())
     everywhere = rendered <= _ROBUST_DB and len(robust) == len(losses)
     apart = f"at most {max(robust):g} mm apart" if any(robust) else "co-located"
     only = f"confirmed only if camera and projector are {apart}" if robust else "not confirmed"
