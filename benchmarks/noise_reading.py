@@ -1,6 +1,6 @@
 """Which reading of the paper's noise formula gives its decibels: all light levels and read noises, three lambdas.
 
-    python benchmarks/noise_reading.py [--json FILE]
+    python benchmarks/noise_reading.py [--json FILE] [--distance 2]
 
 The paper draws Y_n = G/F (Poisson(F/G Y) + N(0, s^2)), s = F 10^(-R/20), and states neither F, G and R nor the scale of
 Y: what counts is how many electrons the brightest pixel has (of each frame: equal peak; of uniform light's: equal
@@ -11,7 +11,8 @@ everything, as a constant in a program would be, relative to each model's larges
 
 Expected squared error of the Tikhonov image in closed form, bias plus variance, noise taken for white with the mean
 variance of all frames; means over eight test images in the idealised model. Printed is, for each convention, lambda and
-brightness of the images, the reading that is nearest to all four bands, and how far outside of them it is [dB].
+brightness of the images, the reading that is nearest to all four bands, and how far outside of them it is [dB]; with
+``--distance`` to the two bands of that distance alone.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ def decibels(squared: np.ndarray, rule: str) -> np.ndarray:
 def outside(found: dict[tuple[float, int], np.ndarray]) -> np.ndarray:
     """Largest distance of four figures from their bands [dB]."""
     return np.max(
-        [np.maximum(0, np.maximum(low - found[key], found[key] - high)) for key, (low, high) in BANDS.items()], axis=0
+        [np.maximum(0, np.maximum(BANDS[key][0] - psnr, psnr - BANDS[key][1])) for key, psnr in found.items()], axis=0
     )
 
 
@@ -121,7 +122,7 @@ def aligned(psnr: np.ndarray, one: Case, first: Case) -> np.ndarray:
 def nearest(cases: dict[tuple[float, int], Case], convention: str, rule: str) -> dict[str, object]:
     """The reading that is nearest to all bands."""
     best: dict[str, object] = {"outside_db": np.inf}
-    first = cases[2.0, 1]
+    first = next(iter(cases.values()))
     for electrons in ELECTRONS:
         by_case = {
             key: list(errors(one, cases[key[0], 1], key[1], convention, electrons)) for key, one in cases.items()
@@ -144,11 +145,13 @@ def nearest(cases: dict[tuple[float, int], Case], convention: str, rule: str) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="write all readings to this file")
+    parser.add_argument("--distance", type=float, choices=[2.0, 0.75], help="of the mask [mm]; both if not given")
     options = parser.parse_args()
-    factors, rows = {distance: factor_at(distance) for distance, _ in BANDS}, []
+    bands = [key for key in BANDS if options.distance in (None, key[0])]
+    factors, rows = {distance: factor_at(distance) for distance, _ in bands}, []
     for brightness in BRIGHTNESS:
         shown = images(brightness)
-        cases = {(distance, k): case(factors[distance], k, shown) for distance, k in BANDS}
+        cases = {(distance, k): case(factors[distance], k, shown) for distance, k in bands}
         for convention in CONVENTIONS:
             for rule in RULES:
                 row = {

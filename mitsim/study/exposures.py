@@ -5,7 +5,7 @@ its own exact factors. Both have the same truth and sensor.
 
 Exposure conventions: *equal peak* exposes each family so that its brightest pixel fills the same part of the full well;
 *equal frame* gives every frame the exposure of uniform light; *equal total* shares that exposure among the family's
-frames.
+frames. *A peak of 5600 electrons* is an equal peak that is dim.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ from mitsim.study.ideal import IdealCamera, Plane
 from mitsim.study.metrics import Quality, psnr
 
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
+DIM_E = 5600
+"""Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
+dots, mask at 2000 um: 22.8 and 34.8 (`benchmarks/noise_reading.py --distance 2`)."""
+DIM = f"a peak of {DIM_E} electrons"
 IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
 LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
 """Of the largest sigma^2: where none can be chosen by the data, the best of these, a quarter of a decade apart."""
@@ -156,9 +160,10 @@ class Unexposed:
         return self.lit.expected(self.model, self.family, self.plane)
 
     def seconds(self, exposure: str) -> float:
-        """Exposure time [s] of each frame by the convention ``exposure``, one of :data:`CONVENTIONS`."""
-        if exposure == EQUAL_PEAK:
-            return peak_time(self.lit.bench, self.expected)
+        """Exposure time [s] of each frame by the convention ``exposure``, one of :data:`CONVENTIONS` or :data:`DIM`."""
+        if exposure in (EQUAL_PEAK, DIM):
+            peak_e = Exposure().fraction * self.lit.bench.sensor.superpixel_full_well_e
+            return peak_time(self.lit.bench, self.expected) * (DIM_E / peak_e if exposure == DIM else 1.0)
         return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
 
     def prepared(self, binning: int = 1) -> Prepared:

@@ -178,7 +178,7 @@ class Studio:
         seed
             of the frames' noise, and of the calibration's.
         exposure
-            one of :data:`mitsim.study.exposures.CONVENTIONS`.
+            one of :data:`mitsim.study.exposures.CONVENTIONS`, or ``DIM``.
         focus
             of rendered frames, as for :func:`mitsim.reconstruct`.
         """

@@ -11,7 +11,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import scene_factor
 from mitsim.rig.mask import mls_mask
 from mitsim.study.experiment import Setup
-from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
+from mitsim.study.exposures import DIM, DIM_E, EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.study.ideal import Plane
 from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
 from mitsim.study.studio import Image, Studio
@@ -77,7 +77,10 @@ def test_exposures_follow_their_conventions(studio: Studio, setup: Setup, model:
     assert studio.image(setup, model, "dots:4", exposure=EQUAL_FRAME).exposure_s == pytest.approx(uniform)
     assert studio.image(setup, model, "dots:4", exposure=EQUAL_TOTAL).exposure_s == pytest.approx(uniform / 16)
     assert studio.image(setup, model, "hadamard:2", exposure=EQUAL_TOTAL).exposure_s == pytest.approx(uniform / 8)
-    assert studio.image(setup, model, "dots:4", exposure=EQUAL_PEAK).exposure_s > 5 * uniform
+    peak = studio.image(setup, model, "dots:4", exposure=EQUAL_PEAK).exposure_s
+    assert peak > 5 * uniform
+    dim, well = studio.image(setup, model, "dots:4", exposure=DIM), studio.bench(setup).sensor.superpixel_full_well_e
+    assert dim.exposure_s == pytest.approx(peak * DIM_E / (0.8 * well))
 
 
 def test_light_and_factors_are_made_once(studio: Studio, setup: Setup) -> None:
