@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
@@ -85,9 +86,12 @@ def stopped() -> bool:
 def end_stopped() -> NoReturn:
     """Say what stopped this process, and what to do, and exit with 128 + the signal's number."""
     number = signal.Signals(_stopped_by or signal.SIGINT)
-    ending = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
-    _say(_with_advice(ending))
+    _say(_with_advice(_ending(number)))
     sys.exit(128 + number)
+
+
+def _ending(number: signal.Signals) -> str:
+    return "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
 
 
 def _with_advice(text: str) -> str:
@@ -164,13 +168,15 @@ def _watch(child: int) -> NoReturn:
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
     killer = os.WTERMSIG(status)
-    _say(_obituary(signal.Signals(killer).name, bool(asked)))
+    _say(_obituary(signal.Signals(killer), asked))
     os._exit(128 + (asked[0] if asked else killer))
 
 
-def _obituary(name: str, asked: bool) -> str:
+def _obituary(killer: signal.Signals, asked: Sequence[int]) -> str:
+    """Why the worker is gone that was ``asked`` to end by these signals, and what to do."""
     if asked:
-        return _with_advice("stopped at once")
-    cause = "a crash in native code" if name in _CRASHES else "out of memory, or killed from outside"
-    remedy = "run: mitsim doctor" if name in _CRASHES else "free memory or ask for less"
-    return f"{_with_advice(f'the worker process was ended by {name} ({cause})')}; {remedy}"
+        # A first signal ends it without a word once Python has given up its handlers, in the last moment.
+        return _with_advice(_ending(killer) if killer == asked[0] else "stopped at once")
+    cause = "a crash in native code" if killer.name in _CRASHES else "out of memory, or killed from outside"
+    remedy = "run: mitsim doctor" if killer.name in _CRASHES else "free memory or ask for less"
+    return f"{_with_advice(f'the worker process was ended by {killer.name} ({cause})')}; {remedy}"

@@ -143,6 +143,12 @@ class _Tree:
             matrix = np.array(_words(node, name), dtype=np.float64).reshape(4, 4)
             limits.check_transform(tag, name, matrix, name == "to_world" and plugin in ("mitsim_lensless", "projector"))
         elif kind == _Type.ResolvedReference:
+            inner = self._child(node, name)
+            within = inner.props.plugin_name()
+            if plugin in PLUGINS["shape"].split() and within in PLUGINS["emitter"].split() and within != "area":
+                raise self.outline.tag(inner).refusal(
+                    "type", repr(within), "a shape's emitter is an area; put other lamps beside the shapes"
+                )
             if name in limits.LIMITS:
                 self._check_texture(self._child(node, name), name, limits.LIMITS[name])
             if plugin == "projector" and name == "irradiance" and "to_uv" in self._child(node, name).props:

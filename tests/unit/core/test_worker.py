@@ -79,6 +79,18 @@ def test_a_signal_to_the_parent_stops_the_worker(number: signal.Signals) -> None
     assert (*process.communicate(timeout=20), process.returncode) == ("", f"mitsim: {words}\n", 128 + number)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_a_workers_last_moment_is_told_as_any(number: signal.Signals) -> None:
+    """Python gives up its handlers before it ends, and the signal itself ends the worker then. (Planted: told as a
+    second signal.)"""
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process, _ = started(f"signal.signal({int(number)}, signal.SIG_DFL)\n" + WAIT)
+    signal.signal(signal.SIGINT, before)
+    process.send_signal(number)
+    words = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    assert (*process.communicate(timeout=20), process.returncode) == ("", f"mitsim: {words}\n", 128 + number)
+
+
 def test_control_c_on_a_terminal_reaches_both_and_stops_once() -> None:
     """A terminal sends it to the whole group: the worker gets it twice, its own and the one passed on.
 

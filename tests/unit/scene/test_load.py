@@ -158,6 +158,17 @@ def test_a_bad_parameter_is_named(small_scene: Write, old: str, new: str, fragme
         assert fragment in message
 
 
+def test_a_lamp_that_is_no_area_is_refused_in_a_shape(small_scene: Write) -> None:
+    """Mitsuba takes it for a lamp of the scene, wherever it stands. (Planted: taken; loading then failed without a word
+    of where, as fuzzing found.)"""
+    lamp = '<emitter type="point"><rgb name="intensity" value="2"/></emitter>'
+    path = small_scene()
+    text = path.read_text()
+    end = text.rindex("</shape>")
+    path.write_text(text[:end] + lamp + text[end:])
+    assert "type: got 'point'" in (told := refusal(path)) and "a shape's emitter is an area" in told
+
+
 def test_a_scene_without_our_sensor(tmp_path: Path) -> None:
     path = tmp_path / "none.xml"
     path.write_text('<scene version="3.0.0"/>')
