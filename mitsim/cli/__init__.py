@@ -44,7 +44,7 @@ from mitsim.cli.options import (
 from mitsim.cli.screen import finish, print_plan
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
-from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, stopped
 
 app = typer.Typer(
     name="mitsim",
@@ -96,6 +96,8 @@ def _usage(error: Any) -> str:
 
 
 def _fail(message: str) -> None:
+    if stopped():
+        end_stopped()  # what an interrupt became on its way, as of a module that was being imported
     print(f"mitsim: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)
 
