@@ -157,7 +157,7 @@ class FactorOfDepths:
         steps = np.where(column < 0, -before, np.where(column > count - 1, after, 0)).astype(np.intp)
         within, row = column - steps * step, np.arange(rows)[:, None] + steps
         known = (row >= 0) & (row < rows) & (within >= 0) & (within <= count - 1)
-        brightness = self._brightness(own) / self._brightness(within)
+        brightness = self.brightness(own) / self.brightness(within)
         return _cubic(self.factor, np.clip(row, 0, rows - 1), within) * brightness, known
 
     @property
@@ -172,12 +172,8 @@ class FactorOfDepths:
         first, last, by_place = self._parallax_pixels
         return float(max(abs(first), abs(last), by_place * len(self.factor) * self.parallax.pixel_pitch_mm / 2))
 
-    @property
-    def brightness(self) -> FloatArray:
-        """(n,) how bright each column is, the mask's shadow apart; 1 in the middle of the window."""
-        return self._brightness(np.arange(self.factor.shape[1]))
-
-    def _brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
+    def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
+        """How bright places at each ``column`` and between are, the mask's shadow apart; 1 in the window's middle."""
         return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
 
     def _across(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:

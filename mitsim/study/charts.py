@@ -20,6 +20,8 @@ _CELL = 1.5
 """Inches of an image in a grid, at most: six stand on a page."""
 _LABEL = 1.1
 """Inches beside a grid for the names of its rows."""
+_CAPTION = 0.32
+"""Inches of a row for the captions below its images."""
 _LETTER = 0.085
 """Inches of a letter of such a name, on the average."""
 
@@ -100,7 +102,7 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
         of all.
     """
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
-    figure, _ = figure_of((size + 0.32) * len(rows) + 0.3, size * len(columns) + _LABEL, layout="compressed")
+    figure, _ = figure_of((size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL, layout="compressed")
     figure.clear()
     cells: Any = figure.subplots(len(rows), len(columns), squeeze=False)
     for index, (name, images) in enumerate(rows.items()):
@@ -112,7 +114,7 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
             axes.set_xlabel(caption, fontsize=FONT - 2)
             if index == 0:
                 axes.set_title(column, fontsize=FONT - 1)
-        fits = len(name) * _LETTER <= size + 0.3
+        fits = len(name) * _LETTER <= size + _CAPTION
         line[0].set_ylabel(name if fits else name.replace(", ", ",\n"), fontsize=FONT - 1)
     if title:
         figure.suptitle(title, fontsize=FONT)

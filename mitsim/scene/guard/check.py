@@ -147,7 +147,7 @@ class _Tree:
             within = inner.props.plugin_name()
             if plugin in PLUGINS["shape"].split() and within in PLUGINS["emitter"].split() and within != "area":
                 raise self.outline.tag(inner).refusal(
-                    "type", repr(within), "a shape's emitter is an area; put other lamps beside the shapes"
+                    "type", repr(within), "a shape holds an area emitter only; put other lamps beside the shapes"
                 )
             if name in limits.LIMITS:
                 self._check_texture(self._child(node, name), name, limits.LIMITS[name])

@@ -36,7 +36,7 @@ def _points(scope: Scope) -> Sequence[Point]:
             setup.printed(name).changed(lamp=f"{radiance:g}"),
             model=RENDERED, patterns=family, exposure=EQUAL_PEAK, seed=seed,
         )
-        for name in (scope.pictures[:1] if scope.quick else scope.pictures)
+        for name in scope.chosen(scope.pictures, scope.pictures[:1])
         for radiance in scope.chosen(RADIANCES, RADIANCES[::2])
         for seed in scope.seeds
         for family in FAMILIES

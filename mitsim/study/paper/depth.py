@@ -43,7 +43,7 @@ _ROBUST_DB = 3.0
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    setups = [scope.setup.printed(name) for name in (scope.pictures[:1] if scope.quick else scope.pictures)]
+    setups = [scope.setup.printed(name) for name in scope.chosen(scope.pictures, scope.pictures[:1])]
     seed, depths = scope.seeds[0], scope.chosen(DEPTHS_MM, (380.0, 400.0))
     families = scope.chosen(FAMILIES, ("dots:7",))
     planes = [("columns", baseline) for baseline in scope.chosen(BASELINES_MM, (0.0, 60.0))]

@@ -178,7 +178,7 @@ def verdict(holds: bool) -> str:
 
 def bars(lines: Lines, column: str = "psnr_db") -> Mapping[str, tuple[Mean, Mean]]:
     """Means of a ``column`` in both models, by the names of ``lines``."""
-    both = {
-        name: [rows.where(model=model).mean(column) for model in (IDEALISED, RENDERED)] for name, rows in lines.items()
+    return {
+        name: (rows.where(model=IDEALISED).mean(column), rows.where(model=RENDERED).mean(column))
+        for name, rows in lines.items()
     }
-    return {name: (idealised, rendered) for name, (idealised, rendered) in both.items()}

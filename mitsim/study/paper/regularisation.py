@@ -39,7 +39,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         Point.of(
             scope.setup.printed(name), model=model, patterns=family, exposure=EQUAL_FRAME, seed=seed, method=method
         )
-        for name in (scope.pictures[:1] if scope.quick else scope.pictures)
+        for name in scope.chosen(scope.pictures, scope.pictures[:1])
         for seed in scope.seeds
         for family in scope.chosen(FAMILIES, _SHOWN)
         for model in MODELS

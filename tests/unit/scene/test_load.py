@@ -166,7 +166,7 @@ def test_a_lamp_that_is_no_area_is_refused_in_a_shape(small_scene: Write) -> Non
     text = path.read_text()
     end = text.rindex("</shape>")
     path.write_text(text[:end] + lamp + text[end:])
-    assert "type: got 'point'" in (told := refusal(path)) and "a shape's emitter is an area" in told
+    assert "type: got 'point'" in (told := refusal(path)) and "a shape holds an area emitter only" in told
 
 
 def test_a_scene_without_our_sensor(tmp_path: Path) -> None:
