@@ -21,7 +21,7 @@ from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames, bound_of, monte_carlo_bound, monte_carlo_error
+from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.rig.patterns import Lighting
 
 if TYPE_CHECKING:
@@ -260,15 +260,14 @@ def trace_light(
         )
         # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
         expected = light.frames(checked, seed, leaking=False)
-        more, bound = _unchecked(light, lighting, checked)
-        error = more * monte_carlo_error(expected)
+        more = _unchecked(light, lighting, checked)
+        error, bound = (ratio * of_checked for ratio, of_checked in zip(more, expected.sampling_error(), strict=True))
         # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
         target = sampling.target(expected) if sampling.target else plan.sampling_target
-        seen = error if sampling.target else bound * monte_carlo_bound(expected)
+        seen = error if sampling.target else bound
         if seen <= target and followed and not sampling.target and len(last.weights) > len(checked.weights):
             # Followed light has heavy paths, which strike single shots: what is stated in the end is seen before.
-            expected = light.frames(last, seed, leaking=False)
-            error, seen = monte_carlo_error(expected), monte_carlo_bound(expected)
+            error, seen = light.frames(last, seed, leaking=False).sampling_error()
         progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
         if seen <= target or light.paths >= _MOST_PATHS:
             return replace(light, sampling_error=error, reached=seen <= target)

@@ -19,7 +19,8 @@ from mitsim.capture.effects import Physics
 from mitsim.capture.evidence import Settings
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Spectrum

@@ -1,32 +1,22 @@
-"""Frames in closed form: from light per (anchor, tan-angle cell) to irradiance on every sensor pixel, and its error.
+"""Frames of a family: from light of its classes to the expected irradiance of every shot, and its Monte Carlo error.
 
-A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
-distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and
-its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
-hold light enter the product: for k x k shifting dots that is one in k of each.
+The closed form of one light distribution is :mod:`mitsim.optics.closed_form`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
-from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.shadow import Directions
-from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
+from mitsim.optics.closed_form import Entries, FrameOptics, IntArray
 from mitsim.rig.patterns import Lighting
-from mitsim.rig.projector import Spectrum
 
-IntArray = npt.NDArray[np.int64]
 _AT_ONCE = 32
 """Frames held at a time: enough to keep all processors busy; 64 MiB of a sensor of 512 pixels."""
 _LARGEST_BASIS = 256
@@ -37,13 +27,11 @@ _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
 _NORMAL = 1.645
 """Standard deviations above which a normal deviate is in 5 % of cases."""
-_HELD = 8
-"""Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
 _MOST_COLUMNS = 2**22
 """Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all, and
 20 to add two unsorted matrices."""
-_shadow = lru_cache(maxsize=24)(shadow_terms)
-"""The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
+_ALL = sparse.csr_array(np.ones((1, 1)))
+"""The one mixture of ambient light: all of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,109 +59,6 @@ class Frame:
     removed: float
     heaviest: float
     by_group: tuple[float, ...] = ()
-
-
-class FrameOptics:
-    """The closed form, prepared once; applying it changes nothing.
-
-    Parameters
-    ----------
-    geometry
-        the camera.
-    rows, columns
-        directions of the cells along the two axes.
-    depths
-        [mm], one a layer.
-    anchors
-        points a side of the sensor from which light is seen.
-    spectrum
-        lines of a wave-optical shadow; None: geometric.
-    """
-
-    def __init__(
-        self,
-        geometry: CameraGeometry,
-        rows: Directions,
-        columns: Directions,
-        depths: Sequence[float],
-        anchors: int,
-        spectrum: Spectrum | None = None,
-    ) -> None:
-        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), geometry.pixel_centres)
-        self.anchors = anchors
-        self.pixels = geometry.pixels
-        self.cells = (len(rows.centres), len(columns.centres))
-        self.shape = (anchors * self.cells[0], anchors * self.cells[1])
-        # Stored with the light's index first, so that picking lit rows copies contiguous memory.
-        stack = _Stack if anchors > _HELD else _stack
-        self._layers = [
-            [
-                (stack(left, weights), stack(right, weights))
-                for left, right in _shadow(geometry, rows, columns, depth, spectrum)
-            ]
-            for depth in depths
-        ]
-
-    def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
-        """(pixels, pixels) irradiance of ``light`` [W m^-2] at distinct indices ``flat`` into (layers, *shape)."""
-        total = np.zeros((self.pixels, self.pixels))
-        for terms, (inside, places) in zip(self._layers, self._split(flat), strict=True):
-            if not len(places):
-                continue
-            rows, columns, block = self._block(places, light[inside])
-            for left, right in terms:
-                # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
-                if len(rows) < len(columns):
-                    total += left[rows].T @ (block @ right[columns])
-                else:
-                    total += (left[rows].T @ block) @ right[columns]
-        return total
-
-    def probe(self, flat: IntArray, lights: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Frames of several lights times some vectors; the frames, which would cost far more, are never formed.
-
-        Parameters
-        ----------
-        flat
-            (k,) distinct indices into (layers, *shape).
-        lights
-            (groups, k) values there [W m^-2].
-        vectors
-            (pixels, probes).
-
-        Returns
-        -------
-        (pixels, groups * probes).
-        """
-        total = np.zeros((self.pixels, len(lights) * vectors.shape[1]))
-        for terms, (inside, places) in zip(self._layers, self._split(flat), strict=True):
-            if not len(places):
-                continue
-            parts = [self._block(places, light[inside]) for light in lights]
-            rows, columns, _ = parts[0]
-            for left, right in terms:
-                seen = right[columns] @ vectors
-                total += left[rows].T @ np.concatenate([block @ seen for _, _, block in parts], axis=1)
-        return total
-
-    def _split(self, flat: IntArray) -> list[tuple[slice | IntArray, IntArray]]:
-        """For each layer: which entries of ``flat`` lie in it, and their places in (rows, columns)."""
-        if len(self._layers) == 1:
-            return [(slice(None), flat)]
-        layer, place = np.divmod(flat, self.shape[0] * self.shape[1])
-        chosen = [np.flatnonzero(layer == index) for index in range(len(self._layers))]
-        return [(inside, place[inside]) for inside in chosen]
-
-    def _block(self, flat: IntArray, light: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-        """Lit rows, lit columns and the dense light between them."""
-        row, column = np.divmod(flat, self.shape[1])
-        lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
-        lit_row[row], lit_column[column] = True, True
-        rows, columns = np.flatnonzero(lit_row), np.flatnonzero(lit_column)
-        place_row, place_column = np.cumsum(lit_row) - 1, np.cumsum(lit_column) - 1
-        block = np.zeros((len(rows), len(columns)))
-        block[place_row[row], place_column[column]] = light
-        return rows, columns, block
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,6 +150,7 @@ class ExpectedFrames:
         self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(self._weights) @ indicator)
         self._formed: tuple[FloatArray, FloatArray] | None = None
         self._always: tuple[FloatArray, FloatArray] | None = None
+        self._seen: FloatArray | None = None
 
     def __len__(self) -> int:
         return int(self._weights.shape[0])
@@ -284,7 +170,7 @@ class ExpectedFrames:
     @property
     def _ambient_formed(self) -> tuple[FloatArray, FloatArray] | None:
         if self._ambient and self._always is None:
-            self._always = _formed(self._ambient, sparse.csr_array(np.ones((1, 1))), self._seed)
+            self._always = _formed(self._ambient, _ALL, self._seed)
         return self._always
 
     def __iter__(self) -> Iterator[Frame]:
@@ -294,14 +180,14 @@ class ExpectedFrames:
             return
         if self._formed is None:
             self._formed = self._form(0, self._basis.shape[0])
-        irradiance, deviation = self._formed
+        irradiance, probed = self._formed
         for start in range(0, len(self), _AT_ONCE):
             weights = self._weights[start : start + _AT_ONCE]
             if np.array_equal(self._weights, np.eye(len(self))):
                 stop = start + len(weights)
-                yield from self._frames(irradiance[start:stop], deviation[start:stop])
+                yield from self._frames(irradiance[start:stop], probed[start:stop])
             else:
-                yield from self._frames(_mix(weights, irradiance), _mix(weights, deviation))
+                yield from self._frames(_mix(weights, irradiance), _mix(weights, probed))
 
     def by_group(self, columns: IntArray) -> FloatArray:
         """(groups, shots, pixels, c) frames that each group of the light makes by itself, at c ``columns`` of pixels.
@@ -311,64 +197,126 @@ class ExpectedFrames:
         shots = sparse.csr_array(sparse.csr_array(self._weights) @ self._basis) if self._mixed else self._basis
         frames = _seen(self._lights, shots, columns)
         if self._ambient:
-            frames += _seen(self._ambient, sparse.csr_array(np.ones((1, 1))), columns)
+            frames += _seen(self._ambient, _ALL, columns)
         if self._glint is not None:
             shares = self._weights[:, self._glint.classes]
             frames += np.tensordot(shares, self._glint.irradiance[:, :, columns], 1)
         return frames
 
+    def sampling_error(self) -> tuple[float, float]:
+        """Relative Monte Carlo error of all frames, and what it is below at 95 %, without forming any.
+
+        The frames' energy is told by the random signs as well: as :func:`monte_carlo_error` and
+        :func:`monte_carlo_bound` to a few percent, in a fraction of the time.
+        """
+        count, energy = self._groups, 0.0
+        parts = np.zeros(count)
+        for start in range(0, len(self), _AT_ONCE):
+            for probed in self._probed(start, min(start + _AT_ONCE, len(self))):
+                by_group = probed.reshape(self._pixels, count, -1)
+                mean = by_group.mean(axis=1)
+                energy += float(np.square(mean).sum())
+                parts += _squares(by_group - mean[:, None])
+        if count < 2 or not energy:
+            return 0.0, 0.0
+        parts /= count * (count - 1)
+        return float(np.sqrt(parts.sum() / energy)), bound_of(parts, energy)
+
+    def _probed(self, start: int, stop: int) -> FloatArray:
+        """(shots, pixels * groups * probes) frames of single groups as random signs see them."""
+        if self._mixed:
+            if self._seen is None:
+                self._seen = self._with_glint(_formed(self._lights, self._basis, self._seed, False)[1], 0)
+            probed = _mix(self._weights[start:stop], self._seen)
+        else:
+            basis = self._basis[start:stop]
+            probed = self._with_glint(_formed(self._lights, basis, self._seed, False)[1], start)
+        if self._ambient:
+            probed = probed + _formed(self._ambient, _ALL, self._seed, False)[1][0]
+        return probed
+
+    def _with_glint(self, probed: FloatArray, start: int) -> FloatArray:
+        """The same of mixtures from ``start`` on with glint, which is in every group."""
+        if self._glint is not None:
+            signs = _probes(self._pixels, self._seed)
+            brought = np.repeat((self._glint.irradiance @ signs)[:, :, None], self._groups, axis=2)
+            shares = self._shares[start : start + len(probed)][:, self._glint.classes]
+            probed = probed + shares @ brought.reshape(len(brought), -1)
+        return probed
+
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) deviations of their groups."""
-        frames, deviations = _formed(self._lights, self._basis[start:stop], self._seed)
+        """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) those of groups as signs see them.
+
+        Glint is exact: it is in the frames alone, as no difference between groups has any.
+        """
+        frames, probed = _formed(self._lights, self._basis[start:stop], self._seed)
         if self._glint is not None:
             shares = self._shares[start:stop][:, self._glint.classes]
             for frame, share in zip(frames, shares, strict=True):
                 for index in np.flatnonzero(share):
                     frame += share[index] * self._glint.irradiance[index]
-        return frames, deviations
+        return frames, probed
 
-    def _frames(self, irradiance: FloatArray, deviation: FloatArray) -> Iterator[Frame]:
+    @property
+    def _groups(self) -> int:
+        return len(self._lights[0].groups)
+
+    @property
+    def _pixels(self) -> int:
+        return self._lights[0].optics.pixels
+
+    def _frames(self, irradiance: FloatArray, probes: FloatArray) -> Iterator[Frame]:
         ambient = self._ambient_formed
-        count = len(self._lights[0].groups)
+        count = self._groups
         pairs = count * (count - 1)
-        for frame, probed in zip(irradiance, deviation, strict=True):
+        for frame, probed in zip(irradiance, probes, strict=True):
             if ambient is not None:
                 frame, probed = frame + ambient[0][0], probed + ambient[1][0]
-            # Not a product of vectors: BLAS adds up in an order that hangs on its threads.
-            squared = np.square(probed.reshape(frame.shape[0], count, -1)).sum(axis=(0, 2)) if pairs else np.zeros(1)
+            by_group = probed.reshape(self._pixels, count, -1)
+            squared = _squares(by_group - by_group.mean(axis=1, keepdims=True)) if pairs else np.zeros(1)
             spread = float(squared.sum())
             variance = spread / pairs / frame.size if pairs else 0.0
             heaviest = float(squared.max()) / spread if spread else 0.0
             seen = np.maximum(frame, 0)
             total = float(seen.sum())
-            by_group = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
-            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, by_group)
+            parts = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
+            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, parts)
 
 
-def _mean_of(groups: Sequence[sparse.csr_array]) -> sparse.csr_array:
-    return sum(groups[1:], groups[0]) / len(groups)
+def _squares(deviations: FloatArray) -> FloatArray:
+    """(groups,) squared norms of ``deviations`` (pixels, groups, probes).
+
+    Not products of vectors: BLAS adds up in an order that hangs on its threads.
+    """
+    return np.asarray(np.square(deviations).sum(axis=(0, 2)))
 
 
-def _formed(lights: Sequence[Filed], basis: sparse.csr_array, seed: int) -> tuple[FloatArray, FloatArray]:
-    """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and deviations of the groups as signs see them."""
+def _formed(
+    lights: Sequence[Filed], basis: sparse.csr_array, seed: int, with_frames: bool = True
+) -> tuple[FloatArray, FloatArray]:
+    """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and the groups' own as random signs see them.
+
+    The latter are (b, pixels * groups * probes); none for a single group. No frames unless ``with_frames``.
+    """
     pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
-    probes = _probes(pixels, seed)
+    probes = _probes(pixels, seed) if groups > 1 or not with_frames else None
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
-    means = [_mean_of(parts) for _, parts in mixed]
-    frames = np.zeros((basis.shape[0], pixels, pixels))
-    deviations = np.zeros((basis.shape[0], pixels * groups * probes.shape[1] if groups > 1 else 1))
+    count = basis.shape[0]
+    frames = np.zeros((count if with_frames else 0, pixels, pixels))
+    probed = np.zeros((count, pixels * groups * (0 if probes is None else probes.shape[1])))
 
     def form(row: int) -> None:
-        for (optics, parts), light in zip(mixed, means, strict=True):
-            flat, mean = _row(light, row)
-            frame = optics.frame(flat, mean)
-            frames[row] += frame
-            if groups > 1:
-                probed = optics.probe(flat, _aligned(flat, [_row(part, row) for part in parts]), probes)
-                deviations[row] += (probed - np.tile(frame @ probes, groups)).ravel()
+        for optics, parts in mixed:
+            estimates = [_row(part, row) for part in parts]
+            if with_frames:
+                frame, seen = optics.seen(estimates, probes)
+                frames[row] += frame
+            else:
+                seen = optics.probe(estimates, probes)
+            probed[row] += seen.ravel()
 
-    in_threads(form, range(basis.shape[0]))
-    return frames, deviations
+    in_threads(form, range(count))
+    return frames, probed
 
 
 def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_array:
@@ -396,8 +344,7 @@ def _seen(lights: Sequence[Filed], basis: sparse.csr_array, columns: IntArray) -
 
     def form(row: int) -> None:
         for optics, parts in mixed:
-            flat, _ = _row(_mean_of([part[[row]] for part in parts]), 0)
-            seen = optics.probe(flat, _aligned(flat, [_row(part, row) for part in parts]), chosen)
+            seen = optics.probe([_row(part, row) for part in parts], chosen)
             frames[:, row] += np.moveaxis(seen.reshape(pixels, groups, -1), 1, 0)
 
     in_threads(form, range(basis.shape[0]))
@@ -459,32 +406,6 @@ def bound_of(parts: FloatArray, energy: float) -> float:
     return float(np.sqrt(parts.sum() / energy * (1 + _NORMAL * np.sqrt(spread))))
 
 
-def _row(matrix: sparse.csr_array, row: int) -> tuple[IntArray, FloatArray]:
+def _row(matrix: sparse.csr_array, row: int) -> Entries:
     inside = slice(matrix.indptr[row], matrix.indptr[row + 1])
-    return matrix.indices[inside].astype(np.int64), matrix.data[inside]
-
-
-def _aligned(flat: IntArray, parts: Sequence[tuple[IntArray, FloatArray]]) -> FloatArray:
-    """(groups, len(flat)) values of each group at the places of their mean, which holds every place of each."""
-    order = np.argsort(flat)
-    values = np.zeros((len(parts), len(flat)))
-    for line, (places, light) in zip(values, parts, strict=True):
-        line[order[np.searchsorted(flat[order], places)]] = light
-    return values
-
-
-class _Stack:
-    """The same as :func:`_stack`, whose rows are made when they are asked for."""
-
-    def __init__(self, factor: FloatArray, weights: FloatArray) -> None:
-        self._factor, self._weights = np.ascontiguousarray(factor.T), np.ascontiguousarray(weights.T)
-
-    def __getitem__(self, rows: IntArray) -> FloatArray:
-        anchor, cell = np.divmod(rows, len(self._factor))
-        return np.asarray(self._weights[anchor] * self._factor[cell])
-
-
-def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:
-    """(anchors * cells, pixels): the factor (pixels, cells) once for each anchor, scaled by the anchor's weight."""
-    scaled = weights.T[:, None, :] * factor.T[None, :, :]
-    return np.ascontiguousarray(scaled.reshape(-1, factor.shape[0]))
+    return matrix.indices[inside], matrix.data[inside]

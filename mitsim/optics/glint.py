@@ -20,7 +20,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.optics.frames import ClassFrames, IntArray
+from mitsim.optics.closed_form import IntArray
+from mitsim.optics.frames import ClassFrames
 from mitsim.optics.samplers import SeparableTerm
 from mitsim.rig.camera import CameraGeometry
 

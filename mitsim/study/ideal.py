@@ -16,7 +16,8 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.core.arrays import FloatArray
-from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms

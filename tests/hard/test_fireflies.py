@@ -14,7 +14,8 @@ from scipy import sparse
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.planning import make_plan
-from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.shadow import Directions
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting

@@ -11,7 +11,7 @@ from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Settings
 from mitsim.capture.simulation import AT_ANCHORS, Simulation
-from mitsim.optics.frames import FrameOptics
+from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.histogram import AMBIENT, Deposits

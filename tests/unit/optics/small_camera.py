@@ -7,7 +7,8 @@ to get wrong.
 import numpy as np
 from scipy import sparse
 
-from mitsim.optics.frames import ExpectedFrames, Filed, FrameOptics
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.shadow import Directions
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.frames import FrameOptics
+from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.mask import Mask

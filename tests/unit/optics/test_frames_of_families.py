@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, FrameOptics, _product, formed_frames
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, _product, formed_frames
 from tests.unit.optics.small_camera import (
     BESIDE,
     CAMERA,

@@ -1,0 +1,186 @@
+"""The closed form: light per (layer, anchor, tan-angle cell) in, irradiance on every sensor pixel out.
+
+A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
+distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and
+its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
+hold light enter the product: for k x k shifting dots that is one in k of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.optics.anchors import anchor_positions, anchor_weights
+from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
+
+IntArray = npt.NDArray[np.integer]
+Entries = tuple[IntArray, FloatArray]
+"""Distinct indices into (layers, rows, columns), and the light [W m^-2] at each."""
+_HELD = 8
+"""Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
+_shadow = lru_cache(maxsize=24)(shadow_terms)
+"""The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Light of one layer in the rows and columns that any of several estimates lights.
+
+    Attributes
+    ----------
+    left, right
+        by term, (r, pixels) and (c, pixels): factors of the lit rows and columns.
+    lights
+        (estimates, r, c) light of each.
+    """
+
+    factors: Sequence[tuple[FloatArray, FloatArray]]
+    lights: FloatArray
+
+    def frame(self, pixels: int) -> FloatArray:
+        """(pixels, pixels) irradiance of the estimates' mean."""
+        mean = self.lights[0] if len(self.lights) == 1 else self.lights.mean(axis=0)
+        total = np.zeros((pixels, pixels))
+        for left, right in self.factors:
+            # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
+            total += left.T @ (mean @ right) if len(left) < len(right) else (left.T @ mean) @ right
+        return total
+
+    def probe(self, vectors: FloatArray) -> FloatArray:
+        """(pixels, estimates * probes) products of each estimate's frame with ``vectors`` (pixels, probes)."""
+        count, rows, columns = self.lights.shape
+        flat = self.lights.reshape(count * rows, columns)
+        total = np.zeros((len(vectors), count * vectors.shape[1]))
+        for left, right in self.factors:
+            seen = (flat @ (right @ vectors)).reshape(count, rows, -1)
+            total += left.T @ np.moveaxis(seen, 0, 1).reshape(rows, -1)
+        return total
+
+
+class FrameOptics:
+    """The closed form, prepared once; applying it changes nothing.
+
+    Parameters
+    ----------
+    geometry
+        the camera.
+    rows, columns
+        directions of the cells along the two axes.
+    depths
+        [mm], one a layer.
+    anchors
+        points a side of the sensor from which light is seen.
+    spectrum
+        lines of a wave-optical shadow; None: geometric.
+    """
+
+    def __init__(
+        self,
+        geometry: CameraGeometry,
+        rows: Directions,
+        columns: Directions,
+        depths: Sequence[float],
+        anchors: int,
+        spectrum: Spectrum | None = None,
+    ) -> None:
+        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), geometry.pixel_centres)
+        self.anchors = anchors
+        self.pixels = geometry.pixels
+        self.cells = (len(rows.centres), len(columns.centres))
+        self.shape = (anchors * self.cells[0], anchors * self.cells[1])
+        # Stored with the light's index first, so that picking lit rows copies contiguous memory.
+        stack = _Stack if anchors > _HELD else _stack
+        self._layers = [
+            [
+                (stack(left, weights), stack(right, weights))
+                for left, right in _shadow(geometry, rows, columns, depth, spectrum)
+            ]
+            for depth in depths
+        ]
+
+    def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
+        """(pixels, pixels) irradiance of ``light`` [W m^-2] at distinct indices ``flat`` into (layers, *shape)."""
+        return self.seen([(flat, light)], None)[0]
+
+    def probe(self, estimates: Sequence[Entries], vectors: FloatArray) -> FloatArray:
+        """Frames of several ``estimates`` times ``vectors`` (pixels, probes): (pixels, estimates * probes).
+
+        The frames, which would cost far more, are never formed.
+        """
+        total = np.zeros((self.pixels, len(estimates) * vectors.shape[1]))
+        for block in self._blocks(estimates):
+            total += block.probe(vectors)
+        return total
+
+    def seen(self, estimates: Sequence[Entries], vectors: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """The frame of the mean of several estimates, and the product of each one's frame with some vectors.
+
+        Parameters
+        ----------
+        estimates
+            of one light.
+        vectors
+            (pixels, probes), or None for no products.
+
+        Returns
+        -------
+        (pixels, pixels) and (pixels, estimates * probes).
+        """
+        probes = 0 if vectors is None else vectors.shape[1]
+        frame, probed = np.zeros((self.pixels, self.pixels)), np.zeros((self.pixels, len(estimates) * probes))
+        for block in self._blocks(estimates):
+            frame += block.frame(self.pixels)
+            if vectors is not None:
+                probed += block.probe(vectors)
+        return frame, probed
+
+    def _blocks(self, estimates: Sequence[Entries]) -> Iterator[_Block]:
+        """The light of each layer that holds any."""
+        split = [self._split(*entries) for entries in estimates]
+        for terms, parts in zip(self._layers, zip(*split, strict=True), strict=True):
+            places = [np.divmod(place, self.shape[1]) for place, _ in parts]
+            lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
+            for row, column in places:
+                lit_row[row], lit_column[column] = True, True
+            rows, columns = np.flatnonzero(lit_row), np.flatnonzero(lit_column)
+            if not len(rows):
+                continue
+            row_of, column_of = np.cumsum(lit_row) - 1, np.cumsum(lit_column) - 1
+            lights = np.zeros((len(parts), len(rows), len(columns)))
+            for light, (row, column), (_, values) in zip(lights, places, parts, strict=True):
+                light[row_of[row], column_of[column]] = values
+            yield _Block([(left[rows], right[columns]) for left, right in terms], lights)
+
+    def _split(self, flat: IntArray, light: FloatArray) -> list[Entries]:
+        """What lies in each layer: places in (rows, columns), and light."""
+        if len(self._layers) == 1:
+            return [(flat, light)]
+        layer, place = np.divmod(flat, self.shape[0] * self.shape[1])
+        chosen = [np.flatnonzero(layer == index) for index in range(len(self._layers))]
+        return [(place[inside], light[inside]) for inside in chosen]
+
+
+class _Stack:
+    """The same as :func:`_stack`, whose rows are made when they are asked for."""
+
+    def __init__(self, factor: FloatArray, weights: FloatArray) -> None:
+        self._factor, self._weights = np.ascontiguousarray(factor.T), np.ascontiguousarray(weights.T)
+
+    def __getitem__(self, rows: IntArray) -> FloatArray:
+        anchor, cell = np.divmod(rows, len(self._factor))
+        return np.asarray(self._weights[anchor] * self._factor[cell])
+
+
+def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:
+    """(anchors * cells, pixels): the factor (pixels, cells) once for each anchor, scaled by the anchor's weight."""
+    scaled = weights.T[:, None, :] * factor.T[None, :, :]
+    return np.ascontiguousarray(scaled.reshape(-1, factor.shape[0]))
