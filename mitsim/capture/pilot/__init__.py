@@ -170,12 +170,17 @@ class Look:
         elif stage == "effects":
             self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
         elif stage == "followed":
-            self.followed = FollowedLight(bench, self._everything, sample, self.accuracy, seed, self.fine.judging)
+            self.followed = FollowedLight(bench, self._everything, sample, self._tolerance, seed, self.fine.judging)
         elif stage == "occluded":
             if base.occluded:
-                self.occluded = OccludedLight(bench, base, sample, self.accuracy, seed, self.fine.judging)
+                self.occluded = OccludedLight(bench, base, sample, self._tolerance, seed, self.fine.judging)
         else:
-            self.anchored = AnchoredLight(bench, base, sample, self.accuracy, seed, self.fine.judging)
+            self.anchored = AnchoredLight(bench, base, sample, self._tolerance, seed, self.fine.judging)
+
+    @property
+    def _tolerance(self) -> float:
+        """Norm of a change of the frames that the capture may leave."""
+        return self.accuracy * self.switched.light
 
     @property
     def _everything(self) -> Settings:

@@ -13,7 +13,7 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Effort, Forming, Noise, Part, Settings
-from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, coarsened, ladder, noise
+from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, coarsened, ladder, noise, norm
 from mitsim.capture.simulation import FiledLight, Simulation, Tray
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
@@ -95,12 +95,12 @@ class FineLight:
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of cells and layers that was tried."""
         found: dict[Part, FloatArray] = {}
-        first = _FIRST_JUDGES["cells"]
-        cells = ladder(CELL_LADDER, lambda count: self._frames((), count), first, self.accuracy, EVEN_CELLS)
+        first, tolerance = _FIRST_JUDGES["cells"], self.accuracy * norm(self._whole)
+        cells = ladder(CELL_LADDER, lambda count: self._frames((), count), first, tolerance, EVEN_CELLS)
         found |= {Part("cells", count): change for count, change in cells.items()}
         if len(self.layers) > 1:
             first = _FIRST_JUDGES["layers"]
-            layers = ladder(self.layers, lambda count: self._frames(self.layers[count], 2), first, self.accuracy)
+            layers = ladder(self.layers, lambda count: self._frames(self.layers[count], 2), first, tolerance)
             found |= {Part("layers", count): change for count, change in layers.items()}
         return found
 
@@ -126,20 +126,24 @@ class FineLight:
         return max(1, self.sample.fine // 4)
 
     @cached_property
+    def _whole(self) -> FloatArray:
+        """(looks, ...) frames of the light in the cells and layers of the base."""
+        return self._formed(Simulation(self.bench, self.base), self._deposits, self.sample.fine)
+
+    @cached_property
     def _noise(self) -> tuple[float, float]:
-        return self._noise_of(self._tracer, self._deposits)
+        return self._noise_of(self._tracer, self._whole)
 
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
         tracer = _tracer(Simulation(self.bench, self.base), _shown(self.base, self.sample), 1, spread=True)
-        return self._noise_of(tracer, [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds])
+        seen = [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds]
+        return self._noise_of(tracer, self._formed(Simulation(self.bench, self.base), seen, self.sample.fine))
 
-    def _noise_of(self, tracer: DirectTracer, seen: list[Deposits]) -> tuple[float, float]:
-        """Error of a look of the ``tracer`` as it was ``seen`` with all samples, and with fewer."""
-        simulation = Simulation(self.bench, self.base)
+    def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
+        """Error of a look of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
         few = [tracer.trace(seed, 0, self._fewer) for seed in self._seeds]
-        many = noise(self._formed(simulation, seen, self.sample.fine))
-        return many, noise(self._formed(simulation, few, self._fewer))
+        return noise(many), noise(self._formed(Simulation(self.bench, self.base), few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
         """What forming frames of a ``family`` takes; timed with one cell a pixel, its optics prepared."""
@@ -203,8 +207,10 @@ class AnchoredLight:
 
     Parameters
     ----------
-    bench, base, sample, accuracy, seed
+    bench, base, sample, seed
         as for :class:`FineLight`.
+    tolerance
+        norm of a change at which the search for enough may stop.
     layers
         depths [mm] that judge one layer; none for a flat scene.
     """
@@ -217,11 +223,11 @@ class AnchoredLight:
         bench: Bench,
         base: Settings,
         sample: Sample,
-        accuracy: float,
+        tolerance: float,
         seed: int,
         layers: tuple[float, ...] = (),
     ) -> None:
-        self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
+        self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers = layers
         self._seeds = [integer(seed, "pilot", "anchors", look) for look in range(LOOKS)]
         self.pixels, self._samples = self._of(sample)
@@ -238,7 +244,7 @@ class AnchoredLight:
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], self.accuracy)
+        found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], self.tolerance)
         coarse = coarsened(self._name, self._beyond, self.layers)
         return {**{Part(self._part, count): change for count, change in found.items()}, **coarse}
 

@@ -41,8 +41,8 @@ class FollowedLight:
         what is traced, and settings with all its effects on.
     sample
         shots and samples.
-    accuracy
-        where the search for enough may stop.
+    tolerance
+        norm of a change at which the search for enough may stop.
     seed
         root of the random streams.
     layers
@@ -54,11 +54,11 @@ class FollowedLight:
         bench: Bench,
         everything: Settings,
         sample: Sample,
-        accuracy: float,
+        tolerance: float,
         seed: int,
         layers: tuple[float, ...] = (),
     ) -> None:
-        self.bench, self.everything, self.sample, self.accuracy = bench, everything, sample, accuracy
+        self.bench, self.everything, self.sample, self.tolerance = bench, everything, sample, tolerance
         self._layers = layers
         self._seeds = [integer(seed, "pilot", "followed", look) for look in range(LOOKS)]
 
@@ -67,7 +67,7 @@ class FollowedLight:
         """Change of the frames by every number of anchors that was tried; none where there is no such light."""
         if not self._tracers(self._simulation()) or not norm(self._frames(1)):
             return {}
-        found = ladder(FOLLOWED_LADDER, self._frames, _FIRST_JUDGE, self.accuracy)
+        found = ladder(FOLLOWED_LADDER, self._frames, _FIRST_JUDGE, self.tolerance)
         anchors = {Part("followed_anchors", count): change for count, change in found.items()}
         # Where the judge was never judged, few anchors serve, and their light is held in any cells.
         return {**anchors, **self._widths} if len(found) > _FIRST_JUDGE + 1 else anchors

@@ -39,7 +39,7 @@ EVEN_CELLS = 0.25
 _UNKNOWN_GAIN = 0.5
 """What a step leaves of the one before where that is not known, or not small."""
 _GOOD_ENOUGH = 0.3
-"""Part of the accuracy below which a finer step is not tried: its square is a tenth of the budget's."""
+"""Part of the tolerance below which a finer step is not tried: its square is a tenth of the budget's."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Sample:
 
 
 def ladder(
-    steps: Iterable[int], frames: Callable[[int], FloatArray], first: int, accuracy: float, least_gain: float = 0.0
+    steps: Iterable[int], frames: Callable[[int], FloatArray], first: int, tolerance: float, least_gain: float = 0.0
 ) -> Mapping[int, FloatArray]:
     """Change of the frames from each step to what ever finer ones come to.
 
@@ -137,8 +137,8 @@ def ladder(
         (looks, ...) of a step.
     first
         index of the step that judges at first; finer ones are tried until the one before the judge is good enough.
-    accuracy
-        of the capture.
+    tolerance
+        norm of a change of the frames that the capture may leave: its accuracy times the norm of all light.
     least_gain
         what a step leaves at least of the one before, where that is known.
     """
@@ -149,7 +149,7 @@ def ladder(
         last = tried[judge] - tried[before]
         gain = _gain(norm(last), norm(tried[before] - tried[earlier[-1]])) if earlier else _UNKNOWN_GAIN
         rest = max(gain, least_gain) / (1 - max(gain, least_gain))
-        if (1 + rest) * norm(last) <= _GOOD_ENOUGH * accuracy * norm(tried[judge]) or judge == counts[-1]:
+        if (1 + rest) * norm(last) <= _GOOD_ENOUGH * tolerance or judge == counts[-1]:
             break
         following = counts[counts.index(judge) + 1]
         tried[following] = frames(following)

@@ -176,6 +176,19 @@ def test_probes_see_the_frames_of_all_layers() -> None:
     optics = FrameOptics(CAMERA, rows, columns, (60.0, 20.0), 2)
     flat = np.sort(rng.choice(640, 150, replace=False))
     lights, vectors = rng.random((3, 150)), rng.standard_normal((96, 5))
-    found = optics.probe(flat, lights, vectors)
+    found = optics.probe([(flat, light) for light in lights], vectors)
     expected = np.concatenate([optics.frame(flat, light) @ vectors for light in lights], axis=1)
     assert np.allclose(found, expected, rtol=1e-10)
+
+
+def test_estimates_that_light_different_places_are_seen_as_each_is() -> None:
+    """The frame is their mean's, a product each one's own, though neither holds all places of the other."""
+    rng, edges = np.random.default_rng(8), np.linspace(-0.2, 0.2, 11)
+    optics = FrameOptics(CAMERA, Directions.cells(edges), Directions.cells(edges), (60.0, 20.0), 2)
+    estimates = [(np.sort(rng.choice(800, 60, replace=False)), rng.random(60)) for _ in range(3)]
+    vectors = rng.standard_normal((96, 4))
+    frame, probed = optics.seen(estimates, vectors)
+    alone = [optics.frame(*estimate) for estimate in estimates]
+    assert np.allclose(frame, sum(alone) / 3, rtol=1e-12)
+    assert np.allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-10)
+    assert np.array_equal(probed, optics.probe(estimates, vectors))

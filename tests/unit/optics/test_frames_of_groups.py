@@ -58,10 +58,31 @@ def test_each_group_makes_frames_by_itself(family: str) -> None:
             assert np.allclose(frame, expected.irradiance[:, columns], rtol=1e-10)
 
 
+@pytest.mark.parametrize("family", BESIDE)
+def test_the_sampling_error_is_told_without_frames(family: str) -> None:
+    """That of the frames, and its bound, but for the energy, which the same signs tell.
+
+    Nearly all energy is in the frames' means over columns, which are told exactly; of the rest eight signs tell a
+    half. Ambient light and glint are large parts of it: either left out would move the error by more than the gate.
+    """
+    labels, weights = BESIDE[family]
+    optics, groups, lamps = small_optics(), random_groups(4, 7, 0.3), ambient_groups(4)
+    bright = next(iter(expected_frames(optics, groups, labels, weights, 0))).irradiance.mean()
+    exact = ClassFrames(np.array([1, 3]), bright * np.random.default_rng(3).random((2, 40, 40)))
+    frames = expected_frames(optics, groups, labels, weights, 0, ambient=[Filed(optics, lamps)], glint=exact)
+    error, bound = frames.sampling_error()
+    assert error == pytest.approx(monte_carlo_error(frames), rel=0.02)
+    assert bound / error == pytest.approx(monte_carlo_bound(frames) / monte_carlo_error(frames), rel=1e-9)
+    for without in ({"glint": exact}, {"ambient": [Filed(optics, lamps)]}):
+        other, _ = expected_frames(optics, groups, labels, weights, 0, **without).sampling_error()
+        assert other != pytest.approx(monte_carlo_error(frames), rel=0.02)
+
+
 def test_one_group_has_no_variance_to_tell() -> None:
     frames = expected_frames(small_optics(), random_groups(1, 7, 0.2), LABELS, np.eye(4), 0)
     assert all(frame.variance == 0 and frame.irradiance.any() for frame in frames)
     assert monte_carlo_error(frames) == monte_carlo_bound(frames) == 0
+    assert frames.sampling_error() == (0.0, 0.0)
 
 
 def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() -> None:
