@@ -34,7 +34,7 @@ from scipy.special import fresnel
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
-from mitsim.optics.profile import Steps, sampled_box_means
+from mitsim.optics.profile import Steps, smooth_box_means
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
 from mitsim.rig.projector import Spectrum
 
@@ -107,11 +107,16 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
     """
     weights = _pair_weights(shadow.weights())
     means = _thick_means if shadow.thickness_mm else _thin_means
-    terms: SeparableTerms = []
-    for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-        left, right = both_axes(shadow, rows, columns, partial(means, wavelength_nm=float(wavelength)))
-        terms += [(share * weight * a, b) for weight, a, b in zip(weights, left, right, strict=True)]
-    return terms
+
+    def of_line(wavelength: float) -> tuple[FloatArray, FloatArray]:
+        return both_axes(shadow, rows, columns, partial(means, wavelength_nm=float(wavelength)))
+
+    lines = in_threads(of_line, spectrum.wavelengths_nm)
+    return [
+        (share * weight * a, b)
+        for (left, right), share in zip(lines, spectrum.weights, strict=True)
+        for weight, a, b in zip(weights, left, right, strict=True)
+    ]
 
 
 def wave_profiles(
@@ -171,7 +176,7 @@ def _thin_means(
     waves = _prepare(shadow, wavelength_nm, low, high)
     start = _start(shadow, waves.step_mm, float(low))
     products = _products([waves.field(clear, start) for clear in shadow.clear(profiles, 0.0)])
-    return sampled_box_means(products, start, waves.step_mm, crossings, shadow.half_pixel, half_cell)
+    return smooth_box_means(products, start, waves.step_mm, crossings, shadow.half_pixel, half_cell)
 
 
 def _thick_means(
@@ -187,7 +192,7 @@ def _thick_means(
         start = _start(shadow, waves.step_mm, float(lows[j]))
         clear = shadow.clear(profiles, float(directions.centres[j]))
         products = _products([waves.field(aperture, start) for aperture in clear])
-        return sampled_box_means(products, start, waves.step_mm, crossings[:, j], shadow.half_pixel, half_cell)
+        return smooth_box_means(products, start, waves.step_mm, crossings[:, j], shadow.half_pixel, half_cell)
 
     return np.stack(in_threads(toward, range(crossings.shape[1])), axis=-1)
 

@@ -12,7 +12,7 @@ from scipy.integrate import quad
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
-from mitsim.optics.profile import Steps
+from mitsim.optics.profile import Steps, sampled_box_means, smooth_box_means
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
@@ -356,3 +356,20 @@ def test_a_hopeless_grid_is_refused() -> None:
     geometry = CameraGeometry(pixels=64, mask_distance=1e-9)
     with pytest.raises(MitsimError, match=r"a grid of 1.31e\+08 .*move the mask off the sensor"):
         shadow_terms(geometry, Directions([0.0], 0.0), Directions([0.0], 0.0), 400.0, line())
+
+
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+@pytest.mark.parametrize("distance", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("cells", [4, 8])
+def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: float, cells: int) -> None:
+    """Between the grid's cells a shadow is interpolated where there are many points: against all points one by one.
+
+    Cubic polynomials leave 2e-6 to 3.1e-5, a tenth of the grid's own 3.2e-4; straight lines 3.8e-5 to 1.5e-4.
+    """
+    shadow = ShadowGeometry.of(CameraGeometry(mask=kind, mask_distance=distance), 400.0)
+    directions = Directions.cells(np.linspace(-0.15, 0.15, 128 * cells + 1))
+    parts, start, step = wave_profiles(shadow, 520.0, -4.4, 4.4, 0.0)
+    values = np.stack([profile for _, profile in parts])
+    where = values, start, step, shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
+    exact, found = sampled_box_means(*where), smooth_box_means(*where)
+    assert 0 < np.linalg.norm(found - exact) / np.linalg.norm(exact) < 4e-5
