@@ -231,13 +231,17 @@ def summary(pairs: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str, Any]:
 
 def table(results: Mapping[str, Any]) -> str:
     """One line a case, for people."""
-    lines = [f"{'case':<22} {'0.3.0 least, median s':>24} {'today least, median s':>24} {'ratio':>6} {'aim s':>6}  light s"]
+    lines = [
+        f"{'case':<22} {'0.3.0 least, median s':>24} {'today least, median s':>24} {'ratio':>6} {'aim s':>6}  light s"
+    ]
     for name, case in CASES.items():
         if name not in results["cases"]:
             continue
         row = results["cases"][name]["summary"]
         sides = [f"{row[v]['least']:.2f}, {row[v]['median']:.2f}" for v in ("0.3.0", "today")]
-        sides = [side + (" killed" if row[v]["killed"] else "") for side, v in zip(sides, ("0.3.0", "today"), strict=True)]
+        sides = [
+            side + (" killed" if row[v]["killed"] else "") for side, v in zip(sides, ("0.3.0", "today"), strict=True)
+        ]
         light = " -> ".join(f"{row[v]['light']:.1f}" for v in ("0.3.0", "today") if "light" in row[v])
         lines.append(f"{name:<22} {sides[0]:>24} {sides[1]:>24} {row['ratio']:6.2f} {case.aim or '':>6}  {light}")
     return "\n".join(lines)

@@ -139,6 +139,9 @@ class Simulation:
         what is simulated, and how finely.
     pixels
         cells a side of the projector's window, instead of one a pixel.
+    one_line
+        whether diffraction is that of the light's mean wavelength alone: for what hardly hangs on it, in a third of the
+        time.
 
     Attributes
     ----------
@@ -149,9 +152,11 @@ class Simulation:
         cells of ``fine`` and of ``followed``.
     """
 
-    def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None) -> None:
+    def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None, one_line: bool = False) -> None:
         self.bench, self.settings = bench, settings
         self.physics = Physics.simulated(bench, settings.effects)
+        if one_line and self.physics.spectrum:
+            self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
         pixels = pixels or bench.n
         # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
         self.aim = self._grid(pixels, 1, None)

@@ -46,6 +46,11 @@ class Spectrum(ByValue):
             )
         self._hold(wavelengths_nm=wavelengths, weights=weights)
 
+    @property
+    def mean(self) -> Spectrum:
+        """All photons at their mean wavelength."""
+        return Spectrum(np.array([np.sum(self.wavelengths_nm * self.weights)]), np.ones(1))
+
 
 Nanometres = Annotated[float, Field(ge=1, le=1e6)]
 """Wavelength [nm]: from soft X-rays to a millimetre."""

@@ -203,7 +203,9 @@ def _product_seconds() -> float:
 class AnchoredLight:
     """The frames with fewer anchors; every anchor is connected to the same points, so little noise is left.
 
-    Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame.
+    Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame. Of one
+    wavelength: anchors change the same with all (to 0.2 % in photograph, cards and corner), coarse cells at most a
+    quarter less.
 
     Parameters
     ----------
@@ -277,7 +279,7 @@ class AnchoredLight:
         return self._formed(simulation, [tray.file(look, labels, self._samples) for look in traced])
 
     def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        return Simulation(self.bench, replace(settings, anchors=anchors))
+        return Simulation(self.bench, replace(settings, anchors=anchors), one_line=True)
 
     def _tray(self, simulation: Simulation) -> Tray:
         """Where light of these pixels is filed."""
@@ -315,7 +317,7 @@ class OccludedLight(AnchoredLight):
         return len(self.base.occluded)
 
     def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        return Simulation(self.bench, replace(settings, occluded_anchors=anchors))
+        return Simulation(self.bench, replace(settings, occluded_anchors=anchors), one_line=True)
 
     def _tray(self, simulation: Simulation) -> Tray:
         return simulation.occluded

@@ -35,6 +35,8 @@ _FEW_ANCHORS = 2
 class FollowedLight:
     """The frames with fewer anchors for light that is followed; to every anchor go the same paths.
 
+    Of one wavelength, as :class:`mitsim.capture.pilot.direct.AnchoredLight` has them.
+
     Parameters
     ----------
     bench, everything
@@ -115,7 +117,7 @@ class FollowedLight:
         return self._formed(simulation, [filed(seed) for seed in self._seeds])
 
     def _simulation(self, **numbers: Any) -> Simulation:
-        return Simulation(self.bench, replace(self.everything, **numbers))
+        return Simulation(self.bench, replace(self.everything, **numbers), one_line=True)
 
     @staticmethod
     def _tracers(simulation: Simulation) -> list[Tracer]:
