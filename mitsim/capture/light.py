@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from operator import add
@@ -16,13 +18,14 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, LAST_CHECKED_SHOTS
-from mitsim.capture.simulation import FiledLight, Simulation
+from mitsim.capture.simulation import FiledLight, Simulation, Stage
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.rig.patterns import Lighting
+from mitsim.transport.histogram import Deposits
 
 if TYPE_CHECKING:
     from mitsim.core.job import Job
@@ -39,6 +42,8 @@ _LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 1.5
 _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 """Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
 what direct light brings), direct light's with their 0.8th power or faster."""
+_WAITING = 2
+"""Traced parts that wait to be filed, at most: some 0.2 GB each."""
 _VIEW_SAMPLES = 64
 """Samples a cell of a picture to look at: below the step of eight bits."""
 _LOST = 0.1
@@ -342,18 +347,34 @@ class _Group:
         self.trace(wanted)
 
     def trace(self, wanted: Mapping[str, int]) -> None:
-        """Trace until so many samples as are ``wanted`` of each stage by its name are done."""
-        for name, stage in self.simulation.tracers().items():
-            seed = integer(self.seed, stage.stream)
-            while (done := self.done.get(name, 0)) < wanted[name]:
-                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
-                deposits = stage.tracer.trace(seed, done, count)
-                light = stage.file(deposits, self.labels, 1)
-                self._sums[name] = self._sums[name] + light if name in self._sums else light
-                if name in self._flux:
-                    self._flux[name] += self.simulation.flux(deposits, 1)
-                self.done[name] = done + count
-                self.paths += count * stage.tracer.lanes
+        """Trace until so many samples as are ``wanted`` of each stage by its name are done.
+
+        Light is filed while the next is traced: filing takes one processor, and a tracer waits for its last paths.
+        """
+        with ThreadPoolExecutor(1) as filing:
+            filed: deque[Future[tuple[str, FiledLight, FloatArray | None]]] = deque()
+            for name, stage in self.simulation.tracers().items():
+                seed = integer(self.seed, stage.stream)
+                while (done := self.done.get(name, 0)) < wanted[name]:
+                    count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
+                    deposits = stage.tracer.trace(seed, done, count)
+                    if len(filed) == _WAITING:
+                        self._add(*filed.popleft().result())
+                    filed.append(filing.submit(self._filed, name, stage, deposits))
+                    self.done[name] = done + count
+                    self.paths += count * stage.tracer.lanes
+            while filed:
+                self._add(*filed.popleft().result())
+
+    def _filed(self, name: str, stage: Stage, deposits: Deposits) -> tuple[str, FiledLight, FloatArray | None]:
+        """Light of a stage, and the flux of each pixel where it is direct light."""
+        flux = self.simulation.flux(deposits, 1) if name in self._flux else None
+        return name, stage.file(deposits, self.labels, 1), flux
+
+    def _add(self, name: str, light: FiledLight, flux: FloatArray | None) -> None:
+        self._sums[name] = self._sums[name] + light if name in self._sums else light
+        if flux is not None:
+            self._flux[name] += flux
 
     @property
     def light(self) -> FiledLight:
