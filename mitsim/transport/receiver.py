@@ -90,6 +90,24 @@ class SensorPoints:
 
 
 @dataclass
+class Way:
+    """The way from a surface point P to a point of the sensor, whatever light comes to P.
+
+    ``open`` tells whether it is, ``direction`` is the unit one in which light leaves P, ``passed`` the part of it that
+    comes through, ``geometric`` all factors [mm^-2] of the irradiance but for the BSDF and the arriving light's cosine
+    to the surface; ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.histogram.Deposits`.
+    """
+
+    open: mi.Bool
+    direction: mi.Vector3f
+    passed: mi.Spectrum
+    geometric: mi.Float
+    row: mi.Float
+    column: mi.Float
+    inverse_depth: mi.Float
+
+
+@dataclass
 class Reception:
     """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
 
@@ -147,36 +165,60 @@ class Receiver:
         active
             lanes that count.
         """
+        return self.received(si, toward, self.way(si, local, active))
+
+    def way(self, si: mi.SurfaceInteraction3f, local: mi.Point3f, active: mi.Bool) -> Way:
+        """Connect surface points to sensor points.
+
+        Parameters
+        ----------
+        si, local, active
+            as for :meth:`receive`.
+        """
         to_world = self.camera.world_transform()
         point = to_world.inverse() @ si.p
         sensor = to_world @ local
-        apparent, way = si.p, None
+        apparent, bent = si.p, None
         if self.passage.panes:
-            way = refracted_way(self.passage, si, sensor, active)
-            apparent, active = way.apparent, active & way.open
+            bent = refracted_way(self.passage, si, sensor, active)
+            apparent, active = bent.apparent, active & bent.open
             point = to_world.inverse() @ apparent
         offset = sensor - apparent
         squared = dr.squared_norm(offset)
-        direction = offset * dr.rsqrt(squared) if way is None else way.direction
+        direction = offset * dr.rsqrt(squared) if bent is None else bent.direction
         t = mi.Vector2f(point.x - local.x, point.y - local.y) / point.z
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
         active = active & (point.z > dr.opaque(mi.Float, self.geometry.mask_distance))
         active &= (dr.abs(t.x) <= stop) & (dr.abs(t.y) <= stop)
-        if way is None:
+        if bent is None:
             seen, passed = self.passage.between(si, sensor, active)
             active &= seen
         else:
-            passed = way.part
-        si.wi = si.to_local(direction)
-        reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), active)
+            passed = bent.part
         cosine = dr.rsqrt(1 + dr.squared_norm(t))
-        geometric = dr.abs(dr.dot(si.n, direction)) * cosine / (squared * dr.abs(dr.dot(si.n, toward)))
+        geometric = dr.abs(dr.dot(si.n, direction)) * cosine / squared
         if self.geometry.angular_exponent > 0:
             geometric *= dr.power(cosine, dr.opaque(mi.Float, self.geometry.angular_exponent))
         inverse_depth = dr.rcp(point.z)
-        irradiance = dr.select(active, mi.unpolarized_spectrum(reflected) * passed * geometric, 0)
         row, column = rows_columns(point.x, point.y)
-        return Reception(irradiance, row * inverse_depth, column * inverse_depth, inverse_depth, pdf, direction)
+        return Way(active, direction, passed, geometric, row * inverse_depth, column * inverse_depth, inverse_depth)
+
+    @staticmethod
+    def received(si: mi.SurfaceInteraction3f, toward: mi.Vector3f, way: Way) -> Reception:
+        """What comes to the sensor by a way.
+
+        Parameters
+        ----------
+        si, toward
+            as for :meth:`receive`.
+        way
+            from these points.
+        """
+        si.wi = si.to_local(way.direction)
+        reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), way.open)
+        geometric = way.geometric / dr.abs(dr.dot(si.n, toward))
+        irradiance = dr.select(way.open, mi.unpolarized_spectrum(reflected) * way.passed * geometric, 0)
+        return Reception(irradiance, way.row, way.column, way.inverse_depth, pdf, way.direction)
 
 
 def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
