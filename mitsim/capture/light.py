@@ -355,14 +355,17 @@ class _Group:
             filed: deque[Future[tuple[str, FiledLight, FloatArray | None]]] = deque()
             for name, stage in self.simulation.tracers().items():
                 seed = integer(self.seed, stage.stream)
-                while (done := self.done.get(name, 0)) < wanted[name]:
+                ledger = stage.ledger(self.labels) if self.done.get(name, 0) < wanted.get(name, 0) else None
+                while (done := self.done.get(name, 0)) < wanted.get(name, 0):
                     count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
-                    deposits = stage.tracer.trace(seed, done, count)
+                    deposits = stage.trace(seed, done, count, ledger)
                     if len(filed) == _WAITING:
                         self._add(*filed.popleft().result())
                     filed.append(filing.submit(self._filed, name, stage, deposits))
                     self.done[name] = done + count
                     self.paths += count * stage.tracer.lanes
+                if ledger and stage.file_ledger:
+                    self._add(name, stage.file_ledger(ledger), None)
             while filed:
                 self._add(*filed.popleft().result())
 

@@ -66,8 +66,9 @@ def make_plan(
 
 def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
     """What so many ``samples`` of a ``stage`` take to be traced and filed."""
+    ledger = stage.ledger(labels)
     started = time.perf_counter()
-    stage.file(stage.tracer.trace(seed, 0, samples), labels, samples)
+    stage.file(stage.trace(seed, 0, samples, ledger), labels, samples)
     return time.perf_counter() - started
 
 

@@ -30,6 +30,8 @@ from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.ledger import Ledger
+from mitsim.transport.neighbours import NeighbourTracer
 from mitsim.transport.receiver import SensorPoints
 
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
@@ -84,13 +86,30 @@ class FiledLight:
 class Stage:
     """A tracer, the samples of it that the plan predicted, how its light is filed, and its random stream's name.
 
-    ``file`` takes deposits, labels and the number of samples.
+    ``file`` takes deposits, labels and the number of samples. ``ledger`` makes, from labels, what the light that
+    neighbouring pixels share is filed in on the device, and ``file_ledger`` takes it; None without such light.
     """
 
     tracer: DirectTracer | IndirectTracer | FromCameraTracer
     predicted: float
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
+    ledger: Callable[[Labels], Ledger | None] = lambda labels: None
+    file_ledger: Callable[[Ledger], FiledLight] | None = None
+
+    def trace(self, seed: int, first: int, samples: int, ledger: Ledger | None) -> Deposits:
+        """Light of some samples, but for what is filed in the ``ledger``.
+
+        Parameters
+        ----------
+        seed, first, samples
+            as for :meth:`mitsim.transport.paths.Tracer.trace`.
+        ledger
+            of :attr:`ledger`.
+        """
+        if ledger is None or not isinstance(self.tracer, NeighbourTracer):
+            return self.tracer.trace(seed, first, samples)
+        return self.tracer.trace_into(ledger, seed, first, samples)
 
 
 class Tray:
@@ -274,7 +293,9 @@ class Simulation:
         paths = physics.mirrors, physics.interreflection
         if not any(paths):
             return None
-        return IndirectTracer(loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points)
+        parts = loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points
+        sharing = NeighbourTracer(*parts)
+        return sharing if sharing.shares() else IndirectTracer(*parts)
 
     def _from_camera(self, points: SensorPoints) -> FromCameraTracer | None:
         loaded, physics = self.bench.loaded, self.physics
@@ -359,6 +380,18 @@ class Simulation:
         smooth = self.smooth.file(deposits.where(indirect), labels, samples)
         return self._light(deposits, samples, fine=fine, smooth=smooth)
 
+    def smooth_ledger(self, labels: Labels) -> Ledger | None:
+        """What indirect light that neighbours share is filed in by class in ``labels`` (n^2,), where it has room."""
+        bundle, tracer = self.smooth.bundle, self.indirect
+        if not isinstance(tracer, NeighbourTracer) or not Ledger.holds(bundle, labels):
+            return None
+        return Ledger(bundle, labels, tracer.board)
+
+    def file_smooth(self, ledger: Ledger) -> FiledLight:
+        """Light in a ``ledger`` of :meth:`smooth_ledger`."""
+        smooth, received, outside = ledger.filed()
+        return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
+
     def file_sharp(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`apart`, per sample.
 
@@ -395,7 +428,8 @@ class Simulation:
         if self.apart is not None:
             stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp")
         if self.indirect is not None:
-            stages["indirect"] = Stage(self.indirect, settings.indirect_samples, self.file_followed, "indirect")
+            ledger = self.smooth_ledger, self.file_smooth
+            stages["indirect"] = Stage(self.indirect, settings.indirect_samples, self.file_followed, "indirect", *ledger)
         if self.from_camera is not None:
             # The stream keeps the name that it had in 0.3.0, so that the same seed gives the same frames.
             samples = settings.from_camera_samples

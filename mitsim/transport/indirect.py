@@ -21,7 +21,7 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.receiver import Receiver, SensorPoints, sampled_wavelengths
+from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
 
 
@@ -61,10 +61,10 @@ class IndirectTracer(Tracer):
         return self.projector.n**2 * self.points.count
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return _Walk(self, seed, sample, lane).deposits(further=True)
+        return IndirectWalk(self, seed, sample, lane).deposits(further=True)
 
 
-class _Walk(Walk):
+class IndirectWalk(Walk):
     """Paths from the projector's pixels."""
 
     STATE = ("active", "ray", "strength", "bounce", "scattered", "straight", "rng", "kept")
@@ -74,9 +74,7 @@ class _Walk(Walk):
         self.tracer = tracer
         pixel, row, column = tracer.points.of(lane, tracer.projector.n**2)
         self.pixel, self.anchor = pixel, (row, column)
-        # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
-        shared, self.rng = streams(seed, pixel, sample)
-        self.first_turn = stratified(sample, shared)
+        self._begin(seed, sample)
         wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, self.rng)
         jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         self.ray = tracer.rays.sample(pixel, jitter, self.rng, wavelengths)
@@ -84,6 +82,12 @@ class _Walk(Walk):
         self.strength, self.active = mi.Spectrum(1), mi.Bool(True)
         self.bounce, self.scattered = mi.UInt32(0), mi.UInt32(0)
         self.sensor = tracer.points.at(*self.anchor, self.rng)
+
+    def _begin(self, seed: int, sample: mi.UInt32) -> None:
+        """Random numbers of each path, and the points that its first turn is drawn by."""
+        # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
+        shared, self.rng = streams(seed, self.pixel, sample)
+        self.first_turn = stratified(sample, shared)
 
     def vertex(self, first: bool) -> None:
         si = self.scene.ray_intersect(self.ray, self.active)
@@ -95,7 +99,11 @@ class _Walk(Walk):
     def _connect(self, si: mi.SurfaceInteraction3f) -> None:
         """Light that this surface sends to the sensor."""
         # Light that has met nothing but what it passes is the direct tracer's.
-        reception = self.tracer.receiver.receive(si, -self.ray.d, self.sensor, self.active & ~self.straight)
+        self._take(si, self.tracer.receiver.way(si, self.sensor, self.active & ~self.straight))
+
+    def _take(self, si: mi.SurfaceInteraction3f, way: Way) -> None:
+        """Keep the light that a surface sends by a ``way``."""
+        reception = self.tracer.receiver.received(si, -self.ray.d, way)
         value = panchromatic(reception.irradiance * self.flux * self.strength)
         caustic = self.scattered == 0
         value *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))

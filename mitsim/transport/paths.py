@@ -13,8 +13,9 @@ import mitsuba as mi
 from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits, Sightings
 from mitsim.transport.passage import Passage
 
-_KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
-_LANES_PER_LAUNCH = 2**22
+KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
+"""Kinds of light by their names in a walk."""
+LANES_PER_LAUNCH = 2**22
 """Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
 _SHARP = 1.0
 """Density [1/sr] of sampling a turn above which its light is looked for from the camera.
@@ -33,7 +34,9 @@ _LEAST_CHANCE = 1e-6
 """Strength is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
 
-def launches(lanes: int, first: int, samples: int) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
+def launches(
+    lanes: int, first: int, samples: int, at_once: int = LANES_PER_LAUNCH
+) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
     """(sample, lane) of every path, one kernel's at a time.
 
     Parameters
@@ -42,10 +45,12 @@ def launches(lanes: int, first: int, samples: int) -> Iterator[tuple[mi.UInt32, 
         paths of one sample.
     first, samples
         samples ``first`` .. ``first + samples - 1`` are meant.
+    at_once
+        paths of one kernel.
     """
     total, start = lanes * samples, lanes * first
-    for done in range(0, total, _LANES_PER_LAUNCH):
-        index = dr.arange(mi.UInt64, min(_LANES_PER_LAUNCH, total - done)) + dr.opaque(mi.UInt64, start + done)
+    for done in range(0, total, at_once):
+        index = dr.arange(mi.UInt64, min(at_once, total - done)) + dr.opaque(mi.UInt64, start + done)
         # An opaque number keeps the compiled kernel the same for every count.
         per_sample = dr.opaque(mi.UInt64, lanes)
         yield mi.UInt32(index // per_sample), mi.UInt32(index % per_sample)
@@ -68,7 +73,15 @@ def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
 
 
 class Tracer(ABC):
-    """Light of a scene; prepared once, each seed is an independent estimate."""
+    """Light of a scene; prepared once, each seed is an independent estimate.
+
+    Attributes
+    ----------
+    lanes_per_launch
+        paths of one kernel.
+    """
+
+    lanes_per_launch: ClassVar[int] = LANES_PER_LAUNCH
 
     @property
     @abstractmethod
@@ -94,7 +107,8 @@ class Tracer(ABC):
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        launched = [self._launch(seed, *launch) for launch in launches(self.lanes, first, samples)]
+        lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
+        launched = [self._launch(seed, *launch) for launch in lanes]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
 
@@ -128,7 +142,7 @@ class Walk(ABC):
         """
         self.passage, self.scene, self.straight = passage, passage.scene, mi.Bool(True)
         self.mirrors, self.interreflection = mirrors, interreflection
-        self.kept = {kind: Sightings.none() for kind in _KINDS}
+        self.kept = {kind: Sightings.none() for kind in KINDS}
 
     @abstractmethod
     def vertex(self, first: bool) -> None:
@@ -181,7 +195,7 @@ class Walk(ABC):
         if further:
             self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
         dr.eval(self.kept)
-        return [Deposits.fetched(seen, _KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
+        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
 
     def _body(self, *values: object) -> tuple[object, ...]:
         self._load(values)

@@ -1,0 +1,100 @@
+"""Light filed where it is traced: connections on the device in, a sparse matrix of light per row and place out.
+
+Light is added up in whole numbers of a small unit, so that the sums do not hang on the order in which threads add, and
+nothing but the sums is ever fetched. Where :class:`mitsim.transport.histogram.Bundle` splits light between two layers,
+the ledger draws one of them: the same in the mean.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import sparse
+
+from mitsim.core.arrays import Labels
+from mitsim.core.errors import MitsimError
+from mitsim.transport.histogram import Bundle, Sightings
+
+_MOST_PLACES = 2**26
+"""Places of all rows that are held: 0.5 GB."""
+_UNIT_BITS = 40
+"""Power of two of units in the light that is passed as one: 1e-12 of it is lost in rounding, and a place holds 2^24
+times as much."""
+_MOST_BITS = 62
+"""Power of two of units that one path may bring: more is no light, and two of them would overflow."""
+
+
+class Ledger:
+    """Sums of light by row and place.
+
+    Parameters
+    ----------
+    bundle
+        how light is filed; of one anchor, and not between cells.
+    labels
+        (n^2,) row of each projector pixel.
+    one
+        irradiance [W m^-2] that is far above a usual path's and far below 2^24 times as much.
+    """
+
+    def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
+        self._bundle, self._rows = bundle, int(labels.max()) + 1
+        self._width = bundle.size + 1
+        self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
+        self._labels = mi.UInt32(labels.astype(np.uint32))
+        # One place more for each row, of light from beyond all cells; and a last one that counts what is no light.
+        self._sums = dr.zeros(mi.UInt64, self._rows * self._width + 1)
+
+    @staticmethod
+    def holds(bundle: Bundle, labels: Labels) -> bool:
+        """Whether a ledger of these has room."""
+        fits = (int(labels.max()) + 1) * (bundle.size + 1) < _MOST_PLACES
+        return fits and bundle.anchors == 1 and not bundle.between
+
+    def place(self, seen: Sightings, chosen: mi.Float) -> mi.UInt32:
+        """Where light is filed that is ``seen``, its layer ``chosen`` by a random number in [0, 1)."""
+        grid, nodes = self._bundle.grid, [1 / depth for depth in self._bundle.depths]
+        inside, cells = mi.Bool(True), []
+        for axis, tau in ((grid.rows, seen.row), (grid.columns, seen.column)):
+            start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, 1 / axis.size)
+            cell = dr.floor((tau - start) * size)
+            inside &= (cell >= 0) & (cell < dr.opaque(mi.Float, axis.count))
+            cells.append(mi.UInt32(dr.maximum(cell, 0)))
+        layer = mi.UInt32(0)
+        for low, high in zip(nodes[:-1], nodes[1:], strict=True):
+            part = (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
+            layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
+        rows, columns = (dr.opaque(mi.UInt32, count) for count in grid.shape)
+        place = (layer * rows + cells[0]) * columns + cells[1]
+        return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size))
+
+    def add(self, light: mi.Float, pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
+        """File ``light`` [W m^-2] of projector pixels ``pixel`` in places, in lanes that are ``active``."""
+        units = light * dr.opaque(mi.Float, 1 / self._unit)
+        fits = (units >= 0) & (units < 2.0**_MOST_BITS)
+        row = dr.gather(mi.UInt32, self._labels, pixel, active)
+        index = dr.select(fits, row * dr.opaque(mi.UInt32, self._width) + place, self._rows * self._width)
+        amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
+        dr.scatter_reduce(dr.ReduceOp.Add, self._sums, amount, index, active, mode=dr.ReduceMode.Direct)
+
+    def filed(self) -> tuple[sparse.csr_array, float, float]:
+        """(rows + 1, places) light so far, the last row empty; all that was received, and what lay outside [W m^-2].
+
+        MitsimError where light is NaN, infinite, or beyond all numbers.
+        """
+        counted = np.array(self._sums)
+        if counted[-1]:
+            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+        places = np.flatnonzero(counted[:-1])
+        light = counted[places] * self._unit
+        starts = np.searchsorted(places, self._width * np.arange(self._rows + 1))
+        places -= np.repeat(self._width * np.arange(self._rows), np.diff(starts))
+        inside = places < self._bundle.size
+        outside = float(light[~inside].sum())
+        starts -= np.append(0, np.cumsum(~inside))[starts] if outside else 0
+        shape = self._rows + 1, self._bundle.size
+        entries = light[inside], places[inside].astype(np.int32), np.append(starts, starts[-1])
+        return sparse.csr_array(entries, shape=shape), float(light.sum()), outside

@@ -1,0 +1,284 @@
+"""Indirect light with shared second surfaces: neighbouring projector pixels light each other's second points.
+
+Light of projector pixel i comes to x1_i, is turned there toward x2_i, and goes on to the sensor or further. Where pixel
+k of the same block of ``SIDE`` x ``SIDE`` pixels found x2_k, x1_i sees it as well (or does not, which a ray tells): the
+balance heuristic over the block's N directions, each pixel's drawn by its own BSDF, gives the estimate::
+
+    L_i = sum_k  f_i(x2_k) V(x1_i, x2_k) / sum_j p_j(x2_k)  x  (what x2_k hands on of light from x1_i)
+
+f_i is what x1_i sends per area at x2_k, p_j the density per area with which x1_j would have found it, 0 where x1_j
+sends it nothing. It is unbiased (Veach and Guibas 1995; Bekaert, Sbert, Halton 2002, "Accelerating path tracing by
+re-using paths"), and bounded near edges where f_i grows. Shifting dots never light neighbours together, so that common
+points correlate their frames, but make none of them noisier.
+
+x2 hands on: to the sensor, by its BSDF, of each x1_i; and to further surfaces, where it is matt, as the path goes on
+that pixel k follows, scaled by the BSDF. A glossy x2 is followed further for its own pixel alone, because that scale
+has no bound. Deltas at x1 (mirrors), light of several wavelengths, and scenes that light passes straight are not
+shared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.transport.histogram import INDIRECT, Deposits, Sightings, check_finite
+from mitsim.transport.indirect import IndirectTracer, IndirectWalk
+from mitsim.transport.ledger import Ledger
+from mitsim.transport.paths import KINDS, camera_part, launches
+from mitsim.transport.receiver import Way
+from mitsim.transport.sampling import generator, panchromatic, stratified
+
+if TYPE_CHECKING:
+    Store = Callable[[mi.UInt32, mi.UInt32, list[mi.Float], mi.Bool], None]
+
+SIDE = 4
+"""Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""
+MEMBERS = SIDE**2
+_STEP, _TURN = 5, 16
+"""Members of a block take the points of their common sequence in turn; each sample begins five members on, and sixteen
+samples one more, so that each pixel's own points are spread over the sequence."""
+_LANES_PER_LAUNCH = 2**20
+"""Paths of one kernel: their pairs take 256 bytes a path."""
+_NOT_MATT = sum(
+    int(getattr(mi.BSDFFlags, name))
+    for name in ("Null", "GlossyReflection", "GlossyTransmission", "DeltaReflection", "DeltaTransmission")
+)
+"""Lobes that no matt material has."""
+
+
+class NeighbourTracer(IndirectTracer):
+    """The same light as :class:`IndirectTracer`'s, to one point of the sensor or random ones."""
+
+    lanes_per_launch = _LANES_PER_LAUNCH
+
+    @property
+    def lanes(self) -> int:
+        """Paths of one sample: one for each pixel, of whole blocks."""
+        return (-(-self.projector.n // SIDE) * SIDE) ** 2
+
+    def shares(self) -> bool:
+        """Whether what is to be followed can be shared: as the module says."""
+        several = self.points.count > 1 or not mi.is_monochromatic or mi.is_polarized
+        return self.interreflection and not several and not self.receiver.passage.open
+
+    @cached_property
+    def board(self) -> float:
+        """Irradiance [W m^-2] by a pixel's light from a white board where the rig is aligned, to which light compares."""
+        pixel = dr.arange(mi.UInt32, self.projector.n**2)
+        flux = np.array(panchromatic(self.rays.flux(pixel, mi.Color0f())))
+        return float(flux.mean(dtype=np.float64)) / (math.pi * self.receiver.geometry.scene_distance**2)
+
+    def trace_into(self, ledger: Ledger, seed: int, first: int, samples: int) -> Deposits:
+        """The same as :meth:`trace`, what is shared filed in a ``ledger``: what is not shared, on the host.
+
+        Parameters
+        ----------
+        ledger
+            of light by pixel, whose unit is :attr:`board`.
+        seed, first, samples
+            as for :meth:`trace`.
+        """
+        lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
+        launched = [_Block(self, seed, *launch).file(ledger) for launch in lanes]
+        return Deposits.joined([deposits for parts in launched for deposits in parts])
+
+    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        return _Block(self, seed, sample, lane).deposits(further=True)
+
+
+class _Block(IndirectWalk):
+    """Paths of whole blocks of pixels, the members of each one after the other."""
+
+    def __init__(self, tracer: NeighbourTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
+        self.block, self.member = lane // MEMBERS, lane % MEMBERS
+        n, blocks = (dr.opaque(mi.UInt32, count) for count in (tracer.projector.n, -(-tracer.projector.n // SIDE)))
+        row = (self.block // blocks) * SIDE + self.member // SIDE
+        column = (self.block % blocks) * SIDE + self.member % SIDE
+        inside = (row < n) & (column < n)
+        super().__init__(tracer, seed, sample, dr.minimum(row, n - 1) * n + dr.minimum(column, n - 1))
+        self.active &= inside
+
+    def _begin(self, seed: int, sample: mi.UInt32) -> None:
+        shared = dr.opaque(mi.UInt32, seed)
+        self.rng = generator(shared ^ (sample * 0x9E3779B9 + 1), self.pixel)
+        place = (self.member + sample * _STEP + sample // _TURN) % MEMBERS
+        self.first_turn = stratified(sample * MEMBERS + place, generator(shared, self.block))
+
+    def deposits(self, further: bool) -> list[Deposits]:
+        """Light on the host: of each pixel's own paths, and of all pairs of pixels and second points."""
+        own = self._own()
+        values = [dr.zeros(mi.Float, dr.width(self.lit) * MEMBERS) for _ in range(2)]
+
+        def store(place: mi.UInt32, at: mi.UInt32, light: list[mi.Float], active: mi.Bool) -> None:
+            for each, value in zip(values, light, strict=True):
+                dr.scatter(each, value, place, active)
+
+        self._hand_on(*self._weights(), store)
+        dr.eval(values)
+        return [*own, self._paired(values[0], self.way), self._paired(values[1], self.further)]
+
+    def file(self, ledger: Ledger) -> list[Deposits]:
+        """Light of each pixel's own paths on the host; that of pairs in a ``ledger``."""
+        own = self._own()
+        seen = Sightings(self.way.geometric, self.pixel, self.way.row, self.way.column, self.way.inverse_depth)
+        places = [ledger.place(each, self.rng.next_float32()) for each in (seen, self.further)]
+        dr.eval(places)
+
+        def store(place: mi.UInt32, at: mi.UInt32, light: list[mi.Float], active: mi.Bool) -> None:
+            for each, value in zip(places, light, strict=True):
+                lit = active & (value != 0)
+                ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
+
+        self._hand_on(*self._weights(), store)
+        return own
+
+    def _own(self) -> list[Deposits]:
+        """Follow all paths; on the host the light that is not shared."""
+        self._first()
+        self._second()
+        self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
+        kept = self.kept["indirect"]
+        followed = dr.select(self.follows, kept.value, 0)
+        self.further = Sightings(followed, kept.pixel, kept.row, kept.column, kept.inverse_depth)
+        kept.value = dr.select(self.follows, 0, kept.value)
+        dr.eval(vars(self))
+        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
+
+    def _first(self) -> None:
+        """The first surface, and each path's turn there."""
+        self.lit_by, self.power = mi.Ray3f(self.ray), panchromatic(self.flux)
+        self.lit_at = self.scene.ray_intersect_preliminary(self.ray, active=self.active)
+        si = self.lit_at.compute_surface_interaction(self.ray, active=self.active)
+        self.active &= si.is_valid()
+        self.lit = mi.Bool(self.active)
+        self._leave(si, True)
+
+    def _second(self) -> None:
+        """The second surface, its way to the sensor, and each path's turn there: of unit light where it is shared."""
+        self.arrived_by = mi.Ray3f(self.ray)
+        self.arrived_at = self.scene.ray_intersect_preliminary(self.ray, active=self.active)
+        si = self.arrived_at.compute_surface_interaction(self.ray, active=self.active)
+        self.active &= si.is_valid()
+        self.shared = self.active & (self.scattered == 1)
+        self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
+        self.way = self.tracer.receiver.way(si, self.sensor, self.active & ~self.straight)
+        self._take(si, replace(self.way, open=self.way.open & ~self.shared))
+        self.follows = self.shared & ((si.bsdf().flags() & _NOT_MATT) == 0)
+        self.strength = dr.select(self.follows, 1, self.strength)
+        self.flux = dr.select(self.follows, 1, self.flux)
+        self._leave(si, False)
+        self.turned = self._turn(si, -self.arrived_by.d, self.ray.d, self.active & self.follows)
+        self.onward = mi.Vector3f(self.ray.d)
+
+    @staticmethod
+    def _turn(
+        si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
+    ) -> mi.Float:
+        """Light that a surface turns from ``toward`` to ``onward``, but for a factor of the latter."""
+        si.wi = si.to_local(toward)
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        value = panchromatic(mi.unpolarized_spectrum(si.bsdf().eval(context, si, si.to_local(onward), active)))
+        value *= dr.abs(mi.Frame3f.cos_theta(si.wi) / dr.dot(si.n, toward))
+        return dr.select(active & dr.isfinite(value), value, 0)
+
+    def _weights(self) -> tuple[mi.Float, mi.Float]:
+        """(lanes * members,) what each pixel sends to each second point of its block; (lanes,) the points' densities."""
+        width = dr.width(self.lit)
+        sent, density = (dr.zeros(mi.Float, width * MEMBERS) for _ in range(2))
+        index, si = dr.arange(mi.UInt32, width), self._first_points()
+        first, toward = index - self.member, -self.lit_by.d
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+
+        def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
+            point, normal = (dr.gather(type(each), each, first + other) for each in (self.point, self.normal))
+            active = self.lit & dr.gather(mi.Bool, self.shared, first + other)
+            offset = point - si.p
+            squared = dr.squared_norm(offset)
+            direction = offset * dr.rsqrt(squared)
+            local = si.to_local(direction)
+            reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
+            turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
+            turned /= mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward)
+            to_area = dr.abs(dr.dot(normal, direction)) / squared
+            value = panchromatic(mi.unpolarized_spectrum(reflected)) * dr.abs(turned) * to_area
+            active &= (value > 0) & (value < dr.inf) & (pdf > 0)
+            another = active & (other != self.member)
+            active &= ~self.scene.ray_test(si.spawn_ray_to(point), another) | ~another
+            place = index * MEMBERS + other
+            dr.scatter(sent, value, place, active)
+            dr.scatter(density, pdf * to_area, place, active)
+            return (other + 1,)
+
+        dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
+        dr.eval(sent, density)
+        # Gathered in one order: sums of floating-point numbers that are scattered hang on the threads.
+        total = mi.Float(0)
+        for member in range(MEMBERS):
+            total += dr.gather(mi.Float, density, (first + member) * MEMBERS + self.member)
+        return sent, total
+
+    def _hand_on(self, sent: mi.Float, density: mi.Float, store: Store) -> None:
+        """Light of each pixel by each second point of its block, straight to the sensor and further on.
+
+        Parameters
+        ----------
+        sent, density
+            as :meth:`_weights` has them.
+        store
+            takes the light of pairs: their place among all, the lane of the second point, the two lights, and which
+            lanes count.
+        """
+        index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
+        first = index - self.member
+        dr.eval(density)
+
+        def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
+            place, at = index * MEMBERS + other, first + other
+            weight = dr.gather(mi.Float, sent, place) / dr.gather(mi.Float, density, at)
+            active = self.lit & (weight > 0)
+            weight *= self.power
+            met, ray = (dr.gather(type(each), each, at, active) for each in (self.arrived_at, self.arrived_by))
+            second = met.compute_surface_interaction(ray, active=active)
+            toward = dr.normalize(si.p - second.p)
+            way = dr.gather(Way, self.way, at, active)
+            reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
+            connected = panchromatic(reception.irradiance) * (1 - camera_part(reception.pdf)) * weight
+            beyond = dr.gather(mi.Float, self.further.value, at, active)
+            onward, turned = (dr.gather(type(each), each, at, active) for each in (self.onward, self.turned))
+            handed = active & (beyond > 0) & (turned > 0)
+            scale = self._turn(second, toward, onward, handed) / turned
+            store(place, at, [connected, dr.select(handed, beyond * scale * weight, 0)], active)
+            return (other + 1,)
+
+        dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
+
+    def _first_points(self) -> mi.SurfaceInteraction3f:
+        return self.lit_at.compute_surface_interaction(self.lit_by, active=self.lit)
+
+    def _paired(self, values: mi.Float, seen: Way | Sightings) -> Deposits:
+        """Light on the host of pairs of pixels and second points."""
+        light = np.array(values)
+        check_finite(light)
+        pairs = np.flatnonzero(light)
+        lane, other = np.divmod(pairs, MEMBERS)
+        at = lane - lane % MEMBERS + other
+        none = np.zeros(len(pairs), np.int64)
+        row, column, inverse = (np.array(part)[at] for part in (seen.row, seen.column, seen.inverse_depth))
+        return Deposits(
+            pixel=np.array(self.pixel)[lane].astype(np.int64),
+            anchor_row=none,
+            anchor_column=none,
+            row=row.astype(np.float64),
+            column=column.astype(np.float64),
+            inverse_depth=inverse.astype(np.float64),
+            value=light[pairs].astype(np.float64),
+            kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
+        )
