@@ -255,6 +255,7 @@ class _Table:
             followed_width=width,
             coarse_cells=coarse,
             coarse_layers=bool(all_layers),
+            shared=self.evidence.shared,
             reach=self.evidence.reach,
             sharp=self.evidence.sharp,
             occluded=self.evidence.occluded,

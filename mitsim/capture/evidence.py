@@ -83,6 +83,8 @@ class Settings:
     coarse_cells, coarse_layers
         cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
         they have all layers or one.
+    shared
+        whether neighbouring pixels share the second points of indirect light (:mod:`mitsim.transport.neighbours`).
     reach
         largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None: no more
         than of light at ``depth``.
@@ -108,6 +110,7 @@ class Settings:
     followed_width: int = 1
     coarse_cells: int = 1
     coarse_layers: bool = False
+    shared: bool = False
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_samples: float = 1.0
@@ -290,6 +293,8 @@ class Evidence:
         effects that are no part of the expected frames, with the independent error of leaving each out.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
+    shared
+        as in :class:`Settings`: where that takes less for as little noise; ``indirect`` is then what that takes.
     left_out
         light that no tracer finds, over that and what is found (:mod:`mitsim.transport.left_out`).
     mirror
@@ -315,6 +320,7 @@ class Evidence:
     unresolved: float = 0.0
     left_out: float = 0.0
     mirror: int | None = None
+    shared: bool = False
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())

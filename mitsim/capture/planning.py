@@ -89,7 +89,9 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
             at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
             continue
         field = f"{name}_light" if name in ("sharp", "occluded") else name
-        found[field] = replace(getattr(evidence, field), seconds=seconds / stage.tracer.lanes)
+        effort = getattr(evidence, field)
+        # A path of shared light counts for several.
+        found[field] = replace(effort, seconds=seconds / (effort.paths if name == "indirect" else stage.tracer.lanes))
     if at_anchors[1]:
         found["followed"] = replace(evidence.followed, seconds=at_anchors[0] / at_anchors[1])
     return replace(evidence, **found)

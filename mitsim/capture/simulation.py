@@ -268,7 +268,7 @@ class Simulation:
     def indirect(self) -> IndirectTracer | None:
         """Follows light over several surfaces from the projector to the sensor's centre, or to all of it where it has
         anchors; none where there is none."""
-        return self._indirect(self._mean_points)
+        return self._indirect(self._mean_points, self.settings.shared)
 
     @cached_property
     def from_camera(self) -> FromCameraTracer | None:
@@ -288,14 +288,13 @@ class Simulation:
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
 
-    def _indirect(self, points: SensorPoints) -> IndirectTracer | None:
+    def _indirect(self, points: SensorPoints, shared: bool = False) -> IndirectTracer | None:
         loaded, physics = self.bench.loaded, self.physics
         paths = physics.mirrors, physics.interreflection
         if not any(paths):
             return None
         parts = loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points
-        sharing = NeighbourTracer(*parts)
-        return sharing if sharing.shares() else IndirectTracer(*parts)
+        return NeighbourTracer(*parts) if shared else IndirectTracer(*parts)
 
     def _from_camera(self, points: SensorPoints) -> FromCameraTracer | None:
         loaded, physics = self.bench.loaded, self.physics

@@ -204,6 +204,7 @@ class Look:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         samples = self.samples["effects"].followed * LOOKS
+        indirect, shared = switched.indirect_effort()
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
@@ -214,7 +215,8 @@ class Look:
             direct=fine.effort(light),
             spread=fine.spread(light),
             anchored=anchored.effort(light),
-            indirect=switched.effort("indirect"),
+            indirect=indirect,
+            shared=shared,
             from_camera=switched.effort("from_camera"),
             forming=self.forming,
             apart=switched.apart,

@@ -11,11 +11,13 @@ from mitsim.capture.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
 from mitsim.capture.pilot.looks import Sample, coarsened, noise, norm
 from mitsim.capture.pilot.sharp import SHARP_RATE
+from mitsim.capture.prices import SHARED_COST
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.transport import histogram
 from mitsim.transport.histogram import Deposits
+from mitsim.transport.neighbours import NeighbourTracer
 
 _KINDS = {"indirect": histogram.INDIRECT, "ambient": histogram.AMBIENT}
 _TRACERS = ("indirect", "from_camera")
@@ -88,6 +90,22 @@ class SwitchedEffects:
         relative = error / self.light if self.light else 0.0
         return Effort(Noise(relative, self.sample.followed, 0.5), lanes)
 
+    def indirect_effort(self) -> tuple[Effort, bool]:
+        """What light over several surfaces takes, and whether that is less where neighbouring pixels share it."""
+        plain, tracer = self.effort("indirect"), self._sharing.indirect
+        if not plain.noise.error or not isinstance(tracer, NeighbourTracer) or not tracer.shares():
+            return plain, False
+        samples = max(1, self.sample.followed // SHARED_COST)
+        seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
+        error = noise(self._form(self._sharing, [Deposits.none()] * LOOKS, seen, samples=samples)) / self.light
+        shared = Effort(Noise(error, samples, 0.5), SHARED_COST * tracer.lanes)
+        less = shared.variance * shared.paths < plain.variance * plain.paths
+        return (shared, True) if less else (plain, False)
+
+    @cached_property
+    def _sharing(self) -> Simulation:
+        return Simulation(self.bench, replace(self.everything, shared=True))
+
     def sharp_effort(self) -> Effort:
         """The same of pixels that are traced apart, their rate being that of stratified rays."""
         tracer = self.simulation.apart
@@ -149,15 +167,16 @@ class SwitchedEffects:
         direct: list[Deposits],
         followed: list[Deposits],
         sharp: Sequence[Deposits] = (),
+        samples: int | None = None,
     ) -> FloatArray:
+        """Frames of light look by look; ``samples`` of followed light, if not as many as of all."""
         sample, labels = self.sample, self.sample.lighting.labels
         lights = [
             simulation.file_direct(one, labels, sample.direct)
-            + simulation.file_followed(other, labels, sample.followed)
+            + simulation.file_followed(other, labels, samples or sample.followed)
             for one, other in zip(direct, followed, strict=True)
         ]
         if sharp:
-            samples = sample.sharp(simulation)
-            apart = [simulation.file_sharp(look, labels, samples) for look in sharp]
+            apart = [simulation.file_sharp(look, labels, sample.sharp(simulation)) for look in sharp]
             lights = [light + more for light, more in zip(lights, apart, strict=True)]
         return sample.frames(simulation, lights)
