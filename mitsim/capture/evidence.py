@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.parallel import single_threaded_blas
 
 Number = float | FloatArray
 COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors", "followed_width")
@@ -210,14 +211,10 @@ class Changes:
     @classmethod
     def between(cls, seen: Mapping[Part, FloatArray], energy: float) -> Changes:
         """Of changes (looks, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
-        count = len(seen)
-        products = np.zeros((LOOKS, LOOKS, count, count))
-        flat = [change.reshape(LOOKS, -1) for change in seen.values()]
-        for i, first in enumerate(flat):
-            for j, second in enumerate(flat[: i + 1]):
-                # Not by BLAS, whose sums depend on the number of its threads in the last bits.
-                pairs = np.einsum("an,bn->ab", first, second)
-                products[:, :, i, j], products[:, :, j, i] = pairs, pairs.T
+        flat = np.array([change.reshape(LOOKS, -1) for change in seen.values()]).reshape(len(seen) * LOOKS, -1)
+        with single_threaded_blas():  # sums of several threads depend on their number in the last bits
+            pairs = (flat @ flat.T).reshape(len(seen), LOOKS, len(seen), LOOKS)
+        products = np.ascontiguousarray(pairs.transpose(1, 3, 0, 2))
         return cls(tuple(seen), products / energy if energy > 0 else products)
 
     def squared(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:

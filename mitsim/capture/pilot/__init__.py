@@ -16,7 +16,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import LOOKS, Changes, Effort, Evidence, Forming, Part, Settings
 from mitsim.capture.pilot.direct import AnchoredLight, FineLight, OccludedLight
 from mitsim.capture.pilot.followed import FollowedLight
-from mitsim.capture.pilot.looks import Sample
+from mitsim.capture.pilot.looks import GOOD_ENOUGH, Sample
 from mitsim.capture.pilot.occluded import SMOOTH, occluded_pixels
 from mitsim.capture.pilot.reach import light_reach
 from mitsim.capture.pilot.sharp import sharp_pixels
@@ -49,8 +49,13 @@ FINER = 4
 """Samples of a stage over those of the look before: standard errors are halved at least."""
 _ROUGH = 0.5
 """Part of the accuracy that a few anchors may leave at most before it is asked which pixels are to blame."""
+_OF_FOLLOWED = 0.5
+"""The same for followed light: every further step takes twice as many connections, and its own noise is as large as
+what it tells."""
 _FRAMES_AS_MANY = 20.0
 """Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
+_OF_EFFECTS = 3
+"""Changes that each effect's look takes as long as: it forms all light with and without, and coarse cells besides."""
 _LOBE_RAYS = 2**22
 """Rays that look for sharp lobes, some 0.5 s: a lobe of 1e-4 of the hemisphere is met 400 times, a metal ball of 20 mm
 at 370 twelve times on a sensor of 6.4 mm; a quarter of them overlooked it in one plan of twenty."""
@@ -149,7 +154,7 @@ class Look:
             paths, changes = FIXED.followed * lanes * finer.followed * connections, len(self.followed.changes)
         else:
             followed = sum(getattr(FIXED, name) * lanes for name, lanes in self.switched.lanes.items())
-            paths, changes = FIXED.direct * pixels * finer.direct + followed * finer.followed, len(self.present)
+            paths, changes = FIXED.direct * pixels * finer.direct + followed * finer.followed, _OF_EFFECTS * len(self.present)
         return LOOKS * paths + changes * float(one)
 
     @property
@@ -170,17 +175,16 @@ class Look:
         elif stage == "effects":
             self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
         elif stage == "followed":
-            self.followed = FollowedLight(bench, self._everything, sample, self._tolerance, seed, self.fine.judging)
+            self.followed = FollowedLight(bench, self._everything, sample, self._tolerance(_OF_FOLLOWED), seed, self.fine.judging)
         elif stage == "occluded":
             if base.occluded:
-                self.occluded = OccludedLight(bench, base, sample, self._tolerance, seed, self.fine.judging)
+                self.occluded = OccludedLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)
         else:
-            self.anchored = AnchoredLight(bench, base, sample, self._tolerance, seed, self.fine.judging)
+            self.anchored = AnchoredLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)
 
-    @property
-    def _tolerance(self) -> float:
-        """Norm of a change of the frames that the capture may leave."""
-        return self.accuracy * self.switched.light
+    def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
+        """Norm of that ``part`` of all light that the capture may leave out."""
+        return part * self.accuracy * self.switched.light
 
     @property
     def _everything(self) -> Settings:

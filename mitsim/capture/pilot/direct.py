@@ -13,7 +13,7 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Effort, Forming, Noise, Part, Settings
-from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, coarsened, ladder, noise, norm
+from mitsim.capture.pilot.looks import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, ladder, noise, norm
 from mitsim.capture.simulation import FiledLight, Simulation, Tray
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
@@ -95,7 +95,7 @@ class FineLight:
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of cells and layers that was tried."""
         found: dict[Part, FloatArray] = {}
-        first, tolerance = _FIRST_JUDGES["cells"], self.accuracy * norm(self._whole)
+        first, tolerance = _FIRST_JUDGES["cells"], GOOD_ENOUGH * self.accuracy * norm(self._whole)
         cells = ladder(CELL_LADDER, lambda count: self._frames((), count), first, tolerance, EVEN_CELLS)
         found |= {Part("cells", count): change for count, change in cells.items()}
         if len(self.layers) > 1:

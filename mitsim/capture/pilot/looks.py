@@ -38,8 +38,8 @@ EVEN_CELLS = 0.25
 """Half as large cells leave this much of the error where light is smooth: they are of second order."""
 _UNKNOWN_GAIN = 0.5
 """What a step leaves of the one before where that is not known, or not small."""
-_GOOD_ENOUGH = 0.3
-"""Part of the tolerance below which a finer step is not tried: its square is a tenth of the budget's."""
+GOOD_ENOUGH = 0.3
+"""Part of the accuracy below which a finer step is not tried: its square is a tenth of the budget's."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def ladder(
     first
         index of the step that judges at first; finer ones are tried until the one before the judge is good enough.
     tolerance
-        norm of a change of the frames that the capture may leave: its accuracy times the norm of all light.
+        norm of the change by a finer step below which none is tried.
     least_gain
         what a step leaves at least of the one before, where that is known.
     """
@@ -149,7 +149,7 @@ def ladder(
         last = tried[judge] - tried[before]
         gain = _gain(norm(last), norm(tried[before] - tried[earlier[-1]])) if earlier else _UNKNOWN_GAIN
         rest = max(gain, least_gain) / (1 - max(gain, least_gain))
-        if (1 + rest) * norm(last) <= _GOOD_ENOUGH * tolerance or judge == counts[-1]:
+        if (1 + rest) * norm(last) <= tolerance or judge == counts[-1]:
             break
         following = counts[counts.index(judge) + 1]
         tried[following] = frames(following)
