@@ -11,15 +11,17 @@ sends it nothing. It is unbiased (Veach and Guibas 1995; Bekaert, Sbert, Halton 
 re-using paths"), and bounded near edges where f_i grows. Shifting dots never light neighbours together, so that common
 points correlate their frames, but make none of them noisier.
 
-x2 hands on: to the sensor, by its BSDF, of each x1_i; and to further surfaces, where it is matt, as the path goes on
-that pixel k follows, scaled by the BSDF. A glossy x2 is followed further for its own pixel alone, because that scale
-has no bound. Deltas at x1 (mirrors), light of several wavelengths, and scenes that light passes straight are not
+x2 hands on: to the sensor, by its BSDF, of each x1_i; and to further surfaces, where it is diffuse, as the path goes on
+that pixel k follows. Such a path leaves x2 on the side that x1_k lights, by the shading normal; it stands for light of
+those x1_i that light the same side, and in its density count only x1_j that do. A glossy x2 is followed further for its
+own pixel alone. Deltas at x1 (mirrors), light of several wavelengths, and scenes that light passes straight are not
 shared.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -47,11 +49,10 @@ _STEP, _TURN = 5, 16
 samples one more, so that each pixel's own points are spread over the sequence."""
 _LANES_PER_LAUNCH = 2**20
 """Paths of one kernel: their pairs take 256 bytes a path."""
-_NOT_MATT = sum(
-    int(getattr(mi.BSDFFlags, name))
-    for name in ("Null", "GlossyReflection", "GlossyTransmission", "DeltaReflection", "DeltaTransmission")
-)
-"""Lobes that no matt material has."""
+_MOST_COMPARED = 32
+"""Shapes that each second point is compared with: every comparison is an instruction of the kernel."""
+_REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")
+"""Parameters of a diffuse material, one-sided or two-sided, and of no other."""
 
 
 class NeighbourTracer(IndirectTracer):
@@ -68,6 +69,12 @@ class NeighbourTracer(IndirectTracer):
         """Whether what is to be followed can be shared: as the module says."""
         several = self.points.count > 1 or not mi.is_monochromatic or mi.is_polarized
         return self.interreflection and not several and not self.receiver.passage.open
+
+    @cached_property
+    def diffuse(self) -> frozenset[int]:
+        """Places among the scene's shapes of those whose material is diffuse and nothing else: no bumps, no coat."""
+        shapes = enumerate(self.scene.shapes())
+        return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
 
     @cached_property
     def board(self) -> float:
@@ -92,6 +99,13 @@ class NeighbourTracer(IndirectTracer):
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         return _Block(self, seed, sample, lane).deposits(further=True)
+
+
+def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
+    """Whether a material reflects like Lambert's, on one side or on either."""
+    if bsdf is None or bsdf.class_name() not in ("SmoothDiffuse", "TwoSidedBRDF"):
+        return False
+    return all(_REFLECTANCE.match(name) for name in mi.traverse(bsdf).keys())  # noqa: SIM118 - no dictionary
 
 
 class _Block(IndirectWalk):
@@ -134,7 +148,7 @@ class _Block(IndirectWalk):
 
         def store(place: mi.UInt32, at: mi.UInt32, light: list[mi.Float], active: mi.Bool) -> None:
             for each, value in zip(places, light, strict=True):
-                lit = active & (value != 0)
+                lit = active & ~(value == 0)  # not a number is light to be refused
                 ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
 
         self._hand_on(*self._weights(), store)
@@ -171,12 +185,26 @@ class _Block(IndirectWalk):
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
         self.way = self.tracer.receiver.way(si, self.sensor, self.active & ~self.straight)
         self._take(si, replace(self.way, open=self.way.open & ~self.shared))
-        self.follows = self.shared & ((si.bsdf().flags() & _NOT_MATT) == 0)
+        self.follows = self.shared & self._diffuse(si)
+        self.shading = mi.Normal3f(si.sh_frame.n)
+        self.side = dr.sign(dr.dot(self.shading, -self.arrived_by.d))
         self.strength = dr.select(self.follows, 1, self.strength)
         self.flux = dr.select(self.follows, 1, self.flux)
         self._leave(si, False)
         self.turned = self._turn(si, -self.arrived_by.d, self.ray.d, self.active & self.follows)
         self.onward = mi.Vector3f(self.ray.d)
+
+    def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Whether the surfaces at ``si`` are diffuse; of very many materials none counts as such."""
+        shapes, diffuse = self.scene.shapes(), self.tracer.diffuse
+        others = frozenset(range(len(shapes))) - diffuse
+        few = min(diffuse, others, key=len)
+        if len(few) > _MOST_COMPARED:
+            return mi.Bool(False)
+        found = mi.Bool(False)
+        for place in few:
+            found |= si.shape == mi.ShapePtr(shapes[place])
+        return found if few is diffuse else ~found
 
     @staticmethod
     def _turn(
@@ -189,8 +217,9 @@ class _Block(IndirectWalk):
         value *= dr.abs(mi.Frame3f.cos_theta(si.wi) / dr.dot(si.n, toward))
         return dr.select(active & dr.isfinite(value), value, 0)
 
-    def _weights(self) -> tuple[mi.Float, mi.Float]:
-        """(lanes * members,) what each pixel sends to each second point of its block; (lanes,) the points' densities."""
+    def _weights(self) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """(lanes * members,) what each pixel sends to each second point of its block, negative to its other side;
+        (lanes,) the points' densities, and those with which their own side is lit."""
         width = dr.width(self.lit)
         sent, density = (dr.zeros(mi.Float, width * MEMBERS) for _ in range(2))
         index, si = dr.arange(mi.UInt32, width), self._first_points()
@@ -198,7 +227,8 @@ class _Block(IndirectWalk):
         context = mi.BSDFContext(mi.TransportMode.Importance)
 
         def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
-            point, normal = (dr.gather(type(each), each, first + other) for each in (self.point, self.normal))
+            known = self.point, self.normal, self.shading, self.side
+            point, normal, shading, side = (dr.gather(type(each), each, first + other) for each in known)
             active = self.lit & dr.gather(mi.Bool, self.shared, first + other)
             offset = point - si.p
             squared = dr.squared_norm(offset)
@@ -212,25 +242,26 @@ class _Block(IndirectWalk):
             active &= (value > 0) & (value < dr.inf) & (pdf > 0)
             another = active & (other != self.member)
             active &= ~self.scene.ray_test(si.spawn_ray_to(point), another) | ~another
-            place = index * MEMBERS + other
-            dr.scatter(sent, value, place, active)
-            dr.scatter(density, pdf * to_area, place, active)
+            place, sign = index * MEMBERS + other, dr.select(dr.dot(shading, direction) * side < 0, mi.Float(1), -1)
+            dr.scatter(sent, value * sign, place, active)
+            dr.scatter(density, pdf * to_area * sign, place, active)
             return (other + 1,)
 
         dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
         dr.eval(sent, density)
         # Gathered in one order: sums of floating-point numbers that are scattered hang on the threads.
-        total = mi.Float(0)
+        whole, same_side = mi.Float(0), mi.Float(0)
         for member in range(MEMBERS):
-            total += dr.gather(mi.Float, density, (first + member) * MEMBERS + self.member)
-        return sent, total
+            each = dr.gather(mi.Float, density, (first + member) * MEMBERS + self.member)
+            whole, same_side = whole + dr.abs(each), same_side + dr.maximum(each, 0)
+        return sent, whole, same_side
 
-    def _hand_on(self, sent: mi.Float, density: mi.Float, store: Store) -> None:
+    def _hand_on(self, sent: mi.Float, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
         """Light of each pixel by each second point of its block, straight to the sensor and further on.
 
         Parameters
         ----------
-        sent, density
+        sent, whole, same_side
             as :meth:`_weights` has them.
         store
             takes the light of pairs: their place among all, the lane of the second point, the two lights, and which
@@ -238,13 +269,13 @@ class _Block(IndirectWalk):
         """
         index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
         first = index - self.member
-        dr.eval(density)
+        dr.eval(whole, same_side)
 
         def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
             place, at = index * MEMBERS + other, first + other
-            weight = dr.gather(mi.Float, sent, place) / dr.gather(mi.Float, density, at)
-            active = self.lit & (weight > 0)
-            weight *= self.power
+            given = dr.gather(mi.Float, sent, place)
+            active = self.lit & (given != 0)
+            weight = self.power * dr.abs(given) / dr.gather(mi.Float, whole, at)
             met, ray = (dr.gather(type(each), each, at, active) for each in (self.arrived_at, self.arrived_by))
             second = met.compute_surface_interaction(ray, active=active)
             toward = dr.normalize(si.p - second.p)
@@ -253,9 +284,10 @@ class _Block(IndirectWalk):
             connected = panchromatic(reception.irradiance) * (1 - camera_part(reception.pdf)) * weight
             beyond = dr.gather(mi.Float, self.further.value, at, active)
             onward, turned = (dr.gather(type(each), each, at, active) for each in (self.onward, self.turned))
-            handed = active & (beyond > 0) & (turned > 0)
+            handed = active & (given > 0) & (beyond > 0) & (turned > 0)
             scale = self._turn(second, toward, onward, handed) / turned
-            store(place, at, [connected, dr.select(handed, beyond * scale * weight, 0)], active)
+            further = beyond * scale * self.power * given / dr.gather(mi.Float, same_side, at)
+            store(place, at, [connected, dr.select(handed, further, 0)], active)
             return (other + 1,)
 
         dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)

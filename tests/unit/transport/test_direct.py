@@ -179,7 +179,7 @@ def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatc
     assert not np.isin(whole.row, other.row).any()
     # A sequence in pieces, in samples or in launches, is the same sequence.
     pieces = Deposits.joined([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
-    monkeypatch.setattr(paths, "_LANES_PER_LAUNCH", 300)
+    monkeypatch.setattr(paths.Tracer, "lanes_per_launch", 300)
     launches = trace.trace(1, 0, 4)
     for parts in (pieces, launches):
         assert np.array_equal(parts.pixel, whole.pixel) and np.allclose(parts.row, whole.row, atol=1e-6)

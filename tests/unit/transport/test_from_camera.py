@@ -81,7 +81,7 @@ def test_seeds_and_launches(outdoors: Bench, monkeypatch: pytest.MonkeyPatch) ->
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert np.isin(whole.row, other.row).mean() < 0.01
     pieces = Deposits.joined([trace.trace(6, 0, 1), trace.trace(6, 1, 3)])
-    monkeypatch.setattr(paths, "_LANES_PER_LAUNCH", 300)
+    monkeypatch.setattr(paths.Tracer, "lanes_per_launch", 300)
     for parts in (pieces, trace.trace(6, 0, 4)):
         assert np.allclose(parts.row, whole.row, atol=1e-6) and np.allclose(parts.value, whole.value, rtol=1e-5)
 

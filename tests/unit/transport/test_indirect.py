@@ -179,7 +179,7 @@ def test_seeds_and_launches(hollow: Bench, monkeypatch: pytest.MonkeyPatch) -> N
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert np.isin(whole.row, other.row).mean() < 0.01
     pieces = Deposits.joined([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
-    monkeypatch.setattr(paths, "_LANES_PER_LAUNCH", 3000)
+    monkeypatch.setattr(paths.Tracer, "lanes_per_launch", 3000)
     order = np.argsort(whole.value)
     for parts in (pieces, trace.trace(6, 0, 64)):
         mine = np.argsort(parts.value)
