@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
@@ -26,6 +27,7 @@ from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.histogram import Deposits
+from mitsim.transport.ledger import Ledger
 
 if TYPE_CHECKING:
     from mitsim.core.job import Job
@@ -364,8 +366,8 @@ class _Group:
                     filed.append(filing.submit(self._filed, name, stage, deposits))
                     self.done[name] = done + count
                     self.paths += count * stage.tracer.lanes
-                if ledger and stage.file_ledger:
-                    self._add(name, stage.file_ledger(ledger), None)
+                if ledger:
+                    filed.append(filing.submit(self._from_ledger, name, stage, ledger, ledger.fetched()))
             while filed:
                 self._add(*filed.popleft().result())
 
@@ -373,6 +375,14 @@ class _Group:
         """Light of a stage, and the flux of each pixel where it is direct light."""
         flux = self.simulation.flux(deposits, 1) if name in self._flux else None
         return name, stage.file(deposits, self.labels, 1), flux
+
+    @staticmethod
+    def _from_ledger(
+        name: str, stage: Stage, ledger: Ledger, counted: npt.NDArray[np.uint64]
+    ) -> tuple[str, FiledLight, None]:
+        """Light of a stage that its ledger ``counted``."""
+        assert stage.file_ledger is not None
+        return name, stage.file_ledger(ledger, counted), None
 
     def _add(self, name: str, light: FiledLight, flux: FloatArray | None) -> None:
         self._sums[name] = self._sums[name] + light if name in self._sums else light

@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
@@ -66,7 +68,7 @@ class FiledLight:
     outside: float = 0.0
 
     def __add__(self, other: FiledLight) -> FiledLight:
-        return FiledLight(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
+        return FiledLight(*(_sum(getattr(self, field.name), getattr(other, field.name)) for field in fields(self)))
 
     def __truediv__(self, count: float) -> FiledLight:
         return FiledLight(*(getattr(self, field.name) / count for field in fields(self)))
@@ -82,12 +84,20 @@ class FiledLight:
         return self.outside / self.received if self.outside else 0.0
 
 
+def _sum(one: Any, other: Any) -> Any:
+    """Of numbers or matrices; a matrix to which nothing is added is not copied."""
+    if not isinstance(one, sparse.csr_array) or (one.nnz and other.nnz):
+        return one + other
+    return one if one.nnz else other
+
+
 @dataclass(frozen=True)
 class Stage:
     """A tracer, the samples of it that the plan predicted, how its light is filed, and its random stream's name.
 
     ``file`` takes deposits, labels and the number of samples. ``ledger`` makes, from labels, what the light that
-    neighbouring pixels share is filed in on the device, and ``file_ledger`` takes it; None without such light.
+    neighbouring pixels share is filed in on the device, and ``file_ledger`` takes it and its sums on the host; None
+    without such light.
     """
 
     tracer: DirectTracer | IndirectTracer | FromCameraTracer
@@ -95,7 +105,7 @@ class Stage:
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
     ledger: Callable[[Labels], Ledger | None] = lambda labels: None
-    file_ledger: Callable[[Ledger], FiledLight] | None = None
+    file_ledger: Callable[[Ledger, npt.NDArray[np.uint64]], FiledLight] | None = None
 
     def trace(self, seed: int, first: int, samples: int, ledger: Ledger | None) -> Deposits:
         """Light of some samples, but for what is filed in the ``ledger``.
@@ -386,9 +396,9 @@ class Simulation:
             return None
         return Ledger(bundle, labels, tracer.board)
 
-    def file_smooth(self, ledger: Ledger) -> FiledLight:
-        """Light in a ``ledger`` of :meth:`smooth_ledger`."""
-        smooth, received, outside = ledger.filed()
+    def file_smooth(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
+        """Light in a ``ledger`` of :meth:`smooth_ledger`, from what it ``counted``."""
+        smooth, received, outside = ledger.filed(counted)
         return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
 
     def file_sharp(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
@@ -428,7 +438,9 @@ class Simulation:
             stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp")
         if self.indirect is not None:
             ledger = self.smooth_ledger, self.file_smooth
-            stages["indirect"] = Stage(self.indirect, settings.indirect_samples, self.file_followed, "indirect", *ledger)
+            stages["indirect"] = Stage(
+                self.indirect, settings.indirect_samples, self.file_followed, "indirect", *ledger
+            )
         if self.from_camera is not None:
             # The stream keeps the name that it had in 0.3.0, so that the same seed gives the same frames.
             samples = settings.from_camera_samples

@@ -308,11 +308,11 @@ def _formed(
     def form(row: int) -> None:
         for optics, parts in mixed:
             estimates = [_row(part, row) for part in parts]
-            if with_frames:
-                frame, seen = optics.seen(estimates, probes)
-                frames[row] += frame
-            else:
-                seen = optics.probe(estimates, probes)
+            if probes is not None and not with_frames:
+                probed[row] += optics.probe(estimates, probes).ravel()
+                continue
+            frame, seen = optics.seen(estimates, probes)
+            frames[row] += frame
             probed[row] += seen.ravel()
 
     in_threads(form, range(count))

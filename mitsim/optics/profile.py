@@ -137,7 +137,8 @@ def smooth_box_means(
     if centres.size < _DENSE * count or half_pixel * half_cell < _WIDE * step**2:
         return sampled_box_means(values, start, step, centres, half_pixel, half_cell)
     nodes = low + step * (np.arange(count) - 1)
-    return _cubic(sampled_box_means(values, start, step, nodes, half_pixel, half_cell), (centres - low) / step)
+    means = sampled_box_means(values, start, step, np.asarray(nodes), half_pixel, half_cell)
+    return _cubic(means, (centres - low) / step)
 
 
 def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:

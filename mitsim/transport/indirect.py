@@ -70,6 +70,15 @@ class IndirectWalk(Walk):
     STATE = ("active", "ray", "strength", "bounce", "scattered", "straight", "rng", "kept")
 
     def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
+        """Paths before their first surface.
+
+        Parameters
+        ----------
+        tracer
+            what is followed.
+        seed, sample, lane
+            of the random numbers; the lane tells pixel and anchor.
+        """
         super().__init__(tracer.receiver.passage, tracer.mirrors, tracer.interreflection)
         self.tracer = tracer
         pixel, row, column = tracer.points.of(lane, tracer.projector.n**2)
@@ -90,6 +99,8 @@ class IndirectWalk(Walk):
         self.first_turn = stratified(sample, shared)
 
     def vertex(self, first: bool) -> None:
+        """Find, connect and leave the next surface, as :meth:`mitsim.transport.paths.Walk.vertex` does; ``first`` is
+        not connected."""
         si = self.scene.ray_intersect(self.ray, self.active)
         self.active &= si.is_valid()
         if not first:

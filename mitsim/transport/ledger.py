@@ -8,10 +8,12 @@ the ledger draws one of them: the same in the mean.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.core.arrays import Labels
@@ -50,7 +52,7 @@ class Ledger:
 
     @staticmethod
     def holds(bundle: Bundle, labels: Labels) -> bool:
-        """Whether a ledger of these has room."""
+        """Whether a ledger of a ``bundle`` and ``labels`` has room, and can file as the bundle does."""
         fits = (int(labels.max()) + 1) * (bundle.size + 1) < _MOST_PLACES
         return fits and bundle.anchors == 1 and not bundle.between
 
@@ -64,7 +66,7 @@ class Ledger:
             inside &= (cell >= 0) & (cell < dr.opaque(mi.Float, axis.count))
             cells.append(mi.UInt32(dr.maximum(cell, 0)))
         layer = mi.UInt32(0)
-        for low, high in zip(nodes[:-1], nodes[1:], strict=True):
+        for low, high in pairwise(nodes):
             part = (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
         rows, columns = (dr.opaque(mi.UInt32, count) for count in grid.shape)
@@ -72,7 +74,19 @@ class Ledger:
         return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size))
 
     def add(self, light: mi.Float, pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
-        """File ``light`` [W m^-2] of projector pixels ``pixel`` in places, in lanes that are ``active``."""
+        """File light.
+
+        Parameters
+        ----------
+        light
+            [W m^-2].
+        pixel
+            projector pixels that it is of.
+        place
+            of :meth:`place`.
+        active
+            lanes that count.
+        """
         units = light * dr.opaque(mi.Float, 1 / self._unit)
         fits = (units >= 0) & (units < 2.0**_MOST_BITS)
         row = dr.gather(mi.UInt32, self._labels, pixel, active)
@@ -80,12 +94,17 @@ class Ledger:
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
-    def filed(self) -> tuple[sparse.csr_array, float, float]:
-        """(rows + 1, places) light so far, the last row empty; all that was received, and what lay outside [W m^-2].
+    def fetched(self) -> npt.NDArray[np.uint64]:
+        """The sums so far, on the host."""
+        return np.array(self._sums)
+
+    def filed(self, counted: npt.NDArray[np.uint64] | None = None) -> tuple[sparse.csr_array, float, float]:
+        """(rows + 1, places) light of sums that were ``counted``, the last row empty; all that was received, and what
+        lay outside [W m^-2].
 
         MitsimError where light is NaN, infinite, or beyond all numbers.
         """
-        counted = np.array(self._sums)
+        counted = self.fetched() if counted is None else counted
         if counted[-1]:
             raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
         places = np.flatnonzero(counted[:-1])

@@ -40,10 +40,13 @@ from mitsim.transport.sampling import generator, panchromatic, stratified
 
 if TYPE_CHECKING:
     Store = Callable[[mi.UInt32, mi.UInt32, list[mi.Float], mi.Bool], None]
+    Sender = Callable[[mi.Vector3f, mi.Bool], tuple[mi.Float, mi.Float]]
+    Turner = Callable[[mi.UInt32, mi.Bool], tuple[mi.Float, mi.Float]]
 
 SIDE = 4
 """Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""
 MEMBERS = SIDE**2
+"""Pixels of a block."""
 _STEP, _TURN = 5, 16
 """Members of a block take the points of their common sequence in turn; each sample begins five members on, and sixteen
 samples one more, so that each pixel's own points are spread over the sequence."""
@@ -76,9 +79,14 @@ class NeighbourTracer(IndirectTracer):
         shapes = enumerate(self.scene.shapes())
         return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
 
+    @property
+    def all_diffuse(self) -> bool:
+        """Whether all surfaces are: pairs then take no look at a material."""
+        return len(self.diffuse) == len(self.scene.shapes())
+
     @cached_property
     def board(self) -> float:
-        """Irradiance [W m^-2] by a pixel's light from a white board where the rig is aligned, to which light compares."""
+        """Irradiance [W m^-2] by a pixel's light from a white board at the rig's distance, to which light compares."""
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
         flux = np.array(panchromatic(self.rays.flux(pixel, mi.Color0f())))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.receiver.geometry.scene_distance**2)
@@ -94,11 +102,14 @@ class NeighbourTracer(IndirectTracer):
             as for :meth:`trace`.
         """
         lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
-        launched = [_Block(self, seed, *launch).file(ledger) for launch in lanes]
+        launched = [self._block(seed, *launch).file(ledger) for launch in lanes]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return _Block(self, seed, sample, lane).deposits(further=True)
+        return self._block(seed, sample, lane).deposits(further=True)
+
+    def _block(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> _Block:
+        return (_DiffuseBlock if self.all_diffuse else _Block)(self, seed, sample, lane)
 
 
 def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
@@ -112,6 +123,7 @@ class _Block(IndirectWalk):
     """Paths of whole blocks of pixels, the members of each one after the other."""
 
     def __init__(self, tracer: NeighbourTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
+        self.sharing = tracer
         self.block, self.member = lane // MEMBERS, lane % MEMBERS
         n, blocks = (dr.opaque(mi.UInt32, count) for count in (tracer.projector.n, -(-tracer.projector.n // SIDE)))
         row = (self.block // blocks) * SIDE + self.member // SIDE
@@ -196,7 +208,7 @@ class _Block(IndirectWalk):
 
     def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Whether the surfaces at ``si`` are diffuse; of very many materials none counts as such."""
-        shapes, diffuse = self.scene.shapes(), self.tracer.diffuse
+        shapes, diffuse = self.scene.shapes(), self.sharing.diffuse
         others = frozenset(range(len(shapes))) - diffuse
         few = min(diffuse, others, key=len)
         if len(few) > _MOST_COMPARED:
@@ -207,9 +219,7 @@ class _Block(IndirectWalk):
         return found if few is diffuse else ~found
 
     @staticmethod
-    def _turn(
-        si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
-    ) -> mi.Float:
+    def _turn(si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Light that a surface turns from ``toward`` to ``onward``, but for a factor of the latter."""
         si.wi = si.to_local(toward)
         context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -223,8 +233,9 @@ class _Block(IndirectWalk):
         width = dr.width(self.lit)
         sent, density = (dr.zeros(mi.Float, width * MEMBERS) for _ in range(2))
         index, si = dr.arange(mi.UInt32, width), self._first_points()
-        first, toward = index - self.member, -self.lit_by.d
-        context = mi.BSDFContext(mi.TransportMode.Importance)
+        first = index - self.member
+
+        send = self._sender(si)
 
         def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
             known = self.point, self.normal, self.shading, self.side
@@ -233,12 +244,9 @@ class _Block(IndirectWalk):
             offset = point - si.p
             squared = dr.squared_norm(offset)
             direction = offset * dr.rsqrt(squared)
-            local = si.to_local(direction)
-            reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
-            turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
-            turned /= mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward)
+            value, pdf = send(direction, active)
             to_area = dr.abs(dr.dot(normal, direction)) / squared
-            value = panchromatic(mi.unpolarized_spectrum(reflected)) * dr.abs(turned) * to_area
+            value *= to_area
             active &= (value > 0) & (value < dr.inf) & (pdf > 0)
             another = active & (other != self.member)
             active &= ~self.scene.ray_test(si.spawn_ray_to(point), another) | ~another
@@ -270,27 +278,51 @@ class _Block(IndirectWalk):
         index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
         first = index - self.member
         dr.eval(whole, same_side)
+        turn = self._turner(si)
 
         def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
             place, at = index * MEMBERS + other, first + other
             given = dr.gather(mi.Float, sent, place)
             active = self.lit & (given != 0)
             weight = self.power * dr.abs(given) / dr.gather(mi.Float, whole, at)
+            connected, further = turn(at, active)
+            further *= self.power * given / dr.gather(mi.Float, same_side, at)
+            store(place, at, [connected * weight, dr.select((given > 0) & (further > 0), further, 0)], active)
+            return (other + 1,)
+
+        dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
+
+    def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
+        """What first surfaces at ``si`` send in a direction [1/sr], and the density [1/sr] of sampling that."""
+        context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.lit_by.d
+
+        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+            local = si.to_local(direction)
+            reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
+            turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
+            turned /= mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward)
+            return panchromatic(mi.unpolarized_spectrum(reflected)) * dr.abs(turned), pdf
+
+        return send
+
+    def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
+        """What second points of lanes turn of light from first points at ``si``: to the sensor, and on the ways that
+        are followed further."""
+
+        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
             met, ray = (dr.gather(type(each), each, at, active) for each in (self.arrived_at, self.arrived_by))
             second = met.compute_surface_interaction(ray, active=active)
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.way, at, active)
             reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
-            connected = panchromatic(reception.irradiance) * (1 - camera_part(reception.pdf)) * weight
+            connected = panchromatic(reception.irradiance) * (1 - camera_part(reception.pdf))
             beyond = dr.gather(mi.Float, self.further.value, at, active)
             onward, turned = (dr.gather(type(each), each, at, active) for each in (self.onward, self.turned))
-            handed = active & (given > 0) & (beyond > 0) & (turned > 0)
+            handed = active & (beyond > 0) & (turned > 0)
             scale = self._turn(second, toward, onward, handed) / turned
-            further = beyond * scale * self.power * given / dr.gather(mi.Float, same_side, at)
-            store(place, at, [connected, dr.select(handed, further, 0)], active)
-            return (other + 1,)
+            return connected, dr.select(handed, beyond * scale, 0)
 
-        dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
+        return turn
 
     def _first_points(self) -> mi.SurfaceInteraction3f:
         return self.lit_at.compute_surface_interaction(self.lit_by, active=self.lit)
@@ -314,3 +346,50 @@ class _Block(IndirectWalk):
             value=light[pairs].astype(np.float64),
             kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
         )
+
+
+class _DiffuseBlock(_Block):
+    """The same where all surfaces are diffuse: what they turn hangs on two cosines, and on no material.
+
+    A diffuse surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w|, whatever
+    it goes on to, on the side that s w tells.
+    """
+
+    def _second(self) -> None:
+        super()._second()
+        second = self.arrived_at.compute_surface_interaction(self.arrived_by, active=self.shared)
+        self.sensor_side = dr.sign(dr.dot(self.shading, self.way.direction))
+        facing = self.shading * self.sensor_side
+        way = replace(self.way, open=self.way.open & self.shared)
+        reception = self.tracer.receiver.received(second, facing, way)
+        self.to_sensor = panchromatic(reception.irradiance) * dr.abs(dr.dot(self.normal, facing))
+
+    def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
+        side = dr.sign(mi.Frame3f.cos_theta(si.wi))
+        turned = self._turn(si, -self.lit_by.d, si.sh_frame.n * side, self.lit)
+
+        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+            cosine = dr.dot(si.sh_frame.n, direction) * side
+            value = turned * dr.abs(dr.dot(si.n, direction))
+            return dr.select(active & (cosine > 0), value, 0), cosine * dr.inv_pi
+
+        return send
+
+    def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
+        own = self._cosines(self.shading, self.normal, -self.arrived_by.d)
+        further = dr.select(own > 0, self.further.value / own, 0)
+        dr.eval(further)
+
+        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+            known = self.point, self.normal, self.shading, self.sensor_side, self.to_sensor, further
+            point, normal, shading, side, to_sensor, beyond = (dr.gather(type(e), e, at, active) for e in known)
+            toward = dr.normalize(si.p - point)
+            cosines = self._cosines(shading, normal, toward)
+            return dr.select(dr.dot(shading, toward) * side > 0, to_sensor * cosines, 0), beyond * cosines
+
+        return turn
+
+    @staticmethod
+    def _cosines(shading: mi.Normal3f, normal: mi.Normal3f, toward: mi.Vector3f) -> mi.Float:
+        """Cosine of a direction to the shading normal over that to the geometric one."""
+        return dr.abs(dr.dot(shading, toward)) / dr.abs(dr.dot(normal, toward))

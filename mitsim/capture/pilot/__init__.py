@@ -154,7 +154,10 @@ class Look:
             paths, changes = FIXED.followed * lanes * finer.followed * connections, len(self.followed.changes)
         else:
             followed = sum(getattr(FIXED, name) * lanes for name, lanes in self.switched.lanes.items())
-            paths, changes = FIXED.direct * pixels * finer.direct + followed * finer.followed, _OF_EFFECTS * len(self.present)
+            paths, changes = (
+                FIXED.direct * pixels * finer.direct + followed * finer.followed,
+                _OF_EFFECTS * len(self.present),
+            )
         return LOOKS * paths + changes * float(one)
 
     @property
@@ -175,7 +178,9 @@ class Look:
         elif stage == "effects":
             self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
         elif stage == "followed":
-            self.followed = FollowedLight(bench, self._everything, sample, self._tolerance(_OF_FOLLOWED), seed, self.fine.judging)
+            self.followed = FollowedLight(
+                bench, self._everything, sample, self._tolerance(_OF_FOLLOWED), seed, self.fine.judging
+            )
         elif stage == "occluded":
             if base.occluded:
                 self.occluded = OccludedLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)

@@ -71,7 +71,10 @@ def test_light_by_class_serves_no_other_family(bench: Bench, plan: Plan, family:
 
 
 def test_a_target_stops_the_sampling(bench: Bench, plan: Plan, family: Lighting) -> None:
-    """It is asked with the frames seen so far, eight of the sixteen, and its answer is the error to stop at."""
+    """It is asked with the frames seen so far, eight of the sixteen, and its answer is the error to stop at.
+
+    The error is told by random signs alone, the frames' energy too: 0.7 % off here.
+    """
     asked: list[float] = []
 
     def target(frames: ExpectedFrames) -> float:
@@ -80,7 +83,7 @@ def test_a_target_stops_the_sampling(bench: Bench, plan: Plan, family: Lighting)
         return math.inf if len(asked) == 1 else 0.0
 
     found = trace_light(bench, replace(plan, sampling_target=1e-9), family, 3, Sampling(target=target))
-    assert found.reached and found.sampling_error == pytest.approx(asked[0]) and len(asked) == 1
+    assert found.reached and found.sampling_error == pytest.approx(asked[0], rel=0.03) and len(asked) == 1
     tighter = trace_light(bench, plan, family, 3, Sampling(target=lambda _: found.sampling_error / 3))
     assert tighter.sampling_error <= found.sampling_error / 3 and tighter.paths > found.paths
 
@@ -92,11 +95,11 @@ def test_followed_light_is_sampled_until_all_shots_keep_the_target(
     (Planted: only the eight are asked.)"""
     target, asked = plan.sampling_target, []
 
-    def bound(frames: ExpectedFrames) -> float:
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
         asked.append(len(frames))
-        return 2 * target if asked == [8, 16] else 0.5 * target
+        return 0.5 * target, 2 * target if asked == [8, 16] else 0.5 * target
 
-    monkeypatch.setattr("mitsim.capture.light.monte_carlo_bound", bound)
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
     assert trace_light(bench, plan, family, 3).reached and asked == [8]
     asked.clear()
     followed = replace(plan, settings=replace(plan.settings, effects=frozenset({"interreflection"})))

@@ -39,9 +39,9 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
     assert paces_of(none).direct == FIXED.direct and paces_of(none).product == FIXED.product
     slower = {name: getattr(paces_of(measured), name) / getattr(FIXED, name) for name in ("frame", "entry", "filed")}
     assert slower == pytest.approx(dict.fromkeys(slower, paces_of(measured).product / FIXED.product))
-    timed = replace(measured, forming=replace(measured.forming, product=1e-11))
+    timed = replace(measured, forming=replace(measured.forming, product=FIXED.product / 6))
     assert forming_seconds(timed.forming, ONE, 1.0, paces_of(timed)) == pytest.approx(0.125, rel=1e-12)
-    assert paces_of(timed).product == 1e-11, "large products are not slower because small frames are"
+    assert paces_of(timed).product == FIXED.product / 6, "large products are not slower because small frames are"
     assert paces_of(timed).entry == pytest.approx(FIXED.entry / 6)
     other = replace(EVIDENCE, direct=replace(EVIDENCE.direct, seconds=5e-6))
     assert paces_of(other).direct == 5e-6

@@ -108,11 +108,31 @@ def test_a_shared_path_tells_as_much_as_several(shared_scene: Callable[..., Path
     def variance(side: IndirectTracer) -> float:
         looks = [side.trace(seed, 0, 16) for seed in range(24)]
         seen_in = [np.digitize(look.row, edges) * 8 + np.digitize(look.column, edges) for look in looks]
-        light = [np.bincount(look.pixel * 64 + place, look.value, N * N * 64) for look, place in zip(looks, seen_in)]
+        light = [
+            np.bincount(look.pixel * 64 + place, look.value, N * N * 64)
+            for look, place in zip(looks, seen_in, strict=True)
+        ]
         return float(np.var(light, axis=0).sum())
 
     own, shared = (variance(side) for side in tracers(bench))
     assert shared < own / 5
+
+
+@pytest.mark.parametrize("name", ["matt walls", "bent wall", "card before"])
+def test_diffuse_surfaces_need_no_look_at_their_material(
+    shared_scene: Callable[..., Path], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two cosines give what the BSDF does, pair by pair; a scene with gloss takes the longer way."""
+    bench = opened(shared_scene(f"diffuse {name}", extra=SCENES[name]))
+    tracer = tracers(bench, spread=True)[1]
+    assert tracer.all_diffuse and not tracers(opened(shared_scene("gloss", extra=SCENES["shiny wall"])))[1].all_diffuse
+    short = tracer.trace(3, 0, 64)
+    monkeypatch.setattr(NeighbourTracer, "all_diffuse", False)
+    long = tracer.trace(3, 0, 64)
+    whole = [np.bincount(light.pixel, light.value, N * N) for light in (short, long)]
+    np.testing.assert_allclose(*whole, rtol=2e-3)
+    assert short.value.sum() == pytest.approx(long.value.sum(), rel=1e-5)
+    assert abs(len(short.value) - len(long.value)) < 1e-3 * len(long.value)
 
 
 # ---- the ledger
