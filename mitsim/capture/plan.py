@@ -27,19 +27,16 @@ from mitsim.capture.prices import (
     tracing_seconds,
     truth_seconds,
 )
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.capture.request import Request, check_accuracy
+from mitsim.core.errors import MitsimError
 from mitsim.core.pictures import table
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
-    from mitsim.capture.request import Request
     from mitsim.core.resources import Cost
     from mitsim.scene.guard.outline import Tag
 
 State = Literal["exact", "approximate", "off"]
-LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
-"""Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
-worth its name."""
 _TOLD = 2.0
 """An estimate whose bound is above this much of it is told as a bound."""
 
@@ -206,15 +203,6 @@ class SceneFacts:
             )
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
         return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes)
-
-
-def check_accuracy(accuracy: float) -> float:
-    """``accuracy``, or ArgumentError when it is outside what the estimator can promise."""
-    if not LOWEST_ACCURACY <= accuracy <= HIGHEST_ACCURACY:
-        raise ArgumentError(
-            "accuracy", f"{accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
-        )
-    return accuracy
 
 
 def decide(accuracy: float, evidence: Evidence, facts: SceneFacts, switches: Mapping[str, bool] | None = None) -> Plan:

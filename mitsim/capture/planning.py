@@ -10,7 +10,8 @@ from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.choice import cheapest, doubt
 from mitsim.capture.evidence import GROUPS, Evidence
-from mitsim.capture.plan import Plan, SceneFacts, check_accuracy, decide
+from mitsim.capture.plan import Plan, SceneFacts, decide
+from mitsim.capture.request import check_accuracy
 from mitsim.capture.simulation import AT_ANCHORS, Simulation, Stage
 from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas

@@ -9,17 +9,19 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from mitsim.capture.effects import check_switches, parse_switches
-from mitsim.capture.plan import check_accuracy
 from mitsim.core.configuration import validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import MOST_SHOTS
-from mitsim.rig.patterns import NAMES
+from mitsim.rig.patterns import NAMES, check_patterns
 from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 from mitsim.sensor.chain import exposure_for_peak
 
 if TYPE_CHECKING:
     from mitsim.rig.rig import Rig
 
+LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
+"""Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
+worth its name."""
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
 
@@ -57,6 +59,15 @@ class Exposure:
         return exposure_for_peak(peak_irradiance, self.fraction, rig.sensor, wavelength)
 
 
+def check_accuracy(accuracy: float) -> float:
+    """``accuracy``, or ArgumentError when it is outside what the estimator can promise."""
+    if not LOWEST_ACCURACY <= accuracy <= HIGHEST_ACCURACY:
+        raise ArgumentError(
+            "accuracy", f"{accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
+        )
+    return accuracy
+
+
 class Request(BaseModel):
     """Which shots of a scene are wanted, and how well."""
 
@@ -88,6 +99,11 @@ class Request(BaseModel):
     def changed(self, **values: object) -> Request:
         """The same request with other ``values``; MitsimError as :meth:`of`."""
         return Request.of(**{**self.model_dump(), **values})
+
+    @field_validator("patterns")
+    @classmethod
+    def _of_a_family(cls, patterns: str) -> str:
+        return check_patterns(patterns)
 
     @field_validator("accuracy")
     @classmethod

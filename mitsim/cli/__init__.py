@@ -293,9 +293,14 @@ def reconstruct(
     quiet: Quiet = False,
 ) -> int:
     """Recover the image from frames and a calibration alone."""
-    from mitsim.study.quality import reconstruct as reconstruct_folder
+    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
+    # Refused before the solver is imported, which takes half a second.
+    read_manifest(run, RunManifest)
+    read_manifest(calibration, CalibrationManifest)
+    from mitsim.study.quality import reconstruct as reconstruct_folder
+
     result = reconstruct_folder(
         run, calibration, output or run / "reconstruction", number_of("lambda", lam), method, overwrite, depth
     )

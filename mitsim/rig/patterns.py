@@ -228,25 +228,38 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     MitsimError
         for an unknown family, a K that is not a whole number, or K outside 1..n.
     """
+    name, periods = _read(text, n)
+    if name == "random":
+        return PatternFamily(text, *(_random_binary(n, periods[0], seed, side) for side in ("left", "right")))
+    if len(periods) == 2:
+        return PatternFamily(text, *(_shifting_dots(n, period) for period in periods))
+    factor = _SAME_BOTH_SIDES[name](n, periods[0])
+    return PatternFamily(text, factor, factor)
+
+
+def check_patterns(text: str) -> str:
+    """The ``text``, where it names a family that some projector has; MitsimError as :func:`parse_patterns`."""
+    _read(text, None)
+    return text
+
+
+def _read(text: str, n: int | None) -> tuple[str, list[int]]:
+    """Name and periods of the patterns ``text``, for ``n`` projector pixels a side, or any number of them."""
     name, colon, size = text.partition(":")
     if name not in (*_SAME_BOTH_SIDES, "random") or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
         raise MitsimError(f"patterns {text!r}: use {NAMES}")
     rows, _, columns = size.partition("x")
-    if name == "dots" and rows and columns:
-        left, right = (_shifting_dots(n, _period(text, period, n)) for period in (rows, columns))
-        return PatternFamily(text, left, right)
-    k = _period(text, size, n) if colon else 1
-    if name == "random":
-        return PatternFamily(text, _random_binary(n, k, seed, "left"), _random_binary(n, k, seed, "right"))
-    factor = _SAME_BOTH_SIDES[name](n, k)
-    return PatternFamily(text, factor, factor)
+    both = [rows, columns] if name == "dots" and rows and columns else [size or "1"]
+    return name, [_period(text, period, n) for period in both]
 
 
-def _period(text: str, size: str, n: int) -> int:
-    """K of the patterns ``text``, written as ``size``, for ``n`` projector pixels a side."""
+def _period(text: str, size: str, n: int | None) -> int:
+    """K of the patterns ``text``, written as ``size``, for ``n`` projector pixels a side, or any number of them."""
+    most = "the projector's pixels a side" if n is None else n
     if not (size.isascii() and size.isdigit() and len(size) <= _MOST_DIGITS):
-        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {n}")
+        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {most}")
     k = int(size)
-    if not 1 <= k <= n:
-        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {n}, the projector's pixels a side")
+    if k < 1 or (n is not None and k > n):
+        most = most if n is None else f"{n}, the projector's pixels a side"
+        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {most}")
     return k

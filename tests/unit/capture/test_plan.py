@@ -8,7 +8,8 @@ import pytest
 
 from mitsim.capture.effects import EFFECTS, SWITCHES
 from mitsim.capture.evidence import Estimate, Part
-from mitsim.capture.plan import Plan, check_accuracy
+from mitsim.capture.plan import Plan
+from mitsim.capture.request import check_accuracy
 from mitsim.core.errors import MitsimError
 from tests.unit.capture.invented_evidence import ACCURACIES, EVIDENCE, FACTS, ONE_CLASS, SIZES, changes, plan, rows
 
