@@ -295,15 +295,14 @@ def reconstruct(
     """Recover the image from frames and a calibration alone."""
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 
+    strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
     # Refused before the solver is imported, which takes half a second.
     read_manifest(run, RunManifest)
     read_manifest(calibration, CalibrationManifest)
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
-    result = reconstruct_folder(
-        run, calibration, output or run / "reconstruction", number_of("lambda", lam), method, overwrite, depth
-    )
+    result = reconstruct_folder(run, calibration, output or run / "reconstruction", strength, method, overwrite, depth)
     payload = result.summary()
     lines = [payload["status"]]
     if result.quality is not None:

@@ -17,7 +17,7 @@ from tests.system.refusals import NEW, Refused, mentions
     ("options", "fragments"),
     [
         (["--patterns", "dots:17"], ["dots:17", "17", "16"]),
-        (["--patterns", "dots:0"], ["dots:0", "1 to 16"]),
+        (["--patterns", "dots:0"], ["dots:0", "give 1 to the projector's pixels a side"]),
         (["--patterns", "dots"], ["'dots'", "dots:K"]),
         (["--patterns", "dots:x"], ["'x'", "whole number"]),
         (["--patterns", "dots:-1"], ["-1"]),
