@@ -256,6 +256,7 @@ class _Table:
             coarse_cells=coarse,
             coarse_layers=bool(all_layers),
             shared=self.evidence.shared,
+            repeats=self.evidence.repeats,
             reach=self.evidence.reach,
             sharp=self.evidence.sharp,
             occluded=self.evidence.occluded,

@@ -86,6 +86,9 @@ class Settings:
         they have all layers or one.
     shared
         whether neighbouring pixels share the second points of indirect light (:mod:`mitsim.transport.neighbours`).
+    repeats
+        (blocks^2,) paths that each block of pixels takes in a sample of indirect light
+        (:mod:`mitsim.transport.repeats`); none: one of each pixel.
     reach
         largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None: no more
         than of light at ``depth``.
@@ -112,6 +115,7 @@ class Settings:
     coarse_cells: int = 1
     coarse_layers: bool = False
     shared: bool = False
+    repeats: tuple[int, ...] = ()
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_samples: float = 1.0
@@ -290,8 +294,8 @@ class Evidence:
         effects that are no part of the expected frames, with the independent error of leaving each out.
     unresolved
         part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.lobes`).
-    shared
-        as in :class:`Settings`: where that takes less for as little noise; ``indirect`` is then what that takes.
+    shared, repeats
+        as in :class:`Settings`, where that takes less for as little noise; ``indirect`` is then what that takes.
     left_out
         light that no tracer finds, over that and what is found (:mod:`mitsim.transport.left_out`).
     mirror
@@ -318,6 +322,7 @@ class Evidence:
     left_out: float = 0.0
     mirror: int | None = None
     shared: bool = False
+    repeats: tuple[int, ...] = ()
     reach: float | None = None
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())

@@ -278,7 +278,8 @@ class Simulation:
     def indirect(self) -> IndirectTracer | None:
         """Follows light over several surfaces from the projector to the sensor's centre, or to all of it where it has
         anchors; none where there is none."""
-        return self._indirect(self._mean_points, self.settings.shared)
+        tracer, repeats = self._indirect(self._mean_points, self.settings.shared), self.settings.repeats
+        return tracer.repeating(repeats) if tracer and repeats else tracer
 
     @cached_property
     def from_camera(self) -> FromCameraTracer | None:

@@ -14,6 +14,8 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
@@ -22,6 +24,7 @@ from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
+from mitsim.transport.repeats import Turns, by_pixel
 from mitsim.transport.sampling import panchromatic, stratified, streams
 
 
@@ -54,11 +57,18 @@ class IndirectTracer(Tracer):
         self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
         self.points = points or SensorPoints(self.receiver.geometry.half_width)
+        self.turns: Turns | None = None
+
+    def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
+        """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.repeats`) as often as
+        ``repeats`` (blocks^2,) say."""
+        self.turns = Turns.of(by_pixel(repeats, self.projector.n))
+        return self
 
     @property
     def lanes(self) -> int:
-        """Paths of one sample: one per projector pixel and anchor."""
-        return self.projector.n**2 * self.points.count
+        """Paths of one sample: one per projector pixel and anchor, or as often as they are repeated."""
+        return len(self.turns) if self.turns else self.projector.n**2 * self.points.count
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         return IndirectWalk(self, seed, sample, lane).deposits(further=True)
@@ -81,22 +91,30 @@ class IndirectWalk(Walk):
         """
         super().__init__(tracer.receiver.passage, tracer.mirrors, tracer.interreflection)
         self.tracer = tracer
-        pixel, row, column = tracer.points.of(lane, tracer.projector.n**2)
-        self.pixel, self.anchor = pixel, (row, column)
-        self._begin(seed, sample)
+        weight = self._place(sample, lane)
+        self._begin(seed)
         wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, self.rng)
         jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        self.ray = tracer.rays.sample(pixel, jitter, self.rng, wavelengths)
-        self.flux = tracer.rays.flux(pixel, wavelengths) * spectral
+        self.ray = tracer.rays.sample(self.pixel, jitter, self.rng, wavelengths)
+        self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * weight
         self.strength, self.active = mi.Spectrum(1), mi.Bool(True)
         self.bounce, self.scattered = mi.UInt32(0), mi.UInt32(0)
         self.sensor = tracer.points.at(*self.anchor, self.rng)
 
-    def _begin(self, seed: int, sample: mi.UInt32) -> None:
+    def _place(self, sample: mi.UInt32, lane: mi.UInt32) -> mi.Float | float:
+        """Pixel, anchor and sample of each path; its weight."""
+        weight: mi.Float | float = 1.0
+        if self.tracer.turns:
+            lane, sample, weight = self.tracer.turns.at(lane, sample)
+        self.pixel, row, column = self.tracer.points.of(lane, self.tracer.projector.n**2)
+        self.anchor, self.sample = (row, column), sample
+        return weight
+
+    def _begin(self, seed: int) -> None:
         """Random numbers of each path, and the points that its first turn is drawn by."""
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
-        shared, self.rng = streams(seed, self.pixel, sample)
-        self.first_turn = stratified(sample, shared)
+        shared, self.rng = streams(seed, self.pixel, self.sample)
+        self.first_turn = stratified(self.sample, shared)
 
     def vertex(self, first: bool) -> None:
         """Find, connect and leave the next surface, as :meth:`mitsim.transport.paths.Walk.vertex` does; ``first`` is

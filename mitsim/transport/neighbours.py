@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -36,6 +36,7 @@ from mitsim.transport.indirect import IndirectTracer, IndirectWalk
 from mitsim.transport.ledger import Ledger
 from mitsim.transport.paths import KINDS, camera_part, launches
 from mitsim.transport.receiver import Way
+from mitsim.transport.repeats import MEMBERS, SIDE, Turns, blocks_of
 from mitsim.transport.sampling import generator, panchromatic, stratified
 
 if TYPE_CHECKING:
@@ -43,10 +44,6 @@ if TYPE_CHECKING:
     Sender = Callable[[mi.Vector3f, mi.Bool], tuple[mi.Float, mi.Float]]
     Turner = Callable[[mi.UInt32, mi.Bool], tuple[mi.Float, mi.Float]]
 
-SIDE = 4
-"""Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""
-MEMBERS = SIDE**2
-"""Pixels of a block."""
 _STEP, _TURN = 5, 16
 """Members of a block take the points of their common sequence in turn; each sample begins five members on, and sixteen
 samples one more, so that each pixel's own points are spread over the sequence."""
@@ -65,8 +62,13 @@ class NeighbourTracer(IndirectTracer):
 
     @property
     def lanes(self) -> int:
-        """Paths of one sample: one for each pixel, of whole blocks."""
-        return (-(-self.projector.n // SIDE) * SIDE) ** 2
+        """Paths of one sample: one for each pixel of whole blocks, or as often as these are repeated."""
+        return MEMBERS * (len(self.turns) if self.turns else blocks_of(self.projector.n) ** 2)
+
+    def repeating(self, repeats: Sequence[int]) -> NeighbourTracer:
+        """The same, as :meth:`IndirectTracer.repeating`; ``repeats`` (blocks^2,)."""
+        self.turns = Turns.of(np.asarray(repeats, dtype=np.int64))
+        return self
 
     def shares(self) -> bool:
         """Whether what is to be followed can be shared: as the module says."""
@@ -122,18 +124,23 @@ def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
 class _Block(IndirectWalk):
     """Paths of whole blocks of pixels, the members of each one after the other."""
 
-    def __init__(self, tracer: NeighbourTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
-        self.sharing = tracer
-        self.block, self.member = lane // MEMBERS, lane % MEMBERS
-        n, blocks = (dr.opaque(mi.UInt32, count) for count in (tracer.projector.n, -(-tracer.projector.n // SIDE)))
+    tracer: NeighbourTracer
+
+    def _place(self, sample: mi.UInt32, lane: mi.UInt32) -> mi.Float | float:
+        tracer, weight = self.tracer, 1.0
+        self.block, self.member, self.sample = lane // MEMBERS, lane % MEMBERS, sample
+        if tracer.turns:
+            self.block, self.sample, weight = tracer.turns.at(self.block, sample)
+        n, blocks = (dr.opaque(mi.UInt32, count) for count in (tracer.projector.n, blocks_of(tracer.projector.n)))
         row = (self.block // blocks) * SIDE + self.member // SIDE
         column = (self.block % blocks) * SIDE + self.member % SIDE
         inside = (row < n) & (column < n)
-        super().__init__(tracer, seed, sample, dr.minimum(row, n - 1) * n + dr.minimum(column, n - 1))
-        self.active &= inside
+        self.pixel = dr.minimum(row, n - 1) * n + dr.minimum(column, n - 1)
+        self.anchor = dr.zeros(mi.UInt32, dr.width(lane)), dr.zeros(mi.UInt32, dr.width(lane))
+        return dr.select(inside, mi.Float(weight), 0)
 
-    def _begin(self, seed: int, sample: mi.UInt32) -> None:
-        shared = dr.opaque(mi.UInt32, seed)
+    def _begin(self, seed: int) -> None:
+        shared, sample = dr.opaque(mi.UInt32, seed), self.sample
         self.rng = generator(shared ^ (sample * 0x9E3779B9 + 1), self.pixel)
         place = (self.member + sample * _STEP + sample // _TURN) % MEMBERS
         self.first_turn = stratified(sample * MEMBERS + place, generator(shared, self.block))
@@ -208,7 +215,7 @@ class _Block(IndirectWalk):
 
     def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Whether the surfaces at ``si`` are diffuse; of very many materials none counts as such."""
-        shapes, diffuse = self.scene.shapes(), self.sharing.diffuse
+        shapes, diffuse = self.scene.shapes(), self.tracer.diffuse
         others = frozenset(range(len(shapes))) - diffuse
         few = min(diffuse, others, key=len)
         if len(few) > _MOST_COMPARED:

@@ -213,7 +213,7 @@ class Look:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         samples = self.samples["effects"].followed * LOOKS
-        indirect, shared = switched.indirect_effort()
+        indirect, shared, repeats = switched.indirect_effort()
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
@@ -226,6 +226,7 @@ class Look:
             anchored=anchored.effort(light),
             indirect=indirect,
             shared=shared,
+            repeats=repeats,
             from_camera=switched.effort("from_camera"),
             forming=self.forming,
             apart=switched.apart,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+
+import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import DIRECT, EFFECTS, FOLLOWED, Effect
@@ -18,9 +21,13 @@ from mitsim.core.seeds import integer
 from mitsim.transport import histogram
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.neighbours import NeighbourTracer
+from mitsim.transport.repeats import block_moments, chosen_repeats, effect_of
 
 _KINDS = {"indirect": histogram.INDIRECT, "ambient": histogram.AMBIENT}
 _TRACERS = ("indirect", "from_camera")
+_WORTH_REPEATING = 0.85
+"""Variance times paths, over that of even ones, below which blocks are followed unevenly: short looks tell it so
+well."""
 
 
 class SwitchedEffects:
@@ -90,8 +97,32 @@ class SwitchedEffects:
         relative = error / self.light if self.light else 0.0
         return Effort(Noise(relative, self.sample.followed, 0.5), lanes)
 
-    def indirect_effort(self) -> tuple[Effort, bool]:
-        """What light over several surfaces takes, and whether that is less where neighbouring pixels share it."""
+    def indirect_effort(self) -> tuple[Effort, bool, tuple[int, ...]]:
+        """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how
+        often each block of pixels is followed in a sample."""
+        effort, shared = self._shared_or_not
+        repeats, (variance, paths) = self._repeats
+        if variance * paths > _WORTH_REPEATING:
+            return effort, shared, ()
+        noise_left = replace(effort.noise, error=effort.noise.error * math.sqrt(variance))
+        return replace(effort, noise=noise_left, paths=math.ceil(effort.paths * paths)), shared, repeats
+
+    @cached_property
+    def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
+        """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other looks."""
+        pixels = self.bench.n
+        light = [look.where(look.kind == histogram.INDIRECT) for look in self.followed["indirect"]]
+        moments = [block_moments(look.pixel, look.value, pixels) for look in light]
+        repeats = chosen_repeats(np.sum(moments, axis=0))
+        # Judged by looks that had no say, a half each: a single heavy path recommends only its own block.
+        halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
+        judged = [effect_of(chosen_repeats(one), other) for one, other in (halves, halves[::-1])]
+        variance, paths = np.mean(judged, axis=0)
+        return tuple(int(count) for count in repeats.ravel()), (float(variance), float(paths))
+
+    @cached_property
+    def _shared_or_not(self) -> tuple[Effort, bool]:
+        """What light over several surfaces takes, and whether it is shared."""
         plain, tracer = self.effort("indirect"), self._sharing.indirect
         if not plain.noise.error or not isinstance(tracer, NeighbourTracer) or not tracer.shares():
             return plain, False

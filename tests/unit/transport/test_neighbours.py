@@ -76,7 +76,7 @@ def test_shared_light_is_the_light_of_paths_of_their_own(
     second points fails "card before"; density of the own direction alone fails all but the sphere; the BSDF of the own
     pixel fails "shiny wall"; a further path without its scale fails "bent wall".)
     """
-    n, samples = 15 if "walls" in name else N, 1024 if "bent" in name else 256
+    n, samples = 15 if "walls" in name else N, 1024 if "bent" in name else 512
     bench = opened(shared_scene(f"{name} {spread}", extra=SCENES[name], n=n))
     sides = tracers(bench, spread, "mirror" in name)
     found = np.array(

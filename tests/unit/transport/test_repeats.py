@@ -1,0 +1,72 @@
+"""Blocks that are followed more often: the light stays, its noise moves; numbers from moments."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import open_bench
+from mitsim.transport.repeats import Turns, block_moments, blocks_of, by_pixel, chosen_repeats, effect_of
+from tests.unit.transport.test_neighbours import SCENES, SIGMAS, summed, tracers
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, SEEDS = 18, 8
+BLOCKS = 5
+"""Blocks a side of 18 pixels: the last are of two pixels."""
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], shared: bool) -> None:
+    """Of each class of pixels, how much and from where, whatever the repeats; and less noise where there are more.
+
+    (Planted: light that is not divided by the repeats, and turns of a block that share a sample's numbers.)
+    """
+    bench = open_bench(shared_scene(f"repeated {shared}", extra=SCENES["matt walls"], n=N))
+    repeats = np.random.default_rng(2).choice([1, 2, 5], BLOCKS**2)
+    plain, again = (tracers(bench)[shared] for _ in range(2))
+    again.repeating(repeats.tolist())
+    lanes = repeats.sum() * 16 if shared else by_pixel(repeats.tolist(), N).sum()
+    assert again.lanes == lanes
+    looks = [[side.trace(seed, 0, 512) for seed in range(SEEDS)] for side in (plain, again)]
+    found = np.array([[summed(look, 512, N) for look in side] for side in looks])
+    means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
+    bound = SIGMAS * np.hypot(*errors)
+    assert (np.abs(means[0] - means[1]) < bound).all() and (bound[0] < 0.15 * means[0, 0]).all()
+    each = [[np.bincount(look.pixel, look.value, N * N) for look in side] for side in looks]
+    variance = np.var(each, axis=1).reshape(2, -1)
+    for count in (1, 2, 5):
+        such = by_pixel(repeats.tolist(), N) == count
+        assert variance[1][such].sum() == pytest.approx(variance[0][such].sum() / count, rel=0.45), count
+
+
+def test_every_unit_takes_its_turns() -> None:
+    counts = np.array([2, 1, 3])
+    turns = Turns.of(counts)
+    unit, turn, count = (np.array(each) for each in (turns.unit, turns.turn, turns.count))
+    assert len(turns) == 6
+    assert unit.tolist() == [0, 0, 1, 2, 2, 2] and turn.tolist() == [0, 1, 0, 0, 1, 2]
+    assert count.tolist() == [2, 2, 1, 3, 3, 3]
+
+
+def test_moments_and_repeats_by_block() -> None:
+    assert blocks_of(18) == BLOCKS
+    pixel, light = np.array([0, 3 * 18 + 3, 17 * 18 + 17, 4 * 18]), np.array([1.0, 2.0, 3.0, 4.0])
+    moments = block_moments(pixel, light, 18)
+    expected = np.zeros((BLOCKS, BLOCKS))
+    expected[0, 0], expected[4, 4], expected[1, 0] = 5, 9, 16
+    assert np.array_equal(moments, expected)
+    spread = by_pixel(np.arange(25).tolist(), 18).reshape(18, 18)
+    assert spread[3, 3] == 0 and spread[4, 3] == 5 and spread[17, 17] == 24
+
+
+def test_repeats_leave_less_variance_for_the_cost() -> None:
+    """Half of the blocks a hundred times as noisy: (1 + 10)^2 / (2 (1 + 100)) = 0.6 of variance times cost at best."""
+    moments = np.ones((16, 16))
+    moments[:, :8] = 100.0
+    repeats = chosen_repeats(moments)
+    variance, paths = effect_of(repeats, moments)
+    assert variance * paths < 0.72
+    assert repeats[:, :6].min() > 2 * repeats[:, 10:].max()
+    assert set(chosen_repeats(np.ones((8, 8))).ravel()) == {1}
+    assert effect_of(repeats, np.zeros((16, 16)))[0] == 1.0
