@@ -33,13 +33,15 @@ f 1//1 2//2 3//3\nf 1//1 3//3 4//4\n"""
 """A wall whose shading normals lean 37 degrees, each corner's another way."""
 OBJECT = """<shape type="obj"><string name="filename" value="bent.obj"/><bsdf type="twosided"><bsdf type="diffuse">
     <spectrum name="reflectance" value="0.7"/></bsdf></bsdf></shape>"""
-CARD = """<shape type="rectangle"><transform name="to_world"><scale x="12" y="12"/><translate x="5" z="320"/>
-    </transform><bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>"""
+FIN = """<shape type="rectangle"><transform name="to_world"><scale x="25" y="60"/><rotate y="1" angle="90"/>
+    <translate x="{x}" z="375"/></transform><bsdf type="twosided"><bsdf type="diffuse">
+    <spectrum name="reflectance" value="0.8"/></bsdf></bsdf></shape>"""
+"""A board that stands on the sheet, between pixels of one block."""
 SCENES = {
     "matt walls": WALL.format(turn=90, x=-30, bsdf=MATT) + WALL.format(turn=-60, x=40, bsdf=MATT),
     "shiny wall": WALL.format(turn=90, x=-30, bsdf=SHINY) + WALL.format(turn=-60, x=40, bsdf=MATT),
     "bent wall": OBJECT + WALL.format(turn=-60, x=40, bsdf=MATT),
-    "card before": CARD + WALL.format(turn=90, x=-30, bsdf=MATT),
+    "fins": FIN.format(x=14) + FIN.format(x=-26),
     "mirror wall": MIRROR + WALL.format(turn=-60, x=40, bsdf=MATT),
 }
 
@@ -58,11 +60,9 @@ def tracers(bench: Bench, spread: bool = False, mirrors: bool = False) -> tuple[
 
 
 def summed(light: Deposits, samples: int, pixels: int) -> np.ndarray:
-    """Light of four classes of pixels in all, and by row, column and depth that it comes from: (4, 4)."""
-    row, column = np.divmod(light.pixel, pixels)
-    place, label = light.inverse_depth, 2 * (row % 2) + column % 2
-    weights = np.ones_like(place), light.row, light.column, place
-    return np.array([np.bincount(label, light.value * weight / samples, 4) for weight in weights])
+    """Light of each column of pixels in all, and by row, column and depth that it comes from: (4, pixels)."""
+    weights = np.ones_like(light.row), light.row, light.column, light.inverse_depth
+    return np.array([np.bincount(light.pixel % pixels, light.value * each / samples, pixels) for each in weights])
 
 
 @pytest.mark.parametrize("spread", [False, True])
@@ -70,10 +70,10 @@ def summed(light: Deposits, samples: int, pixels: int) -> np.ndarray:
 def test_shared_light_is_the_light_of_paths_of_their_own(
     shared_scene: Callable[..., Path], name: str, spread: bool
 ) -> None:
-    """Of each class of pixels: how much, and in which mean direction and depth.
+    """Of each column of pixels: how much, and in which mean direction and depth.
 
     Fifteen pixels a side do not fill whole blocks. (Planted: the balance heuristic without rays between first and
-    second points fails "card before"; density of the own direction alone fails all but the sphere; the BSDF of the own
+    second points fails "fins"; density of the own direction alone fails all but the sphere; the BSDF of the own
     pixel fails "shiny wall"; a further path without its scale fails "bent wall".)
     """
     n, samples = 15 if "walls" in name else N, 1024 if "bent" in name else 512
@@ -84,8 +84,9 @@ def test_shared_light_is_the_light_of_paths_of_their_own(
     )
     means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
     bound = SIGMAS * np.hypot(*errors)
-    assert (np.abs(means[0] - means[1]) < bound).all()
-    assert (bound[0] < 0.12 * means[0, 0]).all(), "of all light"
+    assert (np.abs(means[0] - means[1]) <= bound).all()
+    lit = means[0, 0] > 0.01 * means[0, 0].max()
+    assert lit.sum() > n / 3 and np.median(bound[0, lit] / means[0, 0, lit]) < 0.3, "of a column's light"
 
 
 def test_each_pixel_lights_a_hollow_sphere_alike(shared_scene: Callable[..., Path]) -> None:
@@ -118,7 +119,7 @@ def test_a_shared_path_tells_as_much_as_several(shared_scene: Callable[..., Path
     assert shared < own / 5
 
 
-@pytest.mark.parametrize("name", ["matt walls", "bent wall", "card before"])
+@pytest.mark.parametrize("name", ["matt walls", "bent wall", "fins"])
 def test_diffuse_surfaces_need_no_look_at_their_material(
     shared_scene: Callable[..., Path], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
