@@ -72,9 +72,9 @@ def test_shared_light_is_the_light_of_paths_of_their_own(
 ) -> None:
     """Of each column of pixels: how much, and in which mean direction and depth.
 
-    Fifteen pixels a side do not fill whole blocks. (Planted: the balance heuristic without rays between first and
-    second points fails "fins"; density of the own direction alone fails all but the sphere; the BSDF of the own
-    pixel fails "shiny wall"; a further path without its scale fails "bent wall".)
+    Fifteen pixels a side do not fill whole blocks. (Planted: no rays between first and second points fails "fins"; the
+    density of the own direction alone all but "mirror wall"; ways on for either side "bent wall" and "fins"; a further
+    path of diffuse surfaces without its cosines "bent wall". The own pixel's direction at glossy points shows below.)
     """
     n, samples = 15 if "walls" in name else N, 1024 if "bent" in name else 512
     bench = opened(shared_scene(f"{name} {spread}", extra=SCENES[name], n=n))
