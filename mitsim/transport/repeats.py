@@ -54,6 +54,8 @@ def chosen_repeats(moments: FloatArray) -> npt.NDArray[np.int64]:
 
     ``moments`` (blocks, blocks) are smoothed over neighbours first; blocks without light count a tenth of the mean.
     """
+    if not moments.any():
+        return np.ones(moments.shape, dtype=np.int64)
     smooth = uniform_filter(moments, 3, mode="nearest")
     wanted = np.sqrt(smooth + 0.1 * smooth.mean())
     tried = [np.clip(np.rint(scale * wanted / wanted.mean()), 1, _MOST).astype(np.int64) for scale in _SCALES]

@@ -68,5 +68,5 @@ def test_repeats_leave_less_variance_for_the_cost() -> None:
     variance, paths = effect_of(repeats, moments)
     assert variance * paths < 0.72
     assert repeats[:, :6].min() > 2 * repeats[:, 10:].max()
-    assert set(chosen_repeats(np.ones((8, 8))).ravel()) == {1}
+    assert set(chosen_repeats(np.ones((8, 8))).ravel()) == set(chosen_repeats(np.zeros((8, 8))).ravel()) == {1}
     assert effect_of(repeats, np.zeros((16, 16)))[0] == 1.0
