@@ -19,7 +19,6 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.rig.recipe import load_recipe
 from mitsim.transport.flux import FluxTracer
-from mitsim.transport.histogram import DIRECT
 
 _FINEST = 1e-4
 """Standard error below which the truth is not refined: 80 dB, where no image of a sensor with a full well comes."""
@@ -130,9 +129,7 @@ class _Flux:
         tracer, at_once = self._tracer.at(pixels), max(1, LANES_AT_ONCE // len(pixels))
         for sums, seed in zip(self._sums, self._seeds, strict=True):
             for start in range(first, first + samples, at_once):
-                found = tracer.trace(seed, start, min(at_once, first + samples - start))
-                value = found.value * (found.kind == DIRECT)
-                sums += np.bincount(found.pixel, value, minlength=len(sums))[: len(sums)]
+                sums[pixels] += tracer.sums(seed, start, min(at_once, first + samples - start))
         self._samples[pixels] += samples
         self.rays += GROUPS * samples * len(pixels)
 

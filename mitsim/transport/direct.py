@@ -61,6 +61,12 @@ class DirectTracer(Tracer):
         return len(self._pixels) * self.points.count
 
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        return [Deposits.fetched(*self._sightings(seed, sample, lane))]
+
+    def _sightings(
+        self, seed: int, sample: mi.UInt32, lane: mi.UInt32
+    ) -> tuple[Sightings, int, tuple[mi.UInt32, mi.UInt32]]:
+        """Light of each lane, its kind, and its anchor."""
         number, anchor, share = self._pair(seed, sample, lane)
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         anchors = dr.opaque(mi.UInt32, self.points.anchors)
@@ -85,7 +91,7 @@ class DirectTracer(Tracer):
             return seen.joined_by(reception.sightings(value, pixel), rng), rng
 
         seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(), rng), seen_at)
-        return [Deposits.fetched(seen, DIRECT, (row, column))]
+        return seen, DIRECT, (row, column)
 
     def _received(
         self,

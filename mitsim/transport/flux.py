@@ -14,9 +14,12 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.direct import DirectTracer
+from mitsim.transport.histogram import check_finite
 from mitsim.transport.landing import landing
+from mitsim.transport.paths import launches
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import Reception
 from mitsim.transport.sampling import shuffled, stratified
@@ -57,6 +60,28 @@ class FluxTracer(DirectTracer):
         part = copy(self)
         part._pixels = pixels
         return part
+
+    def sums(self, seed: int, first: int = 0, samples: int = 1) -> FloatArray:
+        """(m,) light of each pixel, summed over some samples [W m^-2].
+
+        Parameters
+        ----------
+        seed, first, samples
+            as for :meth:`mitsim.transport.paths.Tracer.trace`.
+
+        Raises
+        ------
+        MitsimError
+            when the scene sends NaN or infinite light to the camera.
+        """
+        lanes = len(self._pixels)
+        total = np.zeros(lanes)
+        for sample, lane in launches(lanes, first, samples, lanes * max(1, self.lanes_per_launch // lanes)):
+            seen, *_ = self._sightings(seed, sample, lane)
+            light = np.array(seen.value).reshape(-1, lanes)
+            check_finite(light)
+            total += light.sum(axis=0, dtype=np.float64)
+        return total
 
     def _sensor(
         self, row: mi.UInt32, column: mi.UInt32, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32

@@ -85,3 +85,16 @@ def test_truth_over_a_sharp_lobe_is_exact_to_its_standard_error(bench: Callable[
     error = float(np.linalg.norm(truth.standard_error.ravel() * truth.board_flux))
     assert 0 < SEVEN * error < 0.05 * found
     assert abs(found - over_the_sensor(1e-3)) < SEVEN * error + 1e-3 * found
+
+
+def test_sums_are_what_the_connections_bring(bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pixel by pixel, of some samples of a seed's sequence, however many launches they take; no light is NaN."""
+    rig = bench(0.3, 0.5)
+    loaded = rig.loaded
+    tracer = FluxTracer(loaded.scene, loaded.camera, rig.projector_optics, rig.geometry, True).at(LIT)
+    light = tracer.trace(5, 3, 40)
+    expected = np.bincount(light.pixel, light.value, N * N)[LIT]
+    assert expected.any()
+    np.testing.assert_allclose(tracer.sums(5, 3, 40), expected, rtol=1e-12)
+    monkeypatch.setattr(FluxTracer, "lanes_per_launch", 3 * len(LIT) + 1)
+    np.testing.assert_allclose(tracer.sums(5, 3, 40), expected, rtol=1e-12)
