@@ -6,9 +6,8 @@
 versions run the scene files of 0.3.0, each command as a process of its own from the shell to its exit, in turn, after
 one run of each that compiles kernels and byte code and is not counted. Of ``--repeat`` pairs the least and the median
 are stated, of wall seconds, processor seconds, and memory of the largest process; `ratio` is the median over pairs.
-What FILE holds already is not repeated. Cases named *warm* are later captures of one process. ``--errors`` judges the
-frames of both against an independent answer (`benchmarks/accuracy.py`): the seconds at equal error are those of
-light times (error / accuracy)^2 where sampling makes the error.
+What FILE holds already is not repeated. Cases named *warm* are later captures of one process. Equal seconds are not
+equal errors: 0.3.0 promises the error of sampling, later versions all of it; `benchmarks/accuracy.py --old` tells both.
 """
 
 from __future__ import annotations
@@ -88,7 +87,7 @@ class Case:
         of ``mitsim``; or after ``python`` those of the interpreter, after ``warm`` scene and number of captures.
         ``OUT`` is a new folder, ``SCENES`` that of 0.3.0's scenes.
     status
-        that it ends with; 1 and 2 are both refusals of 0.3.0.
+        that it may end with.
     aim
         seconds that the case should take today.
     window, pixels

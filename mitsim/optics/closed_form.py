@@ -37,8 +37,8 @@ class _Block:
 
     Attributes
     ----------
-    left, right
-        by term, (r, pixels) and (c, pixels): factors of the lit rows and columns.
+    factors
+        by term, (r, pixels) and (c, pixels): the shadow's factors of the lit rows and columns.
     lights
         (estimates, r, c) light of each.
     """

@@ -15,9 +15,12 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import Deposits
@@ -62,8 +65,13 @@ class IndirectTracer(Tracer):
     def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.repeats`) as often as
         ``repeats`` (blocks^2,) say."""
-        self.turns = Turns.of(by_pixel(repeats, self.projector.n))
-        return self
+        return self._taking(by_pixel(repeats, self.projector.n))
+
+    def _taking(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
+        """The same with ``repeats`` of single pixels, or of what else it counts."""
+        again = copy(self)
+        again.turns = Turns.of(repeats)
+        return again
 
     @property
     def lanes(self) -> int:

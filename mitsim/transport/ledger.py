@@ -22,11 +22,12 @@ from mitsim.transport.histogram import Bundle, Sightings
 
 _MOST_PLACES = 2**26
 """Places of all rows that are held: 0.5 GB."""
-_UNIT_BITS = 40
-"""Power of two of units in the light that is passed as one: 1e-12 of it is lost in rounding, and a place holds 2^24
-times as much."""
-_MOST_BITS = 62
-"""Power of two of units that one path may bring: more is no light, and two of them would overflow."""
+_UNIT_BITS = 30
+"""Power of two of units in the light that is passed as one: rounding moves a path's by 5e-10 of it at most, either way,
+and a place holds 2^34 times as much."""
+_MOST_BITS = 52
+"""Power of two of units that one path may bring, four million times the light that is passed as one: more is no light.
+A place would hold 4096 such paths."""
 
 
 class Ledger:
@@ -39,7 +40,7 @@ class Ledger:
     labels
         (n^2,) row of each projector pixel.
     one
-        irradiance [W m^-2] that is far above a usual path's and far below 2^24 times as much.
+        irradiance [W m^-2] of about a bright path's.
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
@@ -102,11 +103,15 @@ class Ledger:
         """(rows + 1, places) light of sums that were ``counted``, the last row empty; all that was received, and what
         lay outside [W m^-2].
 
-        MitsimError where light is NaN, infinite, or beyond all numbers.
+        MitsimError where light is NaN, infinite, or four million times ``one``.
         """
         counted = self.fetched() if counted is None else counted
         if counted[-1]:
-            raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+            raise MitsimError(
+                "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
+            )
+                "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
+            )
         places = np.flatnonzero(counted[:-1])
         light = counted[places] * self._unit
         starts = np.searchsorted(places, self._width * np.arange(self._rows + 1))

@@ -36,7 +36,7 @@ from mitsim.transport.indirect import IndirectTracer, IndirectWalk
 from mitsim.transport.ledger import Ledger
 from mitsim.transport.paths import KINDS, camera_part, launches
 from mitsim.transport.receiver import Way
-from mitsim.transport.repeats import MEMBERS, SIDE, Turns, blocks_of
+from mitsim.transport.repeats import MEMBERS, SIDE, blocks_of
 from mitsim.transport.sampling import generator, panchromatic, stratified
 
 if TYPE_CHECKING:
@@ -65,10 +65,9 @@ class NeighbourTracer(IndirectTracer):
         """Paths of one sample: one for each pixel of whole blocks, or as often as these are repeated."""
         return MEMBERS * (len(self.turns) if self.turns else blocks_of(self.projector.n) ** 2)
 
-    def repeating(self, repeats: Sequence[int]) -> NeighbourTracer:
+    def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same, as :meth:`IndirectTracer.repeating`; ``repeats`` (blocks^2,)."""
-        self.turns = Turns.of(np.asarray(repeats, dtype=np.int64))
-        return self
+        return self._taking(np.asarray(repeats, dtype=np.int64))
 
     def shares(self) -> bool:
         """Whether what is to be followed can be shared: as the module says."""

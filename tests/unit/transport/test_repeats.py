@@ -24,8 +24,8 @@ def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], sha
     """
     bench = open_bench(shared_scene(f"repeated {shared}", extra=SCENES["matt walls"], n=N))
     repeats = np.random.default_rng(2).choice([1, 2, 5], BLOCKS**2)
-    plain, again = (tracers(bench)[shared] for _ in range(2))
-    again.repeating(repeats.tolist())
+    plain = tracers(bench)[shared]
+    again = plain.repeating(repeats.tolist())
     lanes = repeats.sum() * 16 if shared else by_pixel(repeats.tolist(), N).sum()
     assert again.lanes == lanes
     looks = [[side.trace(seed, 0, 512) for seed in range(SEEDS)] for side in (plain, again)]
