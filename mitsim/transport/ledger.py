@@ -110,8 +110,6 @@ class Ledger:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-                "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
-            )
         places = np.flatnonzero(counted[:-1])
         light = counted[places] * self._unit
         starts = np.searchsorted(places, self._width * np.arange(self._rows + 1))
