@@ -95,9 +95,9 @@ def _sum(one: Any, other: Any) -> Any:
 class Stage:
     """A tracer, the samples of it that the plan predicted, how its light is filed, and its random stream's name.
 
-    ``file`` takes deposits, labels and the number of samples. ``ledger`` makes, from labels, what the light that
-    neighbouring pixels share is filed in on the device, and ``file_ledger`` takes it and its sums on the host; None
-    without such light.
+    ``file`` takes deposits, labels and the number of samples. ``ledger`` makes, from labels, what indirect light is
+    filed in on the device, where that has room, and ``file_ledger`` takes it and its sums on the host; None for other
+    light.
     """
 
     tracer: DirectTracer | IndirectTracer | FromCameraTracer
@@ -117,7 +117,7 @@ class Stage:
         ledger
             of :attr:`ledger`.
         """
-        if ledger is None or not isinstance(self.tracer, NeighbourTracer):
+        if ledger is None or not isinstance(self.tracer, IndirectTracer):
             return self.tracer.trace(seed, first, samples)
         return self.tracer.trace_into(ledger, seed, first, samples)
 
@@ -373,9 +373,11 @@ class Simulation:
 
     def _beyond_mean(self, tray: Tray, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
         """Light in a ``tray`` beyond its mean over the sensor."""
-        weights = self._mean_weights(tray.bundle.anchors)
-        mean = replace(tray.bundle, anchors=1).file(deposits.averaged(weights), labels, samples)
-        return tray.file(deposits, labels, samples) - tray.bundle.repeated(mean)
+        return self._less_mean(tray.bundle, tray.file(deposits, labels, samples))
+
+    def _less_mean(self, bundle: Bundle, light: sparse.csr_array) -> sparse.csr_array:
+        """``light`` that was filed by a ``bundle``, beyond its mean over the sensor."""
+        return light - bundle.repeated(bundle.averaged(light, self._mean_weights(bundle.anchors)))
 
     def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`indirect` or :attr:`from_camera`, per sample.
@@ -391,16 +393,26 @@ class Simulation:
         return self._light(deposits, samples, fine=fine, smooth=smooth)
 
     def smooth_ledger(self, labels: Labels) -> Ledger | None:
-        """What indirect light that neighbours share is filed in by class in ``labels`` (n^2,), where it has room."""
-        bundle, tracer = self.smooth.bundle, self.indirect
-        if not isinstance(tracer, NeighbourTracer) or not Ledger.holds(bundle, labels):
-            return None
-        return Ledger(bundle, labels, tracer.board)
+        """What indirect light is filed in by class in ``labels`` (n^2,), where it has room."""
+        return self._ledger(self.smooth.bundle, labels)
 
     def file_smooth(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
         """Light in a ``ledger`` of :meth:`smooth_ledger`, from what it ``counted``."""
         smooth, received, outside = ledger.filed(counted)
         return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
+
+    def anchors_ledger(self, labels: Labels) -> Ledger | None:
+        """What indirect light at anchors is filed in by class in ``labels`` (n^2,), where it has room."""
+        return self._ledger(self.followed.bundle, labels)
+
+    def file_anchors(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
+        """Light in a ``ledger`` of :meth:`anchors_ledger` beyond its mean, from what it ``counted``."""
+        light, *_ = ledger.filed(counted)
+        return self._light(None, 1, followed=self._less_mean(self.followed.bundle, light))
+
+    def _ledger(self, bundle: Bundle, labels: Labels) -> Ledger | None:
+        fits = self.indirect is not None and Ledger.holds(bundle, labels)
+        return Ledger(bundle, labels, self.indirect.board) if self.indirect and fits else None
 
     def file_sharp(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`apart`, per sample.
@@ -447,9 +459,12 @@ class Simulation:
             samples = settings.from_camera_samples
             stages["from_camera"] = Stage(self.from_camera, samples, self.file_followed, "other")
         if settings.followed_anchors > 1:
-            for name, tracer in zip(AT_ANCHORS, self.at_anchors, strict=True):
-                if tracer is not None:
-                    stages[name] = Stage(tracer, settings.followed_samples, self.file_at_anchors, name)
+            samples, file, names = settings.followed_samples, self.file_at_anchors, AT_ANCHORS
+            indirect, from_camera = self.at_anchors
+            if indirect is not None:
+                stages[names[0]] = Stage(indirect, samples, file, names[0], self.anchors_ledger, self.file_anchors)
+            if from_camera is not None:
+                stages[names[1]] = Stage(from_camera, samples, file, names[1])
         return stages
 
     def flux(self, deposits: Deposits, samples: int) -> FloatArray:

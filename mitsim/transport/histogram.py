@@ -255,6 +255,18 @@ class Bundle:
         copied = np.tile(entries.data, copies), (rows, columns)
         return sparse.coo_array(copied, shape=(light.shape[0], self.size)).tocsr()
 
+    def averaged(self, light: sparse.csr_array, weights: FloatArray) -> sparse.csr_array:
+        """``light`` (rows, size) as one anchor's, (rows, size / anchors^2): the mean with ``weights`` (anchors,) along
+        rows and columns."""
+        entries = light.tocoo()
+        height, width = self.cells
+        line, place = np.divmod(entries.col.astype(np.int64), self.anchors * width)
+        (layer, line), (b, column) = np.divmod(line, self.anchors * height), np.divmod(place, width)
+        a, row = np.divmod(line, height)
+        shape = light.shape[0], len(self.depths) * height * width
+        places = ((layer * height + row) * width + column).astype(_index_type(*shape))
+        return sparse.coo_array((entries.data * weights[a] * weights[b], (entries.row, places)), shape=shape).tocsr()
+
     def _cells(self, axis: CellAxis, tau: FloatArray) -> list[tuple[IntArray, FloatArray]]:
         """Cells along an axis that share the light, each with its part."""
         if not self.between or axis.count == 1:

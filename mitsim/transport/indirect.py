@@ -14,8 +14,10 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -23,8 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.histogram import Deposits
-from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
+from mitsim.transport.histogram import DIRECT, Deposits
+from mitsim.transport.ledger import Ledger
+from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta, launches
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
 from mitsim.transport.repeats import Turns, by_pixel
@@ -78,8 +81,32 @@ class IndirectTracer(Tracer):
         """Paths of one sample: one per projector pixel and anchor, or as often as they are repeated."""
         return len(self.turns) if self.turns else self.projector.n**2 * self.points.count
 
+    @cached_property
+    def board(self) -> float:
+        """Irradiance [W m^-2] by a pixel's light from a white board at the rig's distance, to which light compares."""
+        pixel = dr.arange(mi.UInt32, self.projector.n**2)
+        flux = np.array(panchromatic(self.rays.flux(pixel, mi.Color0f())))
+        return float(flux.mean(dtype=np.float64)) / (math.pi * self.receiver.geometry.scene_distance**2)
+
+    def trace_into(self, ledger: Ledger, seed: int, first: int, samples: int) -> Deposits:
+        """The same as :meth:`trace`, indirect light filed in a ``ledger`` as far as it can be: the rest, on the host.
+
+        Parameters
+        ----------
+        ledger
+            of light by pixel, whose unit is :attr:`board`.
+        seed, first, samples
+            as for :meth:`trace`.
+        """
+        lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
+        launched = [self._walk(seed, *launch).file(ledger) for launch in lanes]
+        return Deposits.joined([deposits for parts in launched for deposits in parts])
+
     def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return IndirectWalk(self, seed, sample, lane).deposits(further=True)
+        return self._walk(seed, sample, lane).deposits(further=True)
+
+    def _walk(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> IndirectWalk:
+        return IndirectWalk(self, seed, sample, lane)
 
 
 class IndirectWalk(Walk):
@@ -123,6 +150,17 @@ class IndirectWalk(Walk):
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, self.rng = streams(seed, self.pixel, self.sample)
         self.first_turn = stratified(self.sample, shared)
+
+    def file(self, ledger: Ledger) -> list[Deposits]:
+        """Follow all paths; indirect light goes into a ``ledger``, caustics to the host."""
+        self.follow(further=True)
+        seen = self.kept["indirect"]
+        place = ledger.place(seen, self.rng.next_float32(), self.anchor)
+        ledger.add(seen.value, seen.pixel, place, ~(seen.value == 0))  # not a number is light to be refused
+        caustics = self.kept["direct"] if self.tracer.mirrors else None
+        # Together: apart, each would follow all paths again.
+        dr.eval(caustics, ledger.sums)
+        return [Deposits.fetched(caustics, DIRECT, self.anchor)] if caustics else []
 
     def vertex(self, first: bool) -> None:
         """Find, connect and leave the next surface, as :meth:`mitsim.transport.paths.Walk.vertex` does; ``first`` is

@@ -36,11 +36,16 @@ class Ledger:
     Parameters
     ----------
     bundle
-        how light is filed; of one anchor, and not between cells.
+        how light is filed; not between cells.
     labels
         (n^2,) row of each projector pixel.
     one
         irradiance [W m^-2] of about a bright path's.
+
+    Attributes
+    ----------
+    sums
+        (rows * places + 1,) on the device, in units.
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
@@ -49,16 +54,26 @@ class Ledger:
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
         self._labels = mi.UInt32(labels.astype(np.uint32))
         # One place more for each row, of light from beyond all cells; and a last one that counts what is no light.
-        self._sums = dr.zeros(mi.UInt64, self._rows * self._width + 1)
+        self.sums = dr.zeros(mi.UInt64, self._rows * self._width + 1)
 
     @staticmethod
     def holds(bundle: Bundle, labels: Labels) -> bool:
         """Whether a ledger of a ``bundle`` and ``labels`` has room, and can file as the bundle does."""
         fits = (int(labels.max()) + 1) * (bundle.size + 1) < _MOST_PLACES
-        return fits and bundle.anchors == 1 and not bundle.between
+        return fits and not bundle.between
 
-    def place(self, seen: Sightings, chosen: mi.Float) -> mi.UInt32:
-        """Where light is filed that is ``seen``, its layer ``chosen`` by a random number in [0, 1)."""
+    def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
+        """Where light is filed.
+
+        Parameters
+        ----------
+        seen
+            the light.
+        chosen
+            random numbers in [0, 1) that choose its layer.
+        anchor
+            row and column of its anchor; the first without them.
+        """
         grid, nodes = self._bundle.grid, [1 / depth for depth in self._bundle.depths]
         inside, cells = mi.Bool(True), []
         for axis, tau in ((grid.rows, seen.row), (grid.columns, seen.column)):
@@ -70,8 +85,9 @@ class Ledger:
         for low, high in pairwise(nodes):
             part = (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
-        rows, columns = (dr.opaque(mi.UInt32, count) for count in grid.shape)
-        place = (layer * rows + cells[0]) * columns + cells[1]
+        rows, columns, anchors = (dr.opaque(mi.UInt32, count) for count in (*grid.shape, self._bundle.anchors))
+        line, column = anchor or (mi.UInt32(0), mi.UInt32(0))
+        place = ((layer * anchors + line) * rows + cells[0]) * (anchors * columns) + column * columns + cells[1]
         return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size))
 
     def add(self, light: mi.Float, pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
@@ -93,11 +109,11 @@ class Ledger:
         row = dr.gather(mi.UInt32, self._labels, pixel, active)
         index = dr.select(fits, row * dr.opaque(mi.UInt32, self._width) + place, self._rows * self._width)
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
-        dr.scatter_reduce(dr.ReduceOp.Add, self._sums, amount, index, active, mode=dr.ReduceMode.Direct)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
     def fetched(self) -> npt.NDArray[np.uint64]:
         """The sums so far, on the host."""
-        return np.array(self._sums)
+        return np.array(self.sums)
 
     def filed(self, counted: npt.NDArray[np.uint64] | None = None) -> tuple[sparse.csr_array, float, float]:
         """(rows + 1, places) light of sums that were ``counted``, the last row empty; all that was received, and what

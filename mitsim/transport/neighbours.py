@@ -20,7 +20,6 @@ shared.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -34,7 +33,7 @@ import numpy as np
 from mitsim.transport.histogram import INDIRECT, Deposits, Sightings, check_finite
 from mitsim.transport.indirect import IndirectTracer, IndirectWalk
 from mitsim.transport.ledger import Ledger
-from mitsim.transport.paths import KINDS, camera_part, launches
+from mitsim.transport.paths import KINDS, camera_part
 from mitsim.transport.receiver import Way
 from mitsim.transport.repeats import MEMBERS, SIDE, blocks_of
 from mitsim.transport.sampling import generator, panchromatic, stratified
@@ -85,31 +84,7 @@ class NeighbourTracer(IndirectTracer):
         """Whether all surfaces are: pairs then take no look at a material."""
         return len(self.diffuse) == len(self.scene.shapes())
 
-    @cached_property
-    def board(self) -> float:
-        """Irradiance [W m^-2] by a pixel's light from a white board at the rig's distance, to which light compares."""
-        pixel = dr.arange(mi.UInt32, self.projector.n**2)
-        flux = np.array(panchromatic(self.rays.flux(pixel, mi.Color0f())))
-        return float(flux.mean(dtype=np.float64)) / (math.pi * self.receiver.geometry.scene_distance**2)
-
-    def trace_into(self, ledger: Ledger, seed: int, first: int, samples: int) -> Deposits:
-        """The same as :meth:`trace`, what is shared filed in a ``ledger``: what is not shared, on the host.
-
-        Parameters
-        ----------
-        ledger
-            of light by pixel, whose unit is :attr:`board`.
-        seed, first, samples
-            as for :meth:`trace`.
-        """
-        lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
-        launched = [self._block(seed, *launch).file(ledger) for launch in lanes]
-        return Deposits.joined([deposits for parts in launched for deposits in parts])
-
-    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return self._block(seed, sample, lane).deposits(further=True)
-
-    def _block(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> _Block:
+    def _walk(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> _Block:
         return (_DiffuseBlock if self.all_diffuse else _Block)(self, seed, sample, lane)
 
 
@@ -176,7 +151,7 @@ class _Block(IndirectWalk):
         """Follow all paths; on the host the light that is not shared."""
         self._first()
         self._second()
-        self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
+        self._follow_on()
         kept = self.kept["indirect"]
         followed = dr.select(self.follows, kept.value, 0)
         self.further = Sightings(followed, kept.pixel, kept.row, kept.column, kept.inverse_depth)

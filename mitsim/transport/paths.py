@@ -191,11 +191,19 @@ class Walk(ABC):
 
     def deposits(self, further: bool) -> list[Deposits]:
         """Light on the host of every path, followed to its end or, unless ``further``, to the first surface only."""
-        self.vertex(first=True)
-        if further:
-            self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
+        self.follow(further)
         dr.eval(self.kept)
         return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
+
+    def follow(self, further: bool) -> None:
+        """Follow every path to its end or, unless ``further``, to the first surface only."""
+        self.vertex(first=True)
+        if further:
+            self._follow_on()
+
+    def _follow_on(self) -> None:
+        """Follow every path from where it is."""
+        self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
 
     def _body(self, *values: object) -> tuple[object, ...]:
         self._load(values)

@@ -45,7 +45,7 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 def test_plan(call: Callable[..., Any], lab: Any) -> None:
     plan = call("plan", *lab.rig, "--json", "--quiet", "--variant", "llvm_ad_mono").payload
     assert {"effects", "accuracy", "predicted_seconds"} <= plan.keys()
-    assert plan["accuracy"] == 0.005 and number(plan["predicted_seconds"], 1e-6, 600)
+    assert plan["accuracy"] == 0.005 and number(plan["predicted_seconds"], 1e-6)
     assert len({effect["name"] for effect in plan["effects"]}) == len(plan["effects"]) >= 5
     for effect in plan["effects"]:
         assert {"name", "state", "reason", "error_if_off", "seconds"} <= effect.keys()

@@ -146,6 +146,14 @@ def test_light_averaged_over_the_anchors() -> None:
 
 
 @pytest.mark.parametrize("depths", WAYS)
+def test_filed_light_averaged_over_the_anchors(depths: tuple[float, ...]) -> None:
+    """Averaged before it is filed or after, light is the same."""
+    found, weights, made = deposits(), np.array([0.7, 0.3]), bundle(depths)
+    before = bundle(depths, anchors=1).file(found.averaged(weights), LABELS).toarray()
+    assert np.allclose(made.averaged(made.file(found, LABELS), weights).toarray(), before, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("depths", WAYS)
 def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None:
     made, single = bundle(depths), bundle(depths, anchors=1)
     light = single.file(deposits().averaged(np.array([0.5, 0.5])), LABELS)

@@ -162,6 +162,27 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
     np.testing.assert_allclose(*by_layer, rtol=0.03)
 
 
+@pytest.mark.parametrize("mirrors", [False, True])
+def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Callable[..., Path], mirrors: bool) -> None:
+    """Place by place, all but caustics: those stay on the host."""
+    bench = opened(shared_scene(f"anchors {mirrors}", extra=SCENES["mirror wall"]))
+    loaded, points = bench.loaded, SensorPoints(bench.geometry.half_width, anchors=3)
+    tracer = IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, mirrors, True, points=points)
+    grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
+    bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
+    ledger = Ledger(bundle, labels, tracer.board)
+    rest = tracer.trace_into(ledger, 3, 0, 64)
+    matrix, received, outside = ledger.filed()
+    every = tracer.trace(3, 0, 64)
+    indirect = every.where(every.kind == INDIRECT)
+    assert (len(rest.value) > 0) == mirrors and len(rest.value) + len(indirect.value) == len(every.value)
+    assert 0 < outside == pytest.approx(bundle.outside(indirect), rel=1e-6)
+    assert received == pytest.approx(indirect.value.sum(), rel=1e-6)
+    expected = bundle.file(indirect, labels).toarray()
+    assert (np.count_nonzero(expected.reshape(6, 3, -1, 3, grid.shape[1]), axis=(0, 2, 4)) > 0).all()
+    np.testing.assert_allclose(matrix.toarray(), expected, rtol=1e-4, atol=1e-7 * expected.max())
+
+
 def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path]) -> None:
     bench = open_bench(small_scene(extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
