@@ -22,16 +22,12 @@ from mitsim.transport.landing import landing
 from mitsim.transport.paths import launches
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import Reception
-from mitsim.transport.sampling import shuffled, stratified
 
 IntArray = npt.NDArray[np.int64]
 
 
 class FluxTracer(DirectTracer):
-    """Direct light at the sensor as a whole: its points are stratified together with those of the projector's pixels.
-
-    Frames keep the plain random points that they are bit-equal with.
-    """
+    """Direct light at the sensor as a whole, of each projector pixel."""
 
     def __init__(
         self,
@@ -82,12 +78,6 @@ class FluxTracer(DirectTracer):
             check_finite(light)
             total += light.sum(axis=0, dtype=np.float64)
         return total
-
-    def _sensor(
-        self, row: mi.UInt32, column: mi.UInt32, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32
-    ) -> mi.Point3f:
-        del row, column, rng
-        return self.points.inside(stratified(shuffled(sample, shared), shared))
 
     def _received(
         self,
