@@ -32,7 +32,8 @@ import numpy as np
 
 import mitsim as ms
 from mitsim.capture.bench import Bench
-from mitsim.capture.simulation import FiledLight, Simulation, Stage
+from mitsim.capture.filing import FiledLight
+from mitsim.capture.simulation import Simulation, Stage
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import INDIRECT

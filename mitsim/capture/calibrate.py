@@ -11,12 +11,13 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.checkpoint import Checkpoint, claimed_session
+from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Exposure
 from mitsim.capture.run import digital_scale
 from mitsim.capture.session import SIDES, LitSession, Session
-from mitsim.capture.simulation import TRAYS, FiledLight, Simulation
+from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest

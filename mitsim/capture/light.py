@@ -17,9 +17,10 @@ import numpy.typing as npt
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
+from mitsim.capture.filing import FiledLight
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, LAST_CHECKED_SHOTS
-from mitsim.capture.simulation import FiledLight, Simulation, Stage
+from mitsim.capture.simulation import Simulation, Stage
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
 from mitsim.core.parallel import single_threaded_blas

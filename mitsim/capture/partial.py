@@ -34,8 +34,9 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
+from mitsim.capture.filing import TRAYS, FiledLight, Tray
 from mitsim.capture.light import Light, traced_again
-from mitsim.capture.simulation import TRAYS, FiledLight, Simulation, Stage, Tray, expected_of
+from mitsim.capture.simulation import Simulation, Stage, expected_of
 from mitsim.capture.truth import Truth
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer

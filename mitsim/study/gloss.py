@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.light import Light
-from mitsim.capture.simulation import TRAYS, FiledLight
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames, Frame

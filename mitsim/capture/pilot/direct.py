@@ -13,8 +13,9 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Effort, Forming, Noise, Part, Settings
+from mitsim.capture.filing import FiledLight, Tray
 from mitsim.capture.pilot.looks import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, ladder, noise, norm
-from mitsim.capture.simulation import FiledLight, Simulation, Tray
+from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer

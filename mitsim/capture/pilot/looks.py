@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsim.capture.evidence import Part
-from mitsim.capture.simulation import FiledLight, Simulation
+from mitsim.capture.filing import FiledLight
+from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.rig.patterns import Lighting
 

@@ -10,9 +10,10 @@ import pytest
 import mitsim as ms
 from mitsim.capture import partial
 from mitsim.capture.evidence import SharpPixels
+from mitsim.capture.filing import TRAYS
 from mitsim.capture.light import Light, traced_again
 from mitsim.capture.partial import Anatomy
-from mitsim.capture.simulation import TRAYS, Simulation
+from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.study.exposures import IDEALISED, LitScene
 from mitsim.transport.histogram import DIRECT, Deposits

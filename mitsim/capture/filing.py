@@ -1,0 +1,347 @@
+"""Light of a bench under one choice of settings, from deposits of tracers to sparse matrices, with the
+optics that form their frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.effects import Physics
+from mitsim.capture.evidence import Settings
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.optics.anchors import anchor_positions, anchor_weights
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.frames import Filed
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Spectrum
+from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
+from mitsim.transport.ledger import Ledger
+
+_AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
+"""Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which
+a shadow's fringes hardly move."""
+TRAYS = ("fine", "coarse", "occluded", "smooth", "followed", "sharp")
+"""Parts of an :class:`FiledLight`."""
+_MOST_ROWS = 2**12
+"""Rows of anchors times cells of sharp light: a class that lights them all is a matrix of 128 MiB."""
+
+
+@dataclass(frozen=True, eq=False)
+class FiledLight:
+    """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
+
+    ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees of direct
+    light beyond that, ``occluded`` the same of occluded pixels, which have more anchors; ``smooth`` is indirect light,
+    and ``followed`` what each anchor sees of followed light beyond its average: small or smooth, so coarse cells hold
+    them well. ``sharp`` is direct light of the pixels that are traced apart. Of all light ``received``, a mean over the
+    sensor without its mask, ``outside`` came from beyond all cells: it is in no frame.
+    """
+
+    fine: sparse.csr_array
+    coarse: sparse.csr_array
+    occluded: sparse.csr_array
+    smooth: sparse.csr_array
+    followed: sparse.csr_array
+    sharp: sparse.csr_array
+    received: float = 0.0
+    outside: float = 0.0
+
+    def __add__(self, other: FiledLight) -> FiledLight:
+        return FiledLight(*(_sum(getattr(self, field.name), getattr(other, field.name)) for field in fields(self)))
+
+    def __truediv__(self, count: float) -> FiledLight:
+        return FiledLight(*(getattr(self, field.name) / count for field in fields(self)))
+
+    @property
+    def totals(self) -> FloatArray:
+        """(classes + 1,) light of each row, a mean over the sensor, but for pixels that are traced apart [W m^-2]."""
+        return np.asarray(self.fine.sum(axis=1) + self.smooth.sum(axis=1), dtype=np.float64)
+
+    @property
+    def lost(self) -> float:
+        """Part of the light that is in no frame."""
+        return self.outside / self.received if self.outside else 0.0
+
+
+def _sum(one: Any, other: Any) -> Any:
+    """Of numbers or matrices; a matrix to which nothing is added is not copied."""
+    if not isinstance(one, sparse.csr_array) or (one.nnz and other.nnz):
+        return one + other
+    return one if one.nnz else other
+
+
+class Tray:
+    """Cells that light is filed in, and the optics that form its frames; the optics are prepared on first use.
+
+    Parameters
+    ----------
+    bundle
+        cells, anchors and layers.
+    geometry
+        the camera.
+    spectrum
+        light whose diffraction is simulated; None: the mask's shadow is geometric.
+    """
+
+    def __init__(self, bundle: Bundle, geometry: CameraGeometry, spectrum: Spectrum | None) -> None:
+        self.bundle, self._geometry, self._spectrum = bundle, geometry, spectrum
+
+    @cached_property
+    def optics(self) -> FrameOptics:
+        """From light in these cells to frames."""
+        bundle = self.bundle
+        return FrameOptics(self._geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, self._spectrum)
+
+    def file(self, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
+        """(classes + 1, places) light per sample.
+
+        Parameters
+        ----------
+        deposits
+            of a tracer.
+        labels
+            (n^2,) class of each projector pixel.
+        samples
+            that were traced.
+        """
+        return self.bundle.file(deposits, labels, samples)
+
+
+class Trays:
+    """What light of a bench with settings is filed in; optics are prepared when they are first asked for.
+
+    Parameters
+    ----------
+    bench, settings
+        what is simulated, and how finely.
+    pixels
+        cells a side of the projector's window, instead of one a pixel.
+    one_line
+        whether diffraction is that of the light's mean wavelength alone: for what hardly hangs on it, in a third of the
+        time.
+
+    Attributes
+    ----------
+    physics
+        what is simulated of the bench.
+    fine, coarse, occluded, smooth, followed, sharp
+        trays for the parts of an :class:`FiledLight`; ``ambient`` and ``followed_ambient`` for lamps' light in the
+        cells of ``fine`` and of ``followed``.
+    """
+
+    def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None, one_line: bool = False) -> None:
+        self.bench, self.settings = bench, settings
+        self.physics = Physics.simulated(bench, settings.effects)
+        if one_line and self.physics.spectrum:
+            self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
+        pixels = pixels or bench.n
+        # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
+        self.aim = self._grid(pixels, 1, None)
+        fine = Bundle(self._grid(pixels, settings.subdivision, settings.reach), 1, settings.depths)
+        depths = settings.depths if settings.coarse_layers else (settings.depth,)
+        coarse = self._grid(pixels, settings.coarse_cells, settings.reach)
+        self.fine = self._tray(fine)
+        self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
+        self.occluded = self._tray(Bundle(coarse, settings.occluded_anchors, depths))
+        self.smooth = self._tray(Bundle(coarse, 1, depths))
+        wide = self._grid(-(-pixels // settings.followed_width), 1, settings.reach)
+        broad = (wide, (settings.depth,)) if settings.followed_width > 1 else (coarse, depths)
+        several = Bundle(broad[0], settings.followed_anchors, broad[1])
+        self.followed = self._tray(several)
+        self.sharp = self._tray(self._apart(pixels))
+        lamps = _bands(*_AMBIENT_NM, _AMBIENT_BANDS)
+        self.ambient, self.followed_ambient = self._tray(fine, lamps), self._tray(several, lamps)
+
+    def _tray(self, bundle: Bundle, light: Spectrum | None = None) -> Tray:
+        """``light`` None: the projector's. All light diffracts or none."""
+        spectrum = self.physics.spectrum
+        return Tray(bundle, self.physics.geometry, (light or spectrum) if spectrum else None)
+
+    @property
+    def reach(self) -> float:
+        """Largest tan-angle, from the sensor's centre, of what its edge sees at the light's depth."""
+        return self.physics.geometry.reach(self.settings.depth)
+
+    def _grid(self, pixels: int, subdivision: int, reach: float | None) -> CellGrid:
+        """Cells as far as the sensor's edge sees through the field stop, or to ``reach`` if that is farther.
+
+        The same for any number of anchors and layers, so that their light can be compared.
+        """
+        depth, reach = self.settings.depth, max(self.reach, reach or 0.0)
+        return aligned_grid(*self.bench.windows_at(depth), pixels, subdivision, reach)
+
+    def _apart(self, pixels: int) -> Bundle:
+        """Cells of the sharp pixels' light: their part of the fine ones, or coarser where the anchors are too many."""
+        settings, sharp = self.settings, self.settings.sharp
+        if sharp is None:
+            return Bundle(self._grid(pixels, 1, None), 1, (settings.depth,))
+
+        def part(subdivision: int) -> CellGrid:
+            whole, window = self._grid(pixels, subdivision, settings.reach), sharp.window
+            return CellGrid(whole.rows.part(*window[:2]), whole.columns.part(*window[2:]))
+
+        most = max(1, _MOST_ROWS // (sharp.anchors * max(part(1).shape)))
+        return Bundle(part(min(settings.subdivision, most)), sharp.anchors, settings.depths, between=True)
+
+    @cached_property
+    def sharp_weights(self) -> FloatArray:
+        """(anchors,) weight of each of the sharp pixels' anchors in the mean over the sensor."""
+        return self._mean_weights(self.sharp.bundle.anchors)
+
+    def _mean_weights(self, anchors: int) -> FloatArray:
+        """(anchors,) weight of each anchor in the mean over the sensor."""
+        edges = self.physics.geometry.pixel_edges
+        positions = anchor_positions(anchors, self.physics.geometry.half_width)
+        return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
+
+    def file_direct(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`direct`, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        return self._light(deposits, samples, fine=self.fine.file(deposits, labels, samples))
+
+    def file_anchored(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`anchored` beyond its mean over the sensor, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        return self._light(None, 1, coarse=self._beyond_mean(self.coarse, deposits, labels, samples))
+
+    def file_occluded(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`anchored_occluded` beyond its mean over the sensor, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        return self._light(None, 1, occluded=self._beyond_mean(self.occluded, deposits, labels, samples))
+
+    def file_at_anchors(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`at_anchors` beyond its mean over the sensor, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        return self._light(None, 1, followed=self._beyond_mean(self.followed, deposits, labels, samples))
+
+    def _beyond_mean(self, tray: Tray, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
+        """Light in a ``tray`` beyond its mean over the sensor."""
+        return self._less_mean(tray.bundle, tray.file(deposits, labels, samples))
+
+    def _less_mean(self, bundle: Bundle, light: sparse.csr_array) -> sparse.csr_array:
+        """``light`` that was filed by a ``bundle``, beyond its mean over the sensor."""
+        return light - bundle.repeated(bundle.averaged(light, self._mean_weights(bundle.anchors)))
+
+    def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`indirect` or :attr:`from_camera`, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        indirect = deposits.kind == INDIRECT
+        fine = self.fine.file(deposits.where(~indirect), labels, samples)
+        smooth = self.smooth.file(deposits.where(indirect), labels, samples)
+        return self._light(deposits, samples, fine=fine, smooth=smooth)
+
+    def file_smooth(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
+        """Light in a ``ledger`` of :meth:`smooth_ledger`, from what it ``counted``."""
+        smooth, received, outside = ledger.filed(counted)
+        return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
+
+    def file_anchors(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
+        """Light in a ``ledger`` of :meth:`anchors_ledger` beyond its mean, from what it ``counted``."""
+        light, *_ = ledger.filed(counted)
+        return self._light(None, 1, followed=self._less_mean(self.followed.bundle, light))
+
+    def file_sharp(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`apart`, per sample.
+
+        Parameters
+        ----------
+        deposits, labels, samples
+            as for :meth:`Tray.file`.
+        """
+        light = self._light(None, 1, sharp=self.sharp.file(deposits, labels, samples))
+        mean = deposits.averaged(self.sharp_weights)
+        outside = self.sharp.bundle.outside(mean) / samples
+        return replace(light, received=float(mean.value.sum()) / samples, outside=outside)
+
+    def _light(self, deposits: Deposits | None, samples: int, **parts: sparse.csr_array) -> FiledLight:
+        """Light in ``parts``; of ``deposits`` in so many ``samples`` it is told what is received, and what lost."""
+        rows = next(iter(parts.values())).shape[0]
+        sizes = {name: getattr(self, name).bundle.size for name in TRAYS}
+        filed = {name: parts.get(name, sparse.csr_array((rows, size))) for name, size in sizes.items()}
+        if deposits is None:
+            return FiledLight(**filed)
+        received, outside = float(deposits.value.sum()), self.fine.bundle.outside(deposits)
+        return FiledLight(**filed, received=received / samples, outside=outside / samples)
+
+    def flux(self, deposits: Deposits, samples: int) -> FloatArray:
+        """(n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask.
+
+        ``deposits`` are those of :attr:`direct` or :attr:`apart` in so many ``samples``.
+        """
+        if self.settings.sharp and len(deposits.pixel) and deposits.anchor_row.any():
+            deposits = deposits.averaged(self.sharp_weights)
+        value = deposits.value * (deposits.kind == DIRECT) / samples
+        return np.asarray(np.bincount(deposits.pixel, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
+
+    def filed(self, groups: Sequence[FiledLight], first: int) -> tuple[list[Filed], list[Filed]]:
+        """Light of the projector and ambient light, with the optics that form their frames.
+
+        Parameters
+        ----------
+        groups, first
+            independent estimates of the light, and the row of ambient light in them, the last.
+        """
+        lights, ambient = [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))], []
+        if self.settings.anchors > 1:
+            lights.append(Filed(self.coarse.optics, tuple(_rows(group.coarse, 0, first) for group in groups)))
+        if self.settings.with_own_anchors:
+            lights.append(Filed(self.occluded.optics, tuple(_rows(group.occluded, 0, first) for group in groups)))
+        if self.settings.sharp:
+            lights.append(Filed(self.sharp.optics, tuple(_rows(group.sharp, 0, first) for group in groups)))
+        if self.settings.followed_anchors > 1:
+            lights.append(Filed(self.followed.optics, tuple(_rows(group.followed, 0, first) for group in groups)))
+        if self.physics.interreflection:
+            lights.append(Filed(self.smooth.optics, tuple(_rows(group.smooth, 0, first) for group in groups)))
+        if self.physics.lamps:
+            ambient.append(Filed(self.ambient.optics, tuple(_rows(group.fine, first, first + 1) for group in groups)))
+            if self.settings.followed_anchors > 1:
+                beyond = tuple(_rows(group.followed, first, first + 1) for group in groups)
+                ambient.append(Filed(self.followed_ambient.optics, beyond))
+        return lights, ambient
+
+
+def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:
+    """Rows ``first`` .. ``last`` - 1 of ``light``, not copied."""
+    start, stop = light.indptr[first], light.indptr[last]
+    entries = light.data[start:stop], light.indices[start:stop], light.indptr[first : last + 1] - start
+    return sparse.csr_array(entries, shape=(last - first, light.shape[1]), copy=False)
+
+
+def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:
+    """Equal photons in ``count`` bands between two wavelengths, each taken at its centre."""
+    edges = np.linspace(low_nm, high_nm, count + 1)
+    return Spectrum((edges[:-1] + edges[1:]) / 2, np.full(count, 1 / count))
