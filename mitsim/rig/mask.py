@@ -20,6 +20,7 @@ MaskKind = Literal["separable", "flatcam", "open"]
 """How a plate is made from a code; see :class:`Mask`."""
 Term = tuple[float, FloatArray, FloatArray]
 """Weight, row profile (N,) and column profile (N,) of a separable part of a transmission."""
+BoolArray = npt.NDArray[np.bool_]
 # fmt: off
 _TAPS = {
     2: (1,), 3: (2,), 4: (3,), 5: (3,), 6: (5,), 7: (6,), 8: (7, 6, 1), 9: (5,), 10: (7,), 11: (9,), 12: (11, 10, 4),
@@ -77,6 +78,14 @@ class Mask(ByValue):
             return ((1.0, profile, profile),)
         signed = 2 * self.bits.astype(np.float64) - 1
         return ((0.5, ones, ones), (0.5, signed, signed))
+
+    @property
+    def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
+        """What is open, as grids that do not overlap: (N,) rows and (N,) columns of each, open where both say so."""
+        bits = self.bits.astype(bool)
+        if self.kind == "open":
+            return ((np.ones_like(bits), np.ones_like(bits)),)
+        return ((bits, bits),) if self.kind == "separable" else ((bits, bits), (~bits, ~bits))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
         """Transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm]; the arrays broadcast."""

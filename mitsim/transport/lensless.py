@@ -57,7 +57,8 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin
+from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
+from mitsim.transport.openings import Openings
 from mitsim.transport.registering import register_once
 
 PLUGIN = "mitsim_lensless"
@@ -102,7 +103,8 @@ def _sensor_class() -> type:
                 raise MitsimError(f"{PLUGIN}: the film is cropped; the whole sensor is simulated, remove the crop")
             _check_rigid(self.world_transform())
             self.geometry = _geometry(props, self.film().size())
-            terms = self.geometry.build_mask().terms
+            mask = self.geometry.build_mask()
+            self._openings, terms = Openings(mask), mask.terms
             self._weights = [weight for weight, _, _ in terms]
             self._rows = [mi.Float(rows.astype(np.float32)) for _, rows, _ in terms]
             self._columns = [mi.Float(columns.astype(np.float32)) for _, _, columns in terms]
@@ -114,9 +116,8 @@ def _sensor_class() -> type:
             geometry = self.geometry
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             u = (1 - 2 * self._active(sample2)) * geometry.half_width
-            t = (1 - 2 * sample3) * geometry.tan_half_fov
+            t, weight = self._direction(u, sample3)
             squared = 1 + dr.squared_norm(t)
-            weight = self._transmission(u + geometry.mask_distance * t, active)
             if geometry.mask_thickness:
                 weight *= self._transmission(u + (geometry.mask_distance + geometry.mask_thickness) * t, active)
             if geometry.angular_exponent:
@@ -144,6 +145,20 @@ def _sensor_class() -> type:
                 return sample
             middle = (dr.floor(sample * geometry.pixels) + 0.5) / geometry.pixels
             return middle + (sample - middle) * (geometry.active_side / geometry.pixel_pitch)
+
+        def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
+            """Tan-angles t from sensor points u [mm] to open places of the mask, and the part of all that is open."""
+            geometry = self.geometry
+            stop, side = geometry.tan_half_fov, geometry.mask_feature
+            # What the field stop shows of the mask, in features from the mask's first corner.
+            first = [
+                (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._features
+                for start, centre in zip(rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
+            ]
+            width = 2 * stop * geometry.mask_distance / side
+            row, column, part = self._openings.drawn(*first, width, sample)
+            t = mi.Vector2f(*x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
+            return t, part
 
         def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
             """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""

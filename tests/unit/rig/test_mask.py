@@ -22,6 +22,8 @@ def test_open_share_and_pointwise_transmission(kind, open_share):
     assert set(np.unique(plate)) <= {0.0, 1.0}
     np.testing.assert_array_equal(plate, terms)
     assert plate.mean() == pytest.approx(open_share, abs=2 / 511)
+    # The grids of openings neither overlap nor leave a place out.
+    np.testing.assert_array_equal(plate, sum(np.outer(rows, columns).astype(int) for rows, columns in mask.openings))
 
 
 @pytest.mark.parametrize("order", range(2, 17))
