@@ -60,6 +60,7 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.openings import Openings
 from mitsim.transport.registering import register_once
+from mitsim.transport.sampling import generator, shuffled, stratified
 
 PLUGIN = "mitsim_lensless"
 _BOX_RADIUS = 0.5 + 1e-4
@@ -103,6 +104,7 @@ def _sensor_class() -> type:
                 raise MitsimError(f"{PLUGIN}: the film is cropped; the whole sensor is simulated, remove the crop")
             _check_rigid(self.world_transform())
             self.geometry = _geometry(props, self.film().size())
+            self._points: tuple[int, int] | None = None
             mask = self.geometry.build_mask()
             self._openings, terms = Openings(mask), mask.terms
             self._weights = [weight for weight, _, _ in terms]
@@ -110,11 +112,20 @@ def _sensor_class() -> type:
             self._columns = [mi.Float(columns.astype(np.float32)) for _, _, columns in terms]
             self._features = len(terms[0][1])
 
+        def stratify(self, points: tuple[int, int] | None) -> None:
+            """Draw u and t of a pixel's paths from Sobol points that are scrambled by (seed, paths a pixel) ``points``.
+
+            Each pixel has points of its own, and so has each seed. None: random numbers again.
+            """
+            self._points = points
+
         def sample_ray(
             self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
         ) -> tuple[mi.Ray3f, mi.Spectrum]:
             geometry = self.geometry
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
+            if self._points:
+                sample2, sample3 = self._stratified(sample2, *self._points)
             u = (1 - 2 * self._active(sample2)) * geometry.half_width
             t, weight = self._direction(u, sample3)
             squared = 1 + dr.squared_norm(t)
@@ -137,6 +148,15 @@ def _sensor_class() -> type:
         ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
+
+        def _stratified(self, film: mi.Point2f, seed: int, paths: int) -> tuple[mi.Point2f, mi.Point2f]:
+            """Even points in the pixels of ``film`` points (0..1), and of the unit square; in the order of lanes."""
+            place = dr.minimum(dr.floor(film * self.geometry.pixels), self.geometry.pixels - 1)
+            pixel = mi.UInt32(place.y) * self.geometry.pixels + mi.UInt32(place.x)
+            rng = generator(dr.opaque(mi.UInt32, seed), pixel)
+            index = dr.arange(mi.UInt32, dr.width(film)) % dr.opaque(mi.UInt32, paths)
+            film = (place + stratified(index, rng)) / self.geometry.pixels
+            return film, stratified(shuffled(index, rng), rng)
 
         def _active(self, sample: mi.Point2f) -> mi.Point2f:
             """Film points (0..1) drawn together into the active square of their pixels."""

@@ -26,3 +26,11 @@ def test_a_dark_frame_is_flagged(small_scene: Callable[..., Path]) -> None:
     scene.write_text(text[:start] + text[text.rindex("</shape>") + len("</shape>") :])
     result = open_bench(scene, for_render=True).render(spp=4)
     assert not result.mean.any() and any("dark" in warning for warning in result.warnings)
+
+
+def test_a_sampler_of_dependent_numbers_is_flagged(small_scene: Callable[..., Path]) -> None:
+    scene = small_scene()
+    assert not open_bench(scene, for_render=True).render(spp=4).warnings
+    scene.write_text(scene.read_text().replace('type="independent"', 'type="multijitter"'))
+    (warning,) = open_bench(scene, for_render=True).render(spp=4).warnings
+    assert "MultijitterSampler" in warning and '<sampler type="independent"/>' in warning
