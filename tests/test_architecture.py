@@ -6,6 +6,7 @@ rig - carry their reason here.
 
 import ast
 import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -168,3 +169,65 @@ if "mitsuba" in sys.modules:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not done.stdout, "importing prints"
+
+
+BACKENDS = re.compile(r"llvm|cuda|thread_count", re.IGNORECASE)
+KNOWS_BACKENDS = {
+    "mitsim.core.llvm": "finds the library",
+    "mitsim.core.environment": "chooses the variant",
+    "mitsim.cli.options": "says in the help what there is to choose",
+}
+SUMS = {"sum", "mean", "prod", "prefix_sum", "cumsum", "block_sum", "block_reduce", "block_prefix_sum", "reduce"}
+OF_A_LANE = {
+    "mitsim.transport.sampling": "the channels of a spectrum",
+    "mitsim.transport.grating": "the orders of a grating",
+}
+
+
+def named(tree: ast.AST) -> list[str]:
+    """Names, attributes, imports and strings of a module, but for docstrings."""
+    texts = [
+        node.body[0].value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    ]
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            texts.append(node.value)  # what stands below a constant
+        if isinstance(node, ast.Name | ast.Attribute):
+            found.append(node.id if isinstance(node, ast.Name) else node.attr)
+        elif isinstance(node, ast.ImportFrom | ast.alias):
+            found.append((node.module if isinstance(node, ast.ImportFrom) else node.name) or "")
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in texts:
+            found.append(node.value)
+    return found
+
+
+def names_a_backend(module: str, source: str) -> bool:
+    return module not in KNOWS_BACKENDS and any(BACKENDS.search(name) for name in named(ast.parse(source)))
+
+
+def sums_lanes(module: str, source: str) -> list[str]:
+    """Sums that Dr.Jit would add up over lanes, in the lanes' own 32 bits."""
+    if module in OF_A_LANE:
+        return []
+    calls = (node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    found = (call for call in calls if isinstance(call, ast.Attribute) and call.attr in SUMS)
+    return [call.attr for call in found if isinstance(call.value, ast.Name) and call.value.id in ("dr", "drjit")]
+
+
+def test_no_module_but_core_knows_a_backend() -> None:
+    """All others take their types from the variant in use, so that they run on any."""
+    assert not [name for name, path in modules() if names_a_backend(name, path.read_text(encoding="utf-8"))]
+    for planted in ("from drjit.llvm import Float", "mi.set_variant('llvm_ad_mono')", "dr.set_thread_count(2)"):
+        assert names_a_backend("mitsim.transport.direct", planted)
+    assert not names_a_backend("mitsim.transport.direct", '"""Runs on LLVM."""\nimport mitsuba as mi')
+
+
+def test_lanes_are_not_added_up_in_32_bits() -> None:
+    """Light leaves the device as it is, or in whole numbers of 64 bits; the host adds up in double precision."""
+    assert not [name for name, path in modules() if sums_lanes(name, path.read_text(encoding="utf-8"))]
+    assert sums_lanes("mitsim.transport.flux", "total = dr.sum(light)") == ["sum"]

@@ -29,7 +29,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="no progress")]
 Variant = Annotated[
     str,
     typer.Option(
-        help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral", callback=lambda name: variant_of(name)
+        help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
+        callback=lambda name: variant_of(name),
     ),
 ]
 Patterns = Annotated[str, typer.Option(help="uniform, dots:K, dots:RxC, hadamard:K or random:K")]

@@ -15,7 +15,8 @@ from mitsim.core.errors import MitsimError
 DEFAULT_VARIANT = "llvm_ad_mono"
 """One panchromatic reflectance, as the factored estimator has it; the others cost time and change nothing else."""
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral")
-"""Variants mitsim is tested with; `load_variant` takes any that the installed Mitsuba has."""
+"""Variants mitsim is tested with, and with cuda_ for llvm_ where there is a GPU (tests/physics/test_cuda.py);
+`load_variant` takes any that the installed Mitsuba has."""
 
 _CHILD_SECONDS = 120
 """Longest time for a check; chosen so: all of them take some ten, on a busy machine several times that."""
@@ -57,7 +58,7 @@ def load_variant(name: str) -> ModuleType:
     """Mitsuba with the variant ``name`` set, after choosing an LLVM that works for the llvm_ variants.
 
     Setting a variant is Mitsuba's own process-wide state; nothing in mitsim does so except by this call.
-    Raises MitsimError for an unknown variant, a Mitsuba that cannot be imported, or a missing LLVM.
+    Raises MitsimError for an unknown variant, a Mitsuba that cannot be imported, a missing LLVM, or a missing GPU.
     """
     if name.startswith("llvm_"):
         llvm.select_llvm()
@@ -68,17 +69,29 @@ def load_variant(name: str) -> ModuleType:
     variants = mitsuba.variants()
     if name not in variants:
         raise MitsimError(f"variant: got {name!r}; this Mitsuba has {', '.join(variants)}; choose one of these")
+    if name.startswith("cuda_") and not has_gpu():
+        llvm_name = name.replace("cuda_", "llvm_", 1)
+        raise MitsimError(f"variant {name}: Dr.Jit finds no NVIDIA GPU and driver here; use {llvm_name}")
     try:
         mitsuba.set_variant(name)
     except ImportError as error:
         raise MitsimError(f"variant {name}: cannot be loaded ({_one_line(error)}); run: mitsim doctor") from error
-    if name.startswith("llvm_"):
-        import drjit
+    import drjit
 
-        if drjit.thread_count() < _FEWEST_THREADS:
-            drjit.set_thread_count(_FEWEST_THREADS)
+    if drjit.thread_count() < _FEWEST_THREADS:
+        drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
     return module
+
+
+def has_gpu() -> bool:
+    """Whether Dr.Jit finds a GPU for the cuda_ variants; never raises for the lack of one.
+
+    It imports Dr.Jit, which reads the path of its LLVM then: not to be asked before an LLVM is chosen.
+    """
+    import drjit
+
+    return bool(drjit.has_backend(drjit.JitBackend.CUDA))
 
 
 def doctor() -> list[Check]:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.study.table import Table, Value
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class Setup:
     parameters: tuple[tuple[str, str], ...] = ()
     camera: str | None = None
     projector: str | None = None
-    variant: str = "llvm_ad_mono"
+    variant: str = DEFAULT_VARIANT
     outside: bool = False
     accuracy: float = 1e-3
 

@@ -8,10 +8,13 @@ Irradiance at sensor point u, in the units of the scene's radiance times steradi
 
 over t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (both
 faces count, a thin mask has one), cos^n a pixel's angular response, and the last factor is
-cos(theta) d omega written in t. A sample draws u inside its pixel's active square and t uniformly over the field stop,
-traces the ray from u, and returns weight M M cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, T = tan(fov / 2):
-irradiance is per pixel area. The mask is a factor, not geometry: thin geometry suffers from Mitsuba's ray epsilon and
-blocks connections to delta lights. Diffraction is the factored estimator's: here light travels along rays.
+cos(theta) d omega written in t. A sample draws u inside its pixel's active square and a place where the mask's near
+face is open, evenly among all that the field stop shows from u (:mod:`mitsim.transport.openings`), which makes t. It
+traces the ray from u and returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T =
+tan(fov / 2) and p the part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole
+field stop three of four rays would end at a separable mask. The mask is a factor, not geometry: thin geometry suffers
+from Mitsuba's ray epsilon and blocks connections to delta lights. Diffraction is the factored estimator's: here light
+travels along rays.
 
 The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks
 along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.
@@ -46,7 +49,7 @@ XML::
 
 Python: ``register(); mi.load_dict({"type": "scene", "camera": {"type": "mitsim_lensless", "mask": "open"}, ...})``.
 
-Importance sampling of the mask is left out on purpose: the reference is the judge, and simple enough to check by eye.
+Nothing else is sampled by importance: the reference is the judge, and simple enough to check by eye.
 """
 
 from __future__ import annotations
@@ -176,7 +179,7 @@ def _sensor_class() -> type:
                 for start, centre in zip(rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
             ]
             width = 2 * stop * geometry.mask_distance / side
-            row, column, part = self._openings.drawn(*first, width, sample)
+            row, column, part = self._openings.drawn(mi.Point2f(*first), width, sample)
             t = mi.Vector2f(*x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
             return t, part
 

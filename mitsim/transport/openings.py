@@ -73,15 +73,13 @@ class Openings:
     def __init__(self, mask: Mask) -> None:
         self._grids = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
 
-    def drawn(
-        self, row: mi.Float, column: mi.Float, width: float, number: mi.Point2f
-    ) -> tuple[mi.Float, mi.Float, mi.Float]:
+    def drawn(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:
         """An open place of a square window, each as likely as any other.
 
         Parameters
         ----------
-        row, column
-            the window's first corner, in features from the mask's first corner.
+        corner
+            the window's first (row, column), in features from the mask's first corner.
         width
             its side, in features.
         number
@@ -92,7 +90,7 @@ class Openings:
         row and column from the window's first corner, in features, and the part of the window that is open: where it is
         0 the place means nothing.
         """
-        grids = [(rows.seen(row, width), columns.seen(column, width)) for rows, columns in self._grids]
+        grids = [(rows.seen(corner.x, width), columns.seen(corner.y, width)) for rows, columns in self._grids]
         areas = [rows.length * columns.length for rows, columns in grids]
         total = sum(areas[1:], areas[0])
         left, (rows, columns) = number.y * total, grids[0]

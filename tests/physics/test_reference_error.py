@@ -3,7 +3,7 @@
 Rationale. Stratified points depend on each other within a pass, so the spread of its paths says nothing of
 their mean; passes are independent, and their spread does. Expectation: two sums over all pixels (light as a whole, and
 its slope along the rows), less their means over RUNS runs and divided by the stated error, have the chi-square of
-RUNS - 1 degrees of freedom each. A run has 4 passes of 9 paths in 4096 pixels, so the stated error of a sum is good to a
+RUNS - 1 degrees of freedom each. A run has 4 passes of 9 paths in 4096 pixels: a sum's stated error is good to a
 percent. Seeds are fixed; alpha = 1e-4 for each bound, six bounds in all.
 """
 

@@ -31,6 +31,19 @@ def test_an_unknown_variant_is_refused_with_the_known_ones() -> None:
         environment.load_variant("llvm_mono")
 
 
+def test_without_a_gpu_a_cuda_variant_is_refused_in_one_line() -> None:
+    """In a child, in which no LLVM is looked for: the cuda variants need none."""
+    done = in_child(
+        "from mitsim.core import environment, llvm\n"
+        "environment.has_gpu = lambda: False\n"
+        "llvm.select_llvm = lambda: 1 / 0\n"
+        "try: environment.load_variant('cuda_ad_rgb')\n"
+        "except Exception as error: print(type(error).__name__, error)"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "MitsimError variant cuda_ad_rgb: Dr.Jit finds no NVIDIA GPU" in done.stdout and "llvm_ad_rgb" in done.stdout
+
+
 def test_an_old_llvm_never_reaches_mitsuba() -> None:
     old = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
     if not old.exists():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitsim.transport.cells import CellAxis, CellGrid
-from mitsim.transport.histogram import AMBIENT, DIRECT, Bundle, Deposits
+from mitsim.transport.histogram import AMBIENT, DIRECT, Bundle, Deposits, Sightings
 
 PIXELS = 9  # a projector of 3 x 3
 GRID = CellGrid(CellAxis(-0.2, 0.05, 8), CellAxis(-0.1, 0.02, 15))
@@ -160,3 +160,24 @@ def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None
     shown, one = unpacked(made, made.repeated(light).toarray()), unpacked(single, light.toarray())
     for a, b in np.ndindex(2, 2):
         assert np.array_equal(shown[:, :, a, :, b], one[:, :, 0, :, 0])
+
+
+@pytest.mark.usefixtures("variant")
+def test_small_light_beside_great_light_is_counted() -> None:
+    """4096 paths of 1 beside one of 2^24, where float32 has steps of 2: what is fetched and filed is exact."""
+    import mitsuba as mi
+
+    from mitsim.transport.ledger import Ledger
+
+    light = np.ones(4097, np.float32)
+    light[0] = 2.0**24
+    assert np.add.accumulate(light)[-1] == 2.0**24, "float32 loses all of it"
+    zeros = [mi.Float(np.zeros(4097, np.float32)) for _ in range(2)]
+    depth = mi.Float(np.full(4097, 1 / 400, np.float32))
+    seen = Sightings(mi.Float(light), mi.UInt32(np.zeros(4097, np.uint32)), *zeros, depth)
+    fetched, alone = Deposits.fetched(seen, DIRECT), bundle(anchors=1)
+    assert fetched.value.dtype == np.float64 and fetched.value.sum() == 2.0**24 + 4096
+    assert alone.file(fetched, LABELS).sum() == 2.0**24 + 4096
+    ledger = Ledger(alone, LABELS, one=2.0**24)
+    ledger.add(seen.value, seen.pixel, ledger.place(seen, mi.Float(0.5)), mi.Bool(True))
+    assert ledger.filed()[1] == 2.0**24 + 4096

@@ -43,7 +43,9 @@ def part_open(geometry: CameraGeometry, origin: np.ndarray) -> np.ndarray:
     total = np.zeros(len(origin))
     for weight, *profiles in mask.terms:
         product = np.full(len(origin), weight)
-        for profile, coordinate, centre in zip(profiles, (-origin[:, 1], -origin[:, 0]), geometry.mask_offset):
+        for profile, coordinate, centre in zip(
+            profiles, (-origin[:, 1], -origin[:, 0]), geometry.mask_offset, strict=True
+        ):
             sums = np.append(0, np.cumsum(profile * mask.feature_mm))
             low, high = (np.interp(coordinate - centre + end, edges, sums) for end in (-reach, reach))
             product *= (high - low) / (2 * reach)
@@ -91,7 +93,7 @@ def test_a_ray_passes_where_the_mask_is_open_and_carries_the_open_part(mask: str
 def test_every_open_place_is_met_as_often_as_any_other(mask: str) -> None:
     """A pixel of 1 nm: counts in cells of a fifth of a feature are multinomial. Chi-square, alpha 1e-4."""
     geometry = CameraGeometry(mask=mask, pixels=1, pixel_pitch=1e-6, mask_order=4, mask_offset_row=0.31)
-    origin, direction, *_ = rays(geometry, 400_000)
+    _, direction, *_ = rays(geometry, 400_000)
     t = direction[:, :2] / direction[:, 2:]
     edges = np.linspace(-geometry.tan_half_fov, geometry.tan_half_fov, 60)
     found = np.histogram2d(-t[:, 1], -t[:, 0], [edges, edges])[0]
