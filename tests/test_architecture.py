@@ -186,22 +186,15 @@ OF_A_LANE = {
 
 def named(tree: ast.AST) -> list[str]:
     """Names, attributes, imports and strings of a module, but for docstrings."""
-    texts = [
-        node.body[0].value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-        and node.body
-        and isinstance(node.body[0], ast.Expr)
-    ]
-    found = []
+    found, texts = [], set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            texts.append(node.value)  # what stands below a constant
+            texts.add(id(node.value))  # walked before what it holds; what stands below a constant, too
         if isinstance(node, ast.Name | ast.Attribute):
             found.append(node.id if isinstance(node, ast.Name) else node.attr)
         elif isinstance(node, ast.ImportFrom | ast.alias):
             found.append((node.module if isinstance(node, ast.ImportFrom) else node.name) or "")
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in texts:
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in texts:
             found.append(node.value)
     return found
 

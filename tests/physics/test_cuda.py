@@ -1,7 +1,7 @@
 """A GPU finds the light that the processor finds: the same code under ``cuda_ad_mono`` and ``llvm_ad_mono``.
 
-Rationale. Random numbers, paths and bookkeeping are of the variant's own types throughout, so both backends follow the
-same paths but for float32's last digits (a GPU's reciprocals are approximate). The direct light of a flat sheet, of
+Rationale. Random numbers, paths and bookkeeping are of the variant's own types, so both backends follow the same paths
+but for float32's last digits (a GPU's reciprocals are approximate). The direct light of a flat sheet, of
 which no ray passes an edge, agrees to 1e-5 of the total; frames, and light that goes between walls, whose paths may part
 at an edge, within five times the Monte Carlo error that they state. On the GPU itself a seed gives the same factored
 frame twice, bit for bit: light is added up in whole numbers, or on the host.
