@@ -15,7 +15,7 @@ directions     instead, each ray of a pixel has a direction of its own, drawn fr
 bare           both: a sensor without a mask
 window         the mask's transmission as a factor of what is drawn evenly from the field stop
 reference      ``mitsim_lensless``: open places of the mask alone are drawn
-jittered       the same by Mitsuba's multijittered points
+stratified     the same from Owen-scrambled Sobol points, as `mitsim render` draws them
 =============  =====================================================================================================
 
 ``variance`` is that of one pass, summed over the pixels, over the frame's energy; its product with the seconds is what
@@ -39,8 +39,8 @@ import numpy as np
 import mitsim as ms
 from mitsim.core.versions import versions
 
-CAMERAS = ("perspective", "python", "origins", "directions", "bare", "window", "reference", "jittered")
-SAME = ("window", "reference", "jittered")
+CAMERAS = ("perspective", "python", "origins", "directions", "bare", "window", "reference", "stratified")
+SAME = ("window", "reference", "stratified")
 """Cameras of one expected frame."""
 
 
@@ -99,10 +99,10 @@ def cameras(bench: ms.Bench) -> dict[str, object]:
 
     def made(kind: str) -> object:
         common = {**place, "film": film(geometry.pixels)}
-        common["sampler"] = {"type": "multijitter" if kind == "jittered" else "independent"}
+        common["sampler"] = {"type": "independent"}
         if kind == "perspective":
             return mi.load_dict({"type": "perspective", "fov": geometry.fov, **common})
-        if kind in ("reference", "jittered"):
+        if kind in ("reference", "stratified"):
             return mi.load_dict({"type": "mitsim_lensless", **numbers, **common})
         return mi.load_dict({"type": "benchmark_rays", "kind": kind, **common})
 
@@ -124,6 +124,8 @@ def measured(bench: ms.Bench, spp: int, repeat: int) -> dict[str, dict[str, floa
     passes: dict[str, list[tuple[float, np.ndarray]]] = {kind: [] for kind in CAMERAS}
     for seed in range(repeat + 1):
         for kind, camera in made.items():
+            if kind == "stratified":
+                camera.stratify((1000 + seed, spp))
             passes[kind].append(rendered(bench, camera, spp, seed))
     result = {}
     for kind, (_, *warm) in passes.items():

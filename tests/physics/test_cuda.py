@@ -1,10 +1,10 @@
 """A GPU finds the light that the processor finds: the same code under ``cuda_ad_mono`` and ``llvm_ad_mono``.
 
 Rationale. Random numbers, paths and bookkeeping are of the variant's own types, so both backends follow the same paths
-but for float32's last digits (a GPU's reciprocals are approximate). The direct light of a flat sheet, of
-which no ray passes an edge, agrees to 1e-5 of the total; frames, and light that goes between walls, whose paths may part
-at an edge, within five times the Monte Carlo error that they state. On the GPU itself a seed gives the same factored
-frame twice, bit for bit: light is added up in whole numbers, or on the host.
+but for float32's last digits (a GPU's reciprocals are approximate). The direct light of a flat sheet, of which no ray
+passes an edge, agrees to 1e-5 of the total; frames, and light that goes between walls, whose paths may part at an edge,
+within five times the Monte Carlo error that they state. On the GPU itself a seed gives the same factored frame twice,
+bit for bit: light is added up in whole numbers, or on the host.
 
 Each backend runs in a process of its own. The slow test needs no GPU: the processor with another seed stands in for it,
 which shows that the check passes on equal light, and that it fails on 2 % of planted light.
