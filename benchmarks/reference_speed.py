@@ -21,6 +21,14 @@ stratified     the same from Owen-scrambled Sobol points, as `mitsim render` dra
 ``variance`` is that of one pass, summed over the pixels, over the frame's energy; its product with the seconds is what
 counts, since it tells the time for a wanted error. Only the last three cameras estimate the same. ``--wavefront``
 renders the reference with other numbers of paths in flight.
+
+Measured (2 cores shared with other work, two runs a scene; seconds over the perspective camera's): Python takes nothing
+(0.98 to 1.08), origins 0 to 0.4, directions 0.4 to 0.6 in the photograph and 0.9 to 1.4 in the cookie bag, mask and
+openings 0 to 0.3: in all 1.6 to 1.7 and 1.9 to 2.5. So nearly all of it is directions that differ between neighbours. A
+sensor without a lens has them by its nature: a pixel sees the whole field, and pixels that shared directions would
+share errors, which the tests between the estimators take for independent. Wavefronts of 2^18 to 2^24 paths differ by
+40 %, the smallest is fastest. Variance times seconds fell from 0.485 to 0.032 in the photograph (16 paths a pass), from
+1.83 to 0.23 in the cookie bag (4 paths).
 """
 
 from __future__ import annotations
