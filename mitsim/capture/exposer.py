@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -25,7 +26,7 @@ from mitsim.sensor.chain import (
     electrons_from_irradiance,
     expose,
 )
-from mitsim.sensor.moments import frame_moments
+from mitsim.sensor.moments import mean_variance
 
 Item = TypeVar("Item")
 _CAN_SATURATE = 1e-3
@@ -75,8 +76,8 @@ class Exposer:
 
     def sensor_noise(self, electrons: FloatArray) -> float:
         """Root mean square noise of the sensor on expected ``electrons``, from its closed form [electrons]."""
-        _, variance = frame_moments(electrons, self.exposure_s, self.rig.sensor)
-        return float(np.sqrt(variance.mean()) / self.rig.sensor.gain_dn_per_e)
+        variance = mean_variance(electrons, self.exposure_s, self.rig.sensor)
+        return math.sqrt(variance) / self.rig.sensor.gain_dn_per_e
 
     def saturated(self, digital: Digital, electrons: FloatArray) -> bool:
         """Whether any pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end.

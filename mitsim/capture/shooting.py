@@ -58,7 +58,10 @@ class Totals:
 
 @dataclass(frozen=True, eq=False)
 class _Exposed:
-    """One exposed shot: expected electrons, digital numbers, and the two noises [electrons, rms]."""
+    """One exposed shot: expected electrons, digital numbers, the two noises [electrons, rms], sums over its pixels.
+
+    ``light``, ``energy`` and ``signal``: of the electrons, of their squares, and of the squares without ambient light.
+    """
 
     index: int
     shot: Shot
@@ -66,6 +69,10 @@ class _Exposed:
     digital: Digital
     rendering_noise: float
     sensor_noise: float
+    saturated: bool
+    light: float
+    energy: float
+    signal: float
 
 
 class Shooting:
@@ -92,6 +99,7 @@ class Shooting:
         """
         self.family, self.recorder, self.exposer = family, recorder, exposer
         self.ambient, self.always = ambient, always
+        self._has_ambient = bool(always.any())
         self.saturated, self.noise_ratio = 0, 0.0
         self._noise_energy = self._energy = self._signal = self._light = 0.0
 
@@ -139,26 +147,36 @@ class Shooting:
             with job.clock.stage("write"):
                 in_threads(self._record, exposed)
             for shot in exposed:
-                if shot.rendering_noise:
-                    ratio = shot.rendering_noise / shot.sensor_noise if shot.sensor_noise else np.inf
-                    self.noise_ratio = max(self.noise_ratio, ratio)
-                self.saturated += self.exposer.saturated(shot.digital, shot.electrons)
-                self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
-                self._energy += float(np.square(shot.electrons).sum())
-                self._signal += float(np.square(shot.electrons - self.always).sum())
-                self._light += float(shot.electrons.sum())
+                self._count(shot)
             job.progress("frames", (chunk[-1][0] + 1) / len(expected))
+
+    def _count(self, shot: _Exposed) -> None:
+        """Add what a ``shot`` says to what all say."""
+        if shot.rendering_noise:
+            ratio = shot.rendering_noise / shot.sensor_noise if shot.sensor_noise else np.inf
+            self.noise_ratio = max(self.noise_ratio, ratio)
+        self.saturated += shot.saturated
+        self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
+        self._energy += shot.energy
+        self._signal += shot.signal
+        self._light += shot.light
 
     def _expose(self, item: tuple[int, tuple[Shot, Frame]]) -> _Exposed:
         index, (shot, frame) = item
         electrons = self.exposer.lit(frame, *shot.names)
+        digital = self.exposer.digital(electrons, *shot.names)
+        energy = float(np.square(electrons).sum())
         return _Exposed(
             index=index,
             shot=shot,
             electrons=electrons,
-            digital=self.exposer.digital(electrons, *shot.names),
+            digital=digital,
             rendering_noise=self.exposer.rendering_noise(frame),
             sensor_noise=self.exposer.sensor_noise(electrons),
+            saturated=self.exposer.saturated(digital, electrons),
+            light=float(electrons.sum()),
+            energy=energy,
+            signal=float(np.square(electrons - self.always).sum()) if self._has_ambient else energy,
         )
 
     def _record(self, exposed: _Exposed) -> None:
@@ -175,5 +193,5 @@ class Shooting:
         electrons = exposed.electrons.astype(np.float32)
         # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
         whole = exposed.digital.dtype == np.uint32
-        dn: Channel = exposed.digital.astype(np.uint32) if whole else exposed.digital.astype(np.float32)
+        dn: Channel = exposed.digital.astype(np.uint32, copy=False) if whole else exposed.digital.astype(np.float32)
         self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)

@@ -18,8 +18,12 @@ from mitsim.rig.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]
 """Digital numbers: codes, or real values of a sensor without bits."""
-_MANY = 1e11
-"""Electrons above which numpy's Poisson draw loses digits: its variance is 1 % off at 1e14, 100 times at 1e17."""
+_MANY = 256.0
+"""Mean electrons from which counts are quantiles of normal deviates: four draws in a million are another count (see
+:func:`poisson_count`), less than 1e9 draws tell, in half the time of numpy's Poisson draw; which, besides, loses digits
+above 1e11."""
+_BLOCK = 2**15
+"""Pixels that go through all stages together: the stages' arrays stay in the cache (half the time of whole frames)."""
 
 
 def electrons_from_irradiance(
@@ -95,8 +99,13 @@ def expose(
         streams of their own, so that switching one noise off leaves the other's draw as it was.
     """
     expected = add_dark_current(expected_electrons, exposure_s, model)
-    electrons = clip_at_full_well(draw_electrons(expected, shot_rng), model)
-    return quantise(amplify(add_read_noise(electrons, model, read_rng), model), model)
+    frame = np.empty(expected.shape, np.float64 if model.largest_dn is None else np.uint32)
+    light, numbers = expected.reshape(-1), frame.reshape(-1)
+    for start in range(0, expected.size, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        electrons = clip_at_full_well(draw_electrons(light[block], shot_rng), model)
+        numbers[block] = quantise(amplify(add_read_noise(electrons, model, read_rng), model), model)
+    return frame
 
 
 def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
@@ -128,15 +137,29 @@ def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model
 def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Poisson electrons from ``rng``, float64; mean and variance are both ``expected``.
 
-    Above 1e11 by Cornish and Fisher's expansion, rounded, which is off by some 1/sqrt(mu) of an electron. Above 2^53 =
-    9e15 not every whole number is a float64.
+    Exact below a mean of 256, and :func:`poisson_count` of normal deviates above. Above 2^53 = 9e15 not every whole
+    number is a float64.
     """
-    drawn = np.asarray(rng.poisson(np.minimum(expected, _MANY)), dtype=np.float64)
-    many = expected > _MANY
-    if not np.any(many):
-        return drawn
-    z = rng.standard_normal(np.shape(expected))
-    return np.where(many, np.rint(poisson_quantile(expected, z)), drawn)
+    few = expected < _MANY
+    if np.all(few):
+        return np.asarray(rng.poisson(expected), dtype=np.float64)
+    drawn = poisson_count(np.maximum(expected, _MANY), rng.standard_normal(np.shape(expected)))
+    if np.any(few):
+        drawn[few] = rng.poisson(expected[few])
+    return drawn
+
+
+def poisson_count(expected: FloatArray, z: FloatArray) -> FloatArray:
+    """Whole number of mean ``expected``, 256 or more, as probable as the normal deviate ``z``; both of one shape.
+
+    The expansion of the inverse Poisson distribution by Giles (2016, ACM Transactions on Mathematical Software 42,
+    algorithm 955, Q_N2 without its last term): what :func:`poisson_quantile` has, and the term of 1/sqrt(mu), which
+    holds the third cumulant and the correction for rounding. Off the law by a total variation of 4e-6 at 256, 5e-7
+    at 1000, 2e-8 at 1e4; its variance by 1e-7 of it, its third moment by 7e-4.
+    """
+    count = poisson_quantile(expected, z)
+    count -= z * (np.square(z) + 2) / (72 * np.sqrt(expected))
+    return np.rint(count, out=count)
 
 
 def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
@@ -175,7 +198,8 @@ def quantise(signal_dn: FloatArray, model: SensorModel) -> Digital:
     """
     if model.largest_dn is None:
         return signal_dn
-    return np.clip(np.rint(signal_dn), 0, model.largest_dn).astype(np.uint32)
+    codes = np.minimum(np.maximum(np.rint(signal_dn), 0), model.largest_dn)
+    return np.asarray(codes).astype(np.uint32)
 
 
 def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:

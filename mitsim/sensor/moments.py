@@ -105,7 +105,61 @@ def frame_moments(
     Where an end of the ADC is within eight deviations, or too little noise dithers its codes, the moments are those of
     rounded and cut numbers: summed over the counts below 1e4 electrons, and averaged over 129 of them above.
     """
+    expected = np.asarray(add_dark_current(expected_electrons, exposure_s, model))
+    mean, variance = np.asarray(amplify(expected, model)), np.asarray(_linear_variance(expected, model))
+    first, last = _linear(model)
+    rest = (expected < first) | (expected > last)
+    if rest.any():
+        mean[rest], variance[rest] = _cut(expected[rest], model)
+    return mean, variance
+
+
+def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> float:
+    """Mean over pixels of the variance (DN^2) that :func:`frame_moments` gives; at once where the noise is linear.
+
+    Parameters
+    ----------
+    expected_electrons, exposure_s, model
+        as there.
+    """
     expected = add_dark_current(expected_electrons, exposure_s, model)
+    first, last = _linear(model)
+    if first <= expected.min() and expected.max() <= last:
+        return float(_linear_variance(expected.mean(), model))
+    return float(frame_moments(expected_electrons, exposure_s, model)[1].mean())
+
+
+def _linear_variance(expected: FloatArray, model: SensorModel) -> FloatArray:
+    """Variance [DN^2] of counts and read noise, rounded, where nothing is cut."""
+    read, gain = model.superpixel_read_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
+    return expected * gain**2 + (read**2 + (0.0 if model.largest_dn is None else 1 / 12))
+
+
+def _linear(model: SensorModel) -> tuple[float, float]:
+    """Expected electrons, from least to most, between which the moments are linear; most below least where none are.
+
+    That is 12 deviations below the full well, 8 from both ends of the ADC, and where the noise dithers its codes. A
+    signal y [DN] of variance K (y - b) + r^2 is 8 deviations from 0 beyond the larger root of y^2 - 64 K y + 64 (K b -
+    r^2), and from M below the smaller one of (M - y)^2 - 64 (K y - K b + r^2).
+    """
+    well, top = model.superpixel_full_well_e, model.largest_dn
+    last = well - 12 * math.sqrt(well) if math.isfinite(well) else math.inf
+    if top is None:
+        return 0.0, last
+    gain, black = model.gain_dn_per_e, model.superpixel_black_level_dn
+    read = model.superpixel_read_noise_e * gain
+    offset = 64 * (gain * black - read**2)
+    under = (32 * gain) ** 2 - offset
+    first = (32 * gain + math.sqrt(under) - black) / gain if under > 0 else 0.0
+    over = max((32 * gain) ** 2 + 64 * gain * top - offset, 0.0)
+    last = min(last, (top + 32 * gain - math.sqrt(over) - black) / gain)
+    if read < _DITHERED:
+        first = max(first, _SOME, (_DITHERED**2 - read**2) / gain**2)
+    return max(first, 0.0), last
+
+
+def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+    """:func:`frame_moments` of expected electrons (pixels,), dark ones among them, without short cuts."""
     clipped, variance = clipped_moments(expected, model.superpixel_full_well_e)
     read, gain = model.superpixel_read_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
