@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from mitsim.capture.exposer import Exposer
+from mitsim.capture.exposer import Exposer, frames_at_once
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import MOST_SHOTS
 from mitsim.core.parallel import in_threads
@@ -21,8 +21,6 @@ from mitsim.optics.frames import ExpectedFrames
 from mitsim.rig.patterns import PatternFamily
 
 AmbientChoice = Literal["auto", "yes", "no"]
-_AT_ONCE = 16
-"""Shots held in memory at a time, as many as frames."""
 _PART = 1 / 16
 """Part of an image's noise variance that its ambient frame may bring, 0.26 dB: an exposure for every further tenth of a
 decibel would be better spent on the frames."""
@@ -91,8 +89,9 @@ class AmbientFrame:
         """
         electrons = exposer.electrons(expected.projector_off)
         total, saturated = np.zeros_like(electrons), False
-        for start in range(0, shots, _AT_ONCE):
-            names = [("ambient", shot) for shot in range(start, min(start + _AT_ONCE, shots))]
+        step = frames_at_once(electrons.size)
+        for start in range(0, shots, step):
+            names = [("ambient", shot) for shot in range(start, min(start + step, shots))]
             for digital in in_threads(lambda name: exposer.digital(electrons, *name), names):
                 total += digital
                 saturated |= exposer.saturated(digital, electrons)

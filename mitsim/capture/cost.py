@@ -5,7 +5,7 @@ from __future__ import annotations
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
-from mitsim.capture.exposer import FRAMES_AT_ONCE
+from mitsim.capture.exposer import frames_at_once
 from mitsim.capture.prices import Numbers, entries
 from mitsim.core.resources import Cost
 from mitsim.optics.frames import frames_in_memory
@@ -21,6 +21,9 @@ _ENTRY_BYTES = 45.0
 45 where matrices are large."""
 _DEPOSIT_BYTES = 500.0
 """A path's light while it is filed; measured."""
+_EXPOSED = 6
+"""Frames in double precision that each exposed frame takes as much as: its light, electrons, numbers and squares, and
+electrons and numbers of the chunk before, which is written meanwhile."""
 _EXPOSING_S, _WRITING_S = 4e-8, 2e-8
 """A pixel; measured on two cores."""
 _BYTES_PER_PIXEL = 8
@@ -62,7 +65,7 @@ def frames_cost(
         float(entries(bench.n**2, classes, Numbers.of(settings), settings)),
         min(LANES_AT_ONCE, _paths(bench.n**2, settings)),
     )
-    held = frames_in_memory(classes, shots) + 4 * FRAMES_AT_ONCE
+    held = frames_in_memory(classes, shots, rows) + _EXPOSED * frames_at_once(pixels)
     return Cost(
         seconds=seconds,
         memory_bytes=_LANES_BYTES

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import special
@@ -28,11 +28,12 @@ from mitsim.sensor.chain import (
 )
 from mitsim.sensor.moments import mean_variance
 
-Item = TypeVar("Item")
+Item = TypeVar("Item", bound=tuple[Any, ...])
 _CAN_SATURATE = 1e-3
 """Chance of saturation anywhere in a frame from which a reading at the full well counts as saturation."""
-FRAMES_AT_ONCE = 16
-"""Frames held in memory at a time: enough work for eight processors, and 32 MB at 512 x 512."""
+FRAMES_AT_ONCE, _BYTES_AT_ONCE = 16, 2**27
+"""Frames exposed at a time: enough work for eight processors; and their bytes, where fewer have as many: 4 frames of a
+sensor of 2048 pixels."""
 
 
 @dataclass(frozen=True)
@@ -114,11 +115,16 @@ class Exposer:
         return self.rate(self.digital(self.lit(frame, *names), *names))
 
 
+def frames_at_once(pixels: int) -> int:
+    """Frames of so many ``pixels`` in all that are exposed at a time."""
+    return max(1, min(FRAMES_AT_ONCE, _BYTES_AT_ONCE // (8 * pixels)))
+
+
 def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
-    """Lists of up to :data:`FRAMES_AT_ONCE` ``items``, in order."""
+    """Lists of ``items``, in order, as many as :func:`frames_at_once` has of the frame that each item ends with."""
     remaining = iter(items)
-    while chunk := list(islice(remaining, FRAMES_AT_ONCE)):
-        yield chunk
+    for first in remaining:
+        yield [first, *islice(remaining, frames_at_once(first[-1].irradiance.size) - 1)]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, Settings
 from mitsim.core.arrays import FloatArray
-from mitsim.optics.frames import PROBES, formed_frames
+from mitsim.optics.frames import PROBES, formed_frames, mixes
 
 ROUNDS, CHECKED_SHOTS = 1.5, 8
 """Rounds that sampling takes, most often one or two, and shots that are formed in each to see the error: shots' errors
@@ -239,9 +239,7 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
     """
     several = np.asarray(numbers.anchors) > 1
     coarse = numbers.coarse_cells, numbers.coarse_layers
-    mixes = forming.classes <= forming.shots
-    # Shots that are mixed from frames of classes keep those; others hold light in all rows of cells.
-    lit = forming.lit if mixes else forming.lit + (1 - forming.lit) * numbers.mixed
+    lit = forming.lit
     products = (
         _products(forming, lit, numbers.cells, numbers.layers, 1.0, numbers.waves)
         + several * _products(forming, lit, *coarse, numbers.anchors, numbers.waves)
@@ -251,7 +249,7 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
         + (np.asarray(numbers.followed_anchors) > 1)
         * _products(forming, 1.0, *numbers.of_followed, numbers.followed_anchors, numbers.waves)
     )
-    if mixes:
+    if mixes(forming.classes, forming.shots, forming.pixels):
         products = products + numbers.mixed * forming.classes * forming.pixels**2
     return cast(Number, frames * (paces.frame + paces.product * products))
 
@@ -265,7 +263,8 @@ def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
         as for :func:`forming_seconds`.
     """
     shadows = paces.entry * _entries(forming, numbers)
-    return shadows + forming_seconds(forming, numbers, formed_frames(forming.classes, forming.shots), paces)
+    frames = formed_frames(forming.classes, forming.shots, forming.pixels)
+    return shadows + forming_seconds(forming, numbers, frames, paces)
 
 
 def checking_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:

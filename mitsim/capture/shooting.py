@@ -14,7 +14,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.framefile import Channel
 from mitsim.core.job import Job
 from mitsim.core.manifests import AmbientFile
-from mitsim.core.parallel import in_threads
+from mitsim.core.parallel import Behind, in_threads
 from mitsim.core.recorders import AMBIENT, Recorder
 from mitsim.optics.frames import ExpectedFrames, Frame, bound_of
 from mitsim.rig.patterns import PatternFamily, Shot
@@ -135,20 +135,26 @@ class Shooting:
         return AmbientFile(file=AMBIENT, shots=self.ambient.shots, part=self.ambient_part, noise=self.noise_to_signal)
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
-        """Expose and record the ``expected`` frames in chunks, one thread a processor; the ``job`` times its stages."""
-        chunks = in_chunks(enumerate(zip(self.family.shots, expected, strict=True)))
-        while True:
-            with job.clock.stage("optics"):
-                chunk = next(chunks, None)
-            if chunk is None:
-                return
-            with job.clock.stage("sensor"):
-                exposed = in_threads(self._expose, chunk)
+        """Expose and record the ``expected`` frames in chunks, one thread a processor; the ``job`` times its stages.
+
+        Files are written while the next chunk is formed and exposed: ``write`` is the time that work waits for them.
+        """
+        chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
+        with Behind(self._record) as writing:
+            while True:
+                with job.clock.stage("optics"):
+                    chunk = next(chunks, None)
+                if chunk is None:
+                    break
+                with job.clock.stage("sensor"):
+                    exposed = in_threads(self._expose, chunk)
+                with job.clock.stage("write"):
+                    writing.give(exposed)
+                for shot in exposed:
+                    self._count(shot)
+                job.progress("frames", (chunk[-1][0] + 1) / len(expected))
             with job.clock.stage("write"):
-                in_threads(self._record, exposed)
-            for shot in exposed:
-                self._count(shot)
-            job.progress("frames", (chunk[-1][0] + 1) / len(expected))
+                writing.wait()
 
     def _count(self, shot: _Exposed) -> None:
         """Add what a ``shot`` says to what all say."""
@@ -161,8 +167,8 @@ class Shooting:
         self._signal += shot.signal
         self._light += shot.light
 
-    def _expose(self, item: tuple[int, tuple[Shot, Frame]]) -> _Exposed:
-        index, (shot, frame) = item
+    def _expose(self, item: tuple[int, Shot, Frame]) -> _Exposed:
+        index, shot, frame = item
         electrons = self.exposer.lit(frame, *shot.names)
         digital = self.exposer.digital(electrons, *shot.names)
         energy = float(np.square(electrons).sum())

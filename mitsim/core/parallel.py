@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -47,3 +48,36 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> lis
     """``function`` of each of the ``items``, in order, one thread a processor; it should spend its time in numpy."""
     with single_threaded_blas(), ThreadPoolExecutor(workers()) as pool:
         return list(pool.map(function, items))
+
+
+class Behind(Generic[Item]):
+    """Work on items in threads while the next ones are made; a context, which is left when all of it is done.
+
+    Two lots of items are held: the one that is worked on, and the one that is made meanwhile. What fails is raised
+    where the work is waited for. When the context is left by an error or Control-C, items that nobody has begun are
+    left out, and those that somebody has are finished.
+    """
+
+    def __init__(self, function: Callable[[Item], Any]) -> None:
+        """Nothing is done yet; ``function`` is what is done to each item."""
+        self._function, self._pool = function, ThreadPoolExecutor(workers())
+        self._begun: list[Future[Any]] = []
+
+    def __enter__(self) -> Behind[Item]:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def give(self, items: Iterable[Item]) -> None:
+        """Wait for the items that were given before, and begin these ``items``."""
+        self.wait()
+        self._begun = [self._pool.submit(self._function, item) for item in items]
+
+    def wait(self) -> None:
+        """Wait for all items; the first error of theirs is raised."""
+        for future in self._begun:
+            future.result()
+        self._begun = []

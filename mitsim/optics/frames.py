@@ -17,14 +17,18 @@ from mitsim.core.seeds import stream
 from mitsim.optics.closed_form import Entries, FrameOptics, IntArray
 from mitsim.rig.patterns import Lighting
 
-_AT_ONCE = 32
-"""Frames held at a time: enough to keep all processors busy; 64 MiB of a sensor of 512 pixels."""
-_LARGEST_BASIS = 256
-"""Classes whose frames are held to be mixed: 512 MiB of a sensor of 512 pixels."""
+_AT_ONCE, _BYTES_AT_ONCE = 32, 2**28
+"""Frames formed at a time: enough to keep all processors busy; and their bytes, where fewer have as many: 8 frames of a
+sensor of 2048 pixels."""
+_LARGEST_BASIS, _BASIS_BYTES = 256, 7 * 2**28
+"""Classes whose frames are held to be mixed, 512 MiB of a sensor of 512 pixels; and their bytes, of which a process of
+4 GiB has room for: 56 frames of a sensor of 2048 pixels. Beyond them frames are formed twice."""
 PROBES = 8
 """Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`_probes`."""
 _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+_FLOAT = 8
+"""Bytes of a pixel of a frame."""
 _NORMAL = 1.645
 """Standard deviations above which a normal deviate is in 5 % of cases."""
 _MOST_COLUMNS = 2**22
@@ -93,18 +97,42 @@ class Filed:
     groups: tuple[sparse.csr_array, ...]
 
 
-def frames_in_memory(classes: int, shots: int) -> int:
-    """Frames that :class:`ExpectedFrames` of so many ``classes`` and ``shots`` holds at once."""
-    return (classes if _mixes(classes, shots) else _AT_ONCE) + _AT_ONCE
+def at_once(pixels: int) -> int:
+    """Frames (``pixels``, ``pixels``) that are formed at a time."""
+    return max(1, min(_AT_ONCE, _BYTES_AT_ONCE // (_FLOAT * pixels**2)))
 
 
-def formed_frames(classes: int, shots: int) -> int:
-    """Frames that are formed for a run of so many ``classes`` and ``shots``, whose frames are asked for twice."""
-    return classes if _mixes(classes, shots) else 2 * shots
+def frames_in_memory(classes: int, shots: int, pixels: int) -> int:
+    """Frames that :class:`ExpectedFrames` holds at once.
+
+    Parameters
+    ----------
+    classes, shots, pixels
+        of the family, and a side of the sensor.
+    """
+    return (classes if mixes(classes, shots, pixels) else at_once(pixels)) + at_once(pixels)
 
 
-def _mixes(classes: int, shots: int) -> bool:
-    return classes <= min(_LARGEST_BASIS, shots)
+def formed_frames(classes: int, shots: int, pixels: int) -> int:
+    """Frames that are formed for a run, whose frames are asked for twice.
+
+    Parameters
+    ----------
+    classes, shots, pixels
+        of the family, and a side of the sensor.
+    """
+    return classes if mixes(classes, shots, pixels) else 2 * shots
+
+
+def mixes(classes: int, shots: int, pixels: int) -> bool:
+    """Whether shots are mixed from frames of classes, which are held, and not formed one by one.
+
+    Parameters
+    ----------
+    classes, shots, pixels
+        of the family, and a side of the sensor.
+    """
+    return classes <= min(_LARGEST_BASIS, shots, _BASIS_BYTES // (_FLOAT * pixels**2))
 
 
 class ExpectedFrames:
@@ -112,7 +140,7 @@ class ExpectedFrames:
 
     Light is linear, so the frames are formed once for a *basis* of light distributions and mixed: the classes of
     projector pixels that a family always lights together. A family with too many classes is formed shot by shot
-    and never held in memory as a whole.
+    and never held in memory as a whole; what black pixels leak in all of its shots is formed once.
 
     The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``; with one group there is
     none to tell, and it is 0. Squared norms are estimated without bias from products with random signs (Hutchinson's
@@ -145,11 +173,19 @@ class ExpectedFrames:
         self._seed, self._weights = seed, lighting.weights
         (shots, classes), rows = lighting.weights.shape, lighting.labels.size
         indicator = sparse.csr_array((np.ones(rows), (lighting.labels, np.arange(rows))), shape=(classes, rows))
-        self._mixed = _mixes(classes, shots)
+        self._mixed = mixes(classes, shots, self._pixels)
         self._shares = np.eye(classes) if self._mixed else self._weights
-        self._basis = indicator if self._mixed else sparse.csr_array(sparse.csr_array(self._weights) @ indicator)
+        least = self._weights.min(axis=0)
+        if self._mixed or shots < 2 or 2 * np.count_nonzero(self._weights == least) < self._weights.size:
+            least = np.zeros(classes)
+        self._leak = sparse.csr_array(sparse.csr_array(least[None]) @ indicator) if least.any() else None
+        self._indicator = indicator
+        self._basis = (
+            indicator if self._mixed else sparse.csr_array(sparse.csr_array(self._weights - least) @ indicator)
+        )
         self._formed: tuple[FloatArray, FloatArray] | None = None
         self._always: tuple[FloatArray, FloatArray] | None = None
+        self._leaked: tuple[FloatArray, FloatArray] | None = None
         self._seen: FloatArray | None = None
 
     def __len__(self) -> int:
@@ -173,16 +209,23 @@ class ExpectedFrames:
             self._always = _formed(self._ambient, _ALL, self._seed)
         return self._always
 
+    @property
+    def _leak_formed(self) -> tuple[FloatArray, FloatArray] | None:
+        if self._leak is not None and self._leaked is None:
+            self._leaked = _formed(self._lights, self._leak, self._seed)
+        return self._leaked
+
     def __iter__(self) -> Iterator[Frame]:
+        step = at_once(self._pixels)
         if not self._mixed:
-            for start in range(0, len(self), _AT_ONCE):
-                yield from self._frames(*self._form(start, min(start + _AT_ONCE, len(self))))
+            for start in range(0, len(self), step):
+                yield from self._frames(*self._form(start, min(start + step, len(self))))
             return
         if self._formed is None:
             self._formed = self._form(0, self._basis.shape[0])
         irradiance, probed = self._formed
-        for start in range(0, len(self), _AT_ONCE):
-            weights = self._weights[start : start + _AT_ONCE]
+        for start in range(0, len(self), step):
+            weights = self._weights[start : start + step]
             if np.array_equal(self._weights, np.eye(len(self))):
                 stop = start + len(weights)
                 yield from self._frames(irradiance[start:stop], probed[start:stop])
@@ -194,7 +237,7 @@ class ExpectedFrames:
 
         Nothing is set to zero that came out below it, so differences of frames stay linear in the light.
         """
-        shots = sparse.csr_array(sparse.csr_array(self._weights) @ self._basis) if self._mixed else self._basis
+        shots = sparse.csr_array(sparse.csr_array(self._weights) @ self._indicator)
         frames = _seen(self._lights, shots, columns)
         if self._ambient:
             frames += _seen(self._ambient, _ALL, columns)
@@ -231,6 +274,8 @@ class ExpectedFrames:
         else:
             basis = self._basis[start:stop]
             probed = self._with_glint(_formed(self._lights, basis, self._seed, False)[1], start)
+            if self._leak_formed is not None:
+                probed = probed + self._leak_formed[1][0]
         if self._ambient:
             probed = probed + _formed(self._ambient, _ALL, self._seed, False)[1][0]
         return probed
@@ -250,6 +295,9 @@ class ExpectedFrames:
         Glint is exact: it is in the frames alone, as no difference between groups has any.
         """
         frames, probed = _formed(self._lights, self._basis[start:stop], self._seed)
+        if not self._mixed and self._leak_formed is not None:
+            frames += self._leak_formed[0]
+            probed += self._leak_formed[1]
         if self._glint is not None:
             shares = self._shares[start:stop][:, self._glint.classes]
             for frame, share in zip(frames, shares, strict=True):

@@ -4,8 +4,18 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from mitsim.optics import frames as frames_module
 from mitsim.optics.closed_form import FrameOptics
-from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed, _product, formed_frames
+from mitsim.optics.frames import (
+    ClassFrames,
+    ExpectedFrames,
+    Filed,
+    _product,
+    at_once,
+    formed_frames,
+    frames_in_memory,
+    mixes,
+)
 from tests.unit.optics.small_camera import (
     BESIDE,
     CAMERA,
@@ -77,7 +87,53 @@ def test_frames_are_formed_as_often_as_is_promised(family: str, formed: int, mon
     frames = expected_frames(small_optics(8), random_groups(1, 7), labels, weights, 0)
     for _ in range(2):
         assert len(list(frames)) == len(weights)
-    assert len(count) == formed == formed_frames(labels.max() + 1, len(weights))
+    assert len(count) == formed == formed_frames(labels.max() + 1, len(weights), 8)
+
+
+def test_what_leaks_in_all_shots_is_formed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three shots of twelve classes whose black pixels leak: the frames, and the error, of weighing every pixel.
+
+    (Planted: the leak left out; added twice where shots are asked for from the second on; left out of the probes.) Each
+    shot's own light is then that of its class alone, and not of every pixel.
+    """
+    weights = 0.02 + 0.98 * np.eye(12)[[1, 5, 9]]
+    optics, groups = small_optics(8), random_groups(3, 7, 0.2)
+    leaking = expected_frames(optics, groups, SPLIT, weights, 5)
+    assert leaking._basis.nnz == np.isin(SPLIT, [1, 5, 9]).sum()
+    mean = (sum(groups[1:], groups[0]) / 3).toarray()
+    whole = expected_frames(optics, groups, SPLIT, np.vstack([weights, np.eye(12)]), 5)
+    monkeypatch.setattr(frames_module, "_BYTES_AT_ONCE", 2 * 8 * 8**2)
+    for found, other, row in zip(leaking, whole, weights, strict=False):
+        plain = optics.frame(np.arange(CELLS**2), row[SPLIT] @ mean)
+        assert np.abs(found.irradiance - plain).max() < 1e-12 * plain.max()
+        assert found.variance == pytest.approx(other.variance, rel=1e-9)
+    three = expected_frames(optics, groups, SPLIT, np.vstack([weights] * 4), 5)
+    assert leaking.sampling_error() == pytest.approx(three.sampling_error(), rel=1e-9)
+    columns = np.array([0, 5])
+    np.testing.assert_allclose(leaking.by_group(columns), three.by_group(columns)[:, :3], rtol=1e-10)
+
+
+def test_frames_of_large_sensors_are_held_by_their_bytes() -> None:
+    """2048 x 2048 pixels are 32 MiB: 8 at a time, and no more than 56 to be mixed; 512 x 512 as many as ever."""
+    assert [at_once(pixels) for pixels in (64, 512, 1024, 2048, 4096, 20_000)] == [32, 32, 32, 8, 2, 1]
+    assert mixes(256, 256, 512) and not mixes(257, 300, 512) and not mixes(3, 2, 64)
+    assert mixes(49, 49, 2048) and mixes(56, 56, 2048) and not mixes(57, 64, 2048)
+    assert frames_in_memory(49, 49, 2048) == 57 and frames_in_memory(64, 64, 2048) == 16
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_frames_are_the_same_however_many_are_formed_at_a_time(held: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit by bit, one at a time and all at once; of classes that are held, and of shots that are formed alone."""
+    if not held:
+        monkeypatch.setattr(frames_module, "_BASIS_BYTES", 1)
+
+    def formed() -> list[np.ndarray]:
+        expected = expected_frames(small_optics(8), random_groups(2, 7, 0.2), LABELS, FAMILIES["identity"], 0)
+        return [frame.irradiance for frame in expected]
+
+    whole = formed()
+    monkeypatch.setattr(frames_module, "_BYTES_AT_ONCE", 1)
+    assert at_once(8) == 1 and all(np.array_equal(a, b) for a, b in zip(whole, formed(), strict=True))
 
 
 def test_light_in_very_many_places_is_mixed_where_it_is() -> None:

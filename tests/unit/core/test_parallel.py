@@ -1,0 +1,58 @@
+"""Work that goes on behind other work: what is waited for, what is raised, and what an interruption leaves."""
+
+import threading
+import time
+
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import Behind
+
+
+def test_two_lots_are_held_and_no_more() -> None:
+    """A lot is begun when the one before is done. (Planted: `give` that never waits.)"""
+    done: list[int] = []
+
+    def work(item: int) -> None:
+        time.sleep(0.002)
+        done.append(item)
+
+    with Behind(work) as behind:
+        for lot in range(4):
+            behind.give(range(10 * lot, 10 * lot + 10))
+            assert set(done) >= set(range(10 * lot)) and len(done) <= 10 * lot + 10
+        behind.wait()
+        assert sorted(done) == list(range(40))
+
+
+def test_an_error_behind_is_raised_where_the_work_is_waited_for() -> None:
+    """(Planted: errors of threads that nobody asks for.)"""
+
+    def work(item: int) -> None:
+        if item == 3:
+            raise MitsimError("file frame_00003.exr: cannot be written (No space left on device)")
+
+    with pytest.raises(MitsimError, match="No space left"), Behind(work) as behind:
+        behind.give(range(8))
+        behind.give(range(8, 16))
+        pytest.fail("went on")
+
+
+def test_an_interruption_leaves_begun_items_finished_and_others_undone() -> None:
+    """Control-C while files are written: every file that was begun is whole. (Planted: items that are all finished.)"""
+    begun, finished, go = [], [], threading.Event()
+
+    def work(item: int) -> None:
+        begun.append(item)
+        go.wait(10)
+        finished.append(item)
+
+    def interrupted() -> None:
+        with Behind(work) as behind:
+            behind.give(range(500))
+            threading.Timer(0.05, go.set).start()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert sorted(begun) == sorted(finished) and len(finished) < 500
