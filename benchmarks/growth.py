@@ -5,8 +5,9 @@ and taken.
 
 The photograph is drawn with other numbers of pixels on the same areas, and captured by the command line in a process of
 its own, after one small run that compiles kernels and byte code and is not counted. Each case has wall and processor
-seconds, memory of the largest process, stages, and beside them what the plan predicted. What FILE holds already is not
-repeated; the table is printed as markdown. A case that takes longer than ``--limit`` is killed, and says so.
+seconds, stages, and memory beyond what the program held before, each beside its prediction; and the memory of the
+whole process. What FILE holds already is not repeated; the table is printed as markdown. A case that takes longer than
+``--limit`` is killed, and says so.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ def measured(case: Case, limit: float) -> dict[str, Any]:
         found: dict[str, Any] = {
             "seconds": time.perf_counter() - started,
             "processor_seconds": usage.ru_utime + usage.ru_stime,
-            "memory_bytes": usage.ru_maxrss * 1024,
+            "process_bytes": usage.ru_maxrss * 1024,
         }
         if found["seconds"] >= limit:
             return {**found, "killed": True}
@@ -98,7 +99,7 @@ def measured(case: Case, limit: float) -> dict[str, Any]:
             raise SystemExit(f"mitsim ended with {process.returncode}: {' '.join(words)}\n{said.read_text()}")
         payload = json.loads(printed.read_text())
         manifest = json.loads((inside / "run" / "manifest.json").read_text())
-        told = "mc_error", "total_error_bound", "predicted_memory_bytes", "warnings"
+        told = "mc_error", "total_error_bound", "memory_bytes", "predicted_memory_bytes", "warnings"
         kept = {key: payload.get(key) for key in told}
         plan = manifest["plan"]
         return {**found, **kept, "stages": payload["seconds"], "predicted": plan["predicted"]}
@@ -106,7 +107,14 @@ def measured(case: Case, limit: float) -> dict[str, Any]:
 
 def table(results: Mapping[str, Any]) -> str:
     """What was measured, as markdown: predicted / taken."""
-    heads = ("case", *(f"{stage} [s]" for stage in STAGES), "total [s]", "processor [s]", "memory [GiB]")
+    heads = (
+        "case",
+        *(f"{stage} [s]" for stage in STAGES),
+        "total [s]",
+        "processor [s]",
+        "memory [GiB]",
+        "process [GiB]",
+    )
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for name in CASES:
         row = results["cases"].get(name)
@@ -118,8 +126,8 @@ def table(results: Mapping[str, Any]) -> str:
         stages, predicted = row["stages"], row["predicted"]
         pairs = [f"{predicted.get(stage, 0.0):.1f} / {stages.get(stage, 0.0):.1f}" for stage in STAGES]
         total = f"{sum(predicted.values()):.1f} / {stages['total']:.1f}"
-        foretold = row.get("predicted_memory_bytes")
-        memory = f"{foretold / 2**30:.2f} / {row['memory_bytes'] / 2**30:.2f}" if foretold else "?"
+        sizes = (row[what] / 2**30 for what in ("predicted_memory_bytes", "memory_bytes", "process_bytes"))
+        memory = "{:.2f} / {:.2f} | {:.2f}".format(*sizes)
         lines.append(f"| {' | '.join((name, *pairs, total, format(row['processor_seconds'], '.1f'), memory))} |")
     return "\n".join(lines)
 

@@ -199,6 +199,7 @@ def capture(
             paths=light.paths,
             lost_light=light.lost,
             seconds=job.clock.seconds(),
+            predicted_memory_bytes=cost.memory_bytes,
             warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
             versions=versions(),
         )

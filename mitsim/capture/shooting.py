@@ -10,7 +10,7 @@ import numpy as np
 from mitsim.capture.ambient import AmbientFrame
 from mitsim.capture.evidence import GROUPS, Estimate
 from mitsim.capture.exposer import Exposer, in_chunks
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.framefile import Channel
 from mitsim.core.job import Job
 from mitsim.core.manifests import AmbientFile
@@ -45,15 +45,22 @@ class Totals:
         """Those of all ``expected`` frames, which are formed for it."""
         peak = energy = variance = removed = heaviest = 0.0
         parts = np.zeros(GROUPS)
-        for frame in expected:
-            removed = max(removed, frame.removed)
-            peak = max(peak, float(frame.irradiance.max()))
-            energy += float(np.square(frame.irradiance).sum())
-            variance += frame.variance * frame.irradiance.size
-            heaviest += frame.heaviest * frame.variance * frame.irradiance.size
-            parts += np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
+        for chunk in in_chunks((frame,) for frame in expected):
+            for (frame,), (brightest, squares) in zip(chunk, in_threads(_seen, chunk), strict=True):
+                removed = max(removed, frame.removed)
+                peak = max(peak, brightest)
+                energy += squares
+                variance += frame.variance * frame.irradiance.size
+                heaviest += frame.heaviest * frame.variance * frame.irradiance.size
+                parts += np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
         mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
         return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
+
+
+def _seen(item: tuple[Frame]) -> tuple[float, float]:
+    """Irradiance of the brightest pixel of a frame, and the sum of its squares."""
+    (frame,) = item
+    return float(frame.irradiance.max()), sum_of_squares(frame.irradiance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +178,7 @@ class Shooting:
         index, shot, frame = item
         electrons = self.exposer.lit(frame, *shot.names)
         digital = self.exposer.digital(electrons, *shot.names)
-        energy = float(np.square(electrons).sum())
+        energy = sum_of_squares(electrons)
         return _Exposed(
             index=index,
             shot=shot,
@@ -182,7 +189,7 @@ class Shooting:
             saturated=self.exposer.saturated(digital, electrons),
             light=float(electrons.sum()),
             energy=energy,
-            signal=float(np.square(electrons - self.always).sum()) if self._has_ambient else energy,
+            signal=sum_of_squares(electrons - self.always) if self._has_ambient else energy,
         )
 
     def _record(self, exposed: _Exposed) -> None:

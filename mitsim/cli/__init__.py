@@ -195,6 +195,8 @@ def capture(
     quiet: Quiet = False,
 ) -> int:
     """Render, expose and write one frame for each pattern."""
+    from mitsim.core.resources import memory_in_use, peak_memory
+
     request = request_of(
         patterns=patterns,
         accuracy=accuracy,
@@ -210,15 +212,17 @@ def capture(
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
+        held = memory_in_use()
         shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
-    payload = shots.summary()
+    payload = {**shots.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
     seconds = payload["seconds"]
     lines = [
         f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {seconds['total']:.1f} s "
         f"(transport {seconds['transport']:.2f}, optics {seconds['optics']:.2f}, sensor {seconds['sensor']:.2f}, "
         f"write {seconds['write']:.2f}): {payload['output']}",
         f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
-        f"exposure {payload['exposure_s']:.3g} s a frame",
+        f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
+        f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
     ]
     if payload["ambient_frame"]:
         ambient = payload["ambient_frame"]

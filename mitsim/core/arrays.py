@@ -14,6 +14,12 @@ Progress = Callable[[str, float], None]
 """Called with a stage's name and its finished part, 0 to 1."""
 
 
+def sum_of_squares(values: FloatArray) -> float:
+    """Sum of the squares of ``values`` (any shape), without an array of them, and in one order, unlike BLAS."""
+    flat = np.ravel(values)
+    return float(np.einsum("i,i->", flat, flat))
+
+
 class ByValue:
     """A dataclass (with ``eq=False``) that compares and hashes by its values, arrays by their bytes."""
 

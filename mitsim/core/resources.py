@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,6 +96,24 @@ def free_memory() -> float:
         if soft != psutil.RLIM_INFINITY:
             left.append(float(soft - process.memory_info().vms))
     return max(min(left), 0.0)
+
+
+def memory_in_use() -> float:
+    """Bytes of memory that this process holds."""
+    return float(psutil.Process().memory_info().rss)
+
+
+def peak_memory() -> float:
+    """Most bytes of memory that this process has held since it began."""
+    try:
+        # Not getrusage, where there is this: its peak is inherited from the process that started this one.
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) * 1024.0 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        import resource  # not on Windows
+
+        peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        return peak if sys.platform == "darwin" else peak * 1024
 
 
 def running_seconds() -> float:

@@ -192,6 +192,7 @@ class Capture:
             "truth_error",
             "lost_light",
             "seconds",
+            "predicted_memory_bytes",
             "warnings",
         )
         return {

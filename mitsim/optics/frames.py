@@ -110,7 +110,7 @@ def frames_in_memory(classes: int, shots: int, pixels: int) -> int:
     classes, shots, pixels
         of the family, and a side of the sensor.
     """
-    return (classes if mixes(classes, shots, pixels) else at_once(pixels)) + at_once(pixels)
+    return (classes if mixes(classes, shots, pixels) else 0) + 2 * at_once(pixels)
 
 
 def formed_frames(classes: int, shots: int, pixels: int) -> int:
@@ -313,11 +313,14 @@ class ExpectedFrames:
     def _pixels(self) -> int:
         return self._lights[0].optics.pixels
 
-    def _frames(self, irradiance: FloatArray, probes: FloatArray) -> Iterator[Frame]:
+    def _frames(self, irradiance: FloatArray, probes: FloatArray) -> list[Frame]:
+        """Frames (b, pixels, pixels) of light with what is in all of them, and their variance by ``probes``."""
         ambient = self._ambient_formed
         count = self._groups
         pairs = count * (count - 1)
-        for frame, probed in zip(irradiance, probes, strict=True):
+
+        def seen(row: int) -> Frame:
+            frame, probed = irradiance[row], probes[row]
             if ambient is not None:
                 frame, probed = frame + ambient[0][0], probed + ambient[1][0]
             by_group = probed.reshape(self._pixels, count, -1)
@@ -325,10 +328,12 @@ class ExpectedFrames:
             spread = float(squared.sum())
             variance = spread / pairs / frame.size if pairs else 0.0
             heaviest = float(squared.max()) / spread if spread else 0.0
-            seen = np.maximum(frame, 0)
-            total = float(seen.sum())
+            light = np.maximum(frame, 0)
+            total = float(light.sum())
             parts = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
-            yield Frame(seen, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, parts)
+            return Frame(light, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, parts)
+
+        return in_threads(seen, range(len(irradiance)))
 
 
 def _squares(deviations: FloatArray) -> FloatArray:

@@ -98,12 +98,13 @@ def expose(
     shot_rng, read_rng
         streams of their own, so that switching one noise off leaves the other's draw as it was.
     """
-    expected = add_dark_current(expected_electrons, exposure_s, model)
-    frame = np.empty(expected.shape, np.float64 if model.largest_dn is None else np.uint32)
-    light, numbers = expected.reshape(-1), frame.reshape(-1)
-    for start in range(0, expected.size, _BLOCK):
+    light = checked_light(expected_electrons, "expected_electrons")
+    frame = np.empty(light.shape, np.float64 if model.largest_dn is None else np.uint32)
+    light, numbers = light.reshape(-1), frame.reshape(-1)
+    for start in range(0, light.size, _BLOCK):
         block = slice(start, start + _BLOCK)
-        electrons = clip_at_full_well(draw_electrons(light[block], shot_rng), model)
+        expected = add_dark_current(light[block], exposure_s, model)
+        electrons = clip_at_full_well(draw_electrons(expected, shot_rng), model)
         numbers[block] = quantise(amplify(add_read_noise(electrons, model, read_rng), model), model)
     return frame
 
@@ -209,6 +210,7 @@ def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
 def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:
     """``values`` as float64; ValueError where one is negative or not finite, with their ``name``."""
     array = np.asarray(values, dtype=np.float64)
-    if not np.all((array >= 0) & (array < np.inf)):
+    # Of no number, least and largest are none either.
+    if array.size and not (array.min() >= 0 and array.max() < np.inf):
         raise ValueError(f"{name}: the range is {array.min()} to {array.max()}; all must be finite and 0 or more")
     return array

@@ -106,7 +106,7 @@ def frame_moments(
     rounded and cut numbers: summed over the counts below 1e4 electrons, and averaged over 129 of them above.
     """
     expected = np.asarray(add_dark_current(expected_electrons, exposure_s, model))
-    mean, variance = np.asarray(amplify(expected, model)), np.asarray(_linear_variance(expected, model))
+    mean, variance = np.asarray(amplify(expected, model)), _linear_variance(expected, model)
     first, last = _linear(model)
     rest = (expected < first) | (expected > last)
     if rest.any():
@@ -122,17 +122,20 @@ def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: S
     expected_electrons, exposure_s, model
         as there.
     """
-    expected = add_dark_current(expected_electrons, exposure_s, model)
+    light = checked_light(expected_electrons, "expected_electrons")
+    low, high, mean = (
+        float(add_dark_current(value, exposure_s, model)) for value in (light.min(), light.max(), light.mean())
+    )
     first, last = _linear(model)
-    if first <= expected.min() and expected.max() <= last:
-        return float(_linear_variance(expected.mean(), model))
-    return float(frame_moments(expected_electrons, exposure_s, model)[1].mean())
+    if first <= low and high <= last:
+        return float(_linear_variance(np.float64(mean), model))
+    return float(frame_moments(light, exposure_s, model)[1].mean())
 
 
-def _linear_variance(expected: FloatArray, model: SensorModel) -> FloatArray:
+def _linear_variance(expected: FloatArray | np.float64, model: SensorModel) -> FloatArray:
     """Variance [DN^2] of counts and read noise, rounded, where nothing is cut."""
     read, gain = model.superpixel_read_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
-    return expected * gain**2 + (read**2 + (0.0 if model.largest_dn is None else 1 / 12))
+    return np.asarray(expected * gain**2 + (read**2 + (0.0 if model.largest_dn is None else 1 / 12)))
 
 
 def _linear(model: SensorModel) -> tuple[float, float]:

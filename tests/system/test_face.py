@@ -136,6 +136,9 @@ def test_a_saved_capture_is_that_of_the_command_line(
         for name in names:
             if name.endswith(".exr"):
                 assert_equal_files(tmp_path / other / name, tmp_path / "told" / name)
+    # What the process took is as little of the result as its seconds.
+    taken = told.pop("memory_bytes")
+    assert 0 <= taken < told["predicted_memory_bytes"]
     summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": told["output"]}
     assert {**summary, "seconds": 0} == {**told, "seconds": 0}
 
