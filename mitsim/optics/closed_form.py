@@ -46,14 +46,17 @@ class _Block:
     factors: Sequence[tuple[FloatArray, FloatArray]]
     lights: FloatArray
 
-    def frame(self, pixels: int) -> FloatArray:
-        """(pixels, pixels) irradiance of the estimates' mean."""
+    def frame(self) -> FloatArray:
+        """(pixels, pixels) irradiance of the estimates' mean.
+
+        One product over the rows, or columns, of all terms: those of single terms would go over the frame once each.
+        """
         mean = self.lights[0] if len(self.lights) == 1 else self.lights.mean(axis=0)
-        total = np.zeros((pixels, pixels))
-        for left, right in self.factors:
-            # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
-            total += left.T @ (mean @ right) if len(left) < len(right) else (left.T @ mean) @ right
-        return total
+        lefts, rights = zip(*self.factors, strict=True)
+        # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
+        if len(lefts[0]) < len(rights[0]):
+            return np.asarray(np.concatenate(lefts).T @ np.concatenate([mean @ right for right in rights]))
+        return np.asarray(np.concatenate([mean.T @ left for left in lefts]).T @ np.concatenate(rights))
 
     def probe(self, vectors: FloatArray) -> FloatArray:
         """(pixels, estimates * probes) products of each estimate's frame with ``vectors`` (pixels, probes)."""
@@ -136,12 +139,13 @@ class FrameOptics:
         (pixels, pixels) and (pixels, estimates * probes).
         """
         probes = 0 if vectors is None else vectors.shape[1]
-        frame, probed = np.zeros((self.pixels, self.pixels)), np.zeros((self.pixels, len(estimates) * probes))
+        frame, probed = None, np.zeros((self.pixels, len(estimates) * probes))
         for block in self._blocks(estimates):
-            frame += block.frame(self.pixels)
+            formed = block.frame()
+            frame = formed if frame is None else np.add(frame, formed, out=frame)
             if vectors is not None:
                 probed += block.probe(vectors)
-        return frame, probed
+        return np.zeros((self.pixels, self.pixels)) if frame is None else frame, probed
 
     def _blocks(self, estimates: Sequence[Entries]) -> Iterator[_Block]:
         """The light of each layer that holds any."""
