@@ -16,8 +16,6 @@ import argparse
 import json
 import os
 import platform
-import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -28,6 +26,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from versions import drawn
 
 ROOT = Path(__file__).parents[1]
 STAGES = ("plan", "transport", "truth", "optics", "sensor", "write")
@@ -50,30 +50,11 @@ CASES: Mapping[str, Case] = {
 }
 
 
-def drawn(folder: Path, case: Case) -> tuple[Path, Path]:
-    """Scene file and camera file of a ``case``, on the same areas, in ``folder``."""
-    import numpy as np
-    from skimage import io
-
-    shutil.copytree(ROOT / "scenes" / "photograph", folder / "scene")
-    path, camera = folder / "scene" / "scene.xml", folder / "camera.toml"
-    text = re.sub(r'name="(width|height)" value="512"', rf'name="\1" value="{case.sensor}"', path.read_text())
-    text = text.replace('value="0.01172"', f'value="{0.01172 * 512 / case.sensor!r}"')
-    path.write_text(text)
-    # The same wells and noise on smaller pixels, so that frames of all sizes are as noisy.
-    pitch = f"pixel_pitch_um = {5.86 * 512 / case.sensor!r}"
-    camera.write_text((ROOT / "calibration" / "imx249.toml").read_text().replace("pixel_pitch_um = 5.86", pitch))
-    canvas = np.zeros((case.projector, 2 * case.projector), np.uint8)
-    canvas[:, case.projector :] = 255
-    io.imsave(folder / "scene" / "projector.png", canvas, check_contrast=False)
-    return path, camera
-
-
 def measured(case: Case, limit: float) -> dict[str, Any]:
     """Seconds, memory and predictions of one capture."""
     with tempfile.TemporaryDirectory() as folder:
         inside = Path(folder)
-        scene, camera = drawn(inside, case)
+        scene, camera = drawn(inside, ROOT / "scenes", case.sensor, case.projector)
         words = ["capture", str(scene), "--camera", str(camera), "--patterns", case.patterns, "--json"]
         command = [sys.executable, "-m", "mitsim", *words, "-o", str(inside / "run")]
         printed, said = inside / "stdout", inside / "stderr"

@@ -150,9 +150,11 @@ def measured(version: Version, case: Case, scenes: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         inside = Path(folder)
         (inside / "OUT.xml").write_text("<scene version='3.0.0'><sensor type='mitsim_lensless'")
-        scene = drawn(inside, case, scenes) if case.window or case.pixels else None
         words = [word.replace("OUT", str(inside / "OUT")) for word in case.arguments]
-        words = [str(scene) if scene and "/drawn/" in w else w.replace("SCENES", str(scenes)) for w in words]
+        if case.window or case.pixels:
+            scene, camera = drawn(inside, scenes, case.pixels, case.window)
+            words = [str(scene) if "/drawn/" in word else word for word in (*words, "--camera", str(camera))]
+        words = [word.replace("SCENES", str(scenes)) for word in words]
         printed, said = inside / "stdout", inside / "stderr"
         environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")}
         started = time.perf_counter()
@@ -189,23 +191,34 @@ def measured(version: Version, case: Case, scenes: Path) -> dict[str, Any]:
         return found
 
 
-def drawn(folder: Path, case: Case, scenes: Path) -> Path:
-    """The photograph with another number of sensor or projector pixels on the same areas, in ``folder``."""
+def drawn(folder: Path, scenes: Path, pixels: int | None = None, window: int | None = None) -> tuple[Path, Path]:
+    """Scene and camera file of the photograph with other numbers of pixels on the same areas, made in ``folder``.
+
+    Parameters
+    ----------
+    folder, scenes
+        where they are made, and the shipped scenes, beside which the shipped cameras lie.
+    pixels, window
+        of the sensor and of the projector, a side; those of the photograph where not given.
+    """
     import numpy as np
     from skimage import io
 
     shutil.copytree(scenes / "photograph", folder / "scene")
-    path = folder / "scene" / "scene.xml"
-    text = path.read_text()
-    if case.pixels:
-        text = re.sub(r'name="(width|height)" value="512"', rf'name="\1" value="{case.pixels}"', text)
-        text = text.replace('value="0.01172"', f'value="{0.01172 * 512 / case.pixels!r}"')
-    if case.window:
-        canvas = np.zeros((case.window, 2 * case.window), np.uint8)
-        canvas[:, case.window :] = 255
+    path, camera = folder / "scene" / "scene.xml", folder / "camera.toml"
+    text, shipped = path.read_text(), (scenes.parent / "calibration" / "imx249.toml").read_text()
+    if pixels:
+        text = re.sub(r'name="(width|height)" value="512"', rf'name="\1" value="{pixels}"', text)
+        text = text.replace('value="0.01172"', f'value="{0.01172 * 512 / pixels!r}"')
+        # The same well and noise on other pixels, so that frames of all sizes are as noisy.
+        shipped = shipped.replace("pixel_pitch_um = 5.86", f"pixel_pitch_um = {5.86 * 512 / pixels!r}")
+    if window:
+        canvas = np.zeros((window, 2 * window), np.uint8)
+        canvas[:, window:] = 255
         io.imsave(folder / "scene" / "projector.png", canvas, check_contrast=False)
     path.write_text(text)
-    return path
+    camera.write_text(shipped)
+    return path, camera
 
 
 def summary(pairs: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
 from mitsim.capture.exposer import frames_at_once
 from mitsim.capture.prices import Numbers, entries
 from mitsim.core.resources import Cost
-from mitsim.optics.frames import frames_in_memory
+from mitsim.optics.frames import PROBES, frames_in_memory
 from mitsim.rig.patterns import Lighting
 
 _LANES_BYTES = 380e6
@@ -38,6 +38,18 @@ def frame_seconds(bench: Bench, shots: int) -> dict[str, float]:
     return {"sensor": pixels * _EXPOSING_S, "write": pixels * _WRITING_S}
 
 
+def frames_bytes(classes: int, shots: int, pixels: int) -> float:
+    """Memory of frames that are formed, with the probes that tell their error, exposed and written at a time.
+
+    Parameters
+    ----------
+    classes, shots, pixels
+        of the family, and a side of the sensor.
+    """
+    formed = frames_in_memory(classes, shots, pixels) * (pixels + GROUPS * (PROBES + 1))
+    return 8.0 * pixels * (formed + _EXPOSED * frames_at_once(pixels**2) * pixels)
+
+
 def frames_cost(
     bench: Bench, settings: Settings, lighting: Lighting, seconds: float = 0.0, on_disk: float = 0.0
 ) -> Cost:
@@ -65,12 +77,11 @@ def frames_cost(
         float(entries(bench.n**2, classes, Numbers.of(settings), settings)),
         min(LANES_AT_ONCE, _paths(bench.n**2, settings)),
     )
-    held = frames_in_memory(classes, shots, rows) + _EXPOSED * frames_at_once(pixels)
     return Cost(
         seconds=seconds,
         memory_bytes=_LANES_BYTES
         + _FOLLOWED_BYTES * bool(settings.effects & names(lambda effect: effect.followed))
-        + 8.0 * held * pixels
+        + frames_bytes(classes, shots, rows)
         + GROUPS * filed * _ENTRY_BYTES
         + paths * _DEPOSIT_BYTES,
         disk_bytes=max(files + truth - on_disk, 0.0),

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from mitsim.capture import exposer as exposing
+from mitsim.capture.cost import frames_bytes
 from mitsim.capture.exposer import frames_at_once
-from mitsim.capture.shooting import Shooting
+from mitsim.capture.shooting import Shooting, Totals
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.recorders import RunMemory
+from mitsim.optics import frames as forming
 from mitsim.rig.patterns import parse_patterns
 from tests.unit.capture.test_exposer import PIXELS, exposer, frame
+from tests.unit.optics.small_camera import LABELS, SPLIT, expected_frames, random_groups, small_optics
 
 FAMILY = parse_patterns("dots:5", 10)
 FRAMES = [frame(1e-6 * (2 + index)) for index in range(25)]
@@ -61,3 +66,34 @@ def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.Mon
         with pytest.raises(MitsimError, match=f"^file {bad}: cannot be written"):
             shot(recorder)
         assert bad not in recorder.files and len(recorder.files) <= (24 if bad.endswith("24.exr") else 8)
+
+
+@pytest.mark.parametrize("mixed", [True, False])
+def test_frames_take_as_much_memory_as_is_predicted(mixed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty-six shots of 200 x 200 pixels, mixed from classes that are held or formed one by one: half to all of it.
+
+    (Planted: chunks that are kept until all is written; frames formed 36 at a time, where 5 are predicted.)
+    """
+    pixels, shots = 200, 36
+    for room, count in ((forming, 5), (exposing, 4)):
+        monkeypatch.setattr(room, "_BYTES_AT_ONCE", count * 8 * pixels**2)
+    classes, labels = (4, LABELS) if mixed else (12, SPLIT)
+    if not mixed:
+        monkeypatch.setattr(forming, "_BASIS_BYTES", 1)
+    weights = np.random.default_rng(3).random((shots, classes))
+
+    class Nowhere(RunMemory):
+        def _write(self, name, channels, metadata) -> None:
+            """Kept by nobody."""
+
+    expected = expected_frames(small_optics(pixels), random_groups(8, 7), labels, weights, 0)
+    shooting = Shooting(parse_patterns("dots:6", 12), Nowhere(), exposer(), None, np.zeros((pixels, pixels)))
+    tracemalloc.start()
+    try:
+        totals = Totals.of(expected)
+        shooting.shoot(expected, Job())
+        taken = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert totals.peak > 0 and shooting.sensor_noise > 0
+    assert 0.4 < taken / frames_bytes(classes, shots, pixels) < 1
