@@ -51,6 +51,7 @@ docs/formats
 docs/studies
 docs/extending
 docs/robustness
+docs/growth
 ```
 
 ```{toctree}

@@ -8,14 +8,14 @@ noise. When n is no Hadamard order the next one is used and its first n rows: ro
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
 
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.cost import frame_seconds, frames_cost
+from mitsim.capture.cost import frame_seconds, frames_bytes, frames_cost
 from mitsim.capture.exposer import Exposer, in_chunks
 from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.plan import Plan
@@ -91,9 +91,11 @@ class Session:
         with job.clock.stage("plan"):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
         by_pixel = Lighting(np.arange(n * n), np.broadcast_to(1.0, (self.shots, n * n)))
-        exposing = frame_seconds(self.bench, self.shots)["sensor"]
+        exposing, pixels = frame_seconds(self.bench, self.shots)["sensor"], self.bench.geometry.pixels
         cost = frames_cost(self.bench, plan.settings, by_pixel, plan.predicted_seconds + exposing)
-        cost.check("calibration", job.limits)
+        # Light is filed by pixel, but frames are formed of lines, and those of both sides are held.
+        lines = 2 * frames_bytes(n, self.shots // 2, pixels) - frames_bytes(n * n, self.shots, pixels)
+        replace(cost, memory_bytes=cost.memory_bytes + lines).check("calibration", job.limits)
         return plan
 
     def trace(self, plan: Plan, job: Job) -> Light:

@@ -16,7 +16,7 @@ Progress = Callable[[str, float], None]
 
 def sum_of_squares(values: FloatArray) -> float:
     """Sum of the squares of ``values`` (any shape), without an array of them, and in one order, unlike BLAS."""
-    flat = np.ravel(values)
+    flat = np.ravel(values, order="K")  # as they lie in memory: transposed ones are not copied
     return float(np.einsum("i,i->", flat, flat))
 
 

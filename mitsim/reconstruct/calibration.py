@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.status import Status, Verdict
 
@@ -114,8 +114,9 @@ class StripeSums:
         values = response if self.side == "horizontal" else response.T
         vector = values @ (self.common / np.dot(self.common, self.common))
         self.vectors[:, self.done] = vector
-        self.misfit += float(np.sum(np.square(values - np.outer(vector, self.common))))
-        self.energy += float(np.sum(np.square(values)))
+        explained = np.outer(vector, self.common)
+        self.misfit += sum_of_squares(np.subtract(values, explained, out=explained))
+        self.energy += sum_of_squares(values)
         self.done += 1
 
 
