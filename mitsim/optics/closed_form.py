@@ -46,8 +46,8 @@ class _Block:
     factors: Sequence[tuple[FloatArray, FloatArray]]
     lights: FloatArray
 
-    def frame(self) -> FloatArray:
-        """(pixels, pixels) irradiance of the estimates' mean.
+    def frame(self, out: FloatArray | None = None) -> FloatArray:
+        """(pixels, pixels) irradiance of the estimates' mean, in ``out`` where that is given.
 
         One product over the rows, or columns, of all terms: those of single terms would go over the frame once each.
         """
@@ -55,8 +55,8 @@ class _Block:
         lefts, rights = zip(*self.factors, strict=True)
         # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
         if len(lefts[0]) < len(rights[0]):
-            return np.asarray(np.concatenate(lefts).T @ np.concatenate([mean @ right for right in rights]))
-        return np.asarray(np.concatenate([mean.T @ left for left in lefts]).T @ np.concatenate(rights))
+            return np.matmul(np.concatenate(lefts).T, np.concatenate([mean @ right for right in rights]), out=out)
+        return np.matmul(np.concatenate([mean.T @ left for left in lefts]).T, np.concatenate(rights), out=out)
 
     def probe(self, vectors: FloatArray) -> FloatArray:
         """(pixels, estimates * probes) products of each estimate's frame with ``vectors`` (pixels, probes)."""
@@ -124,7 +124,9 @@ class FrameOptics:
             total += block.probe(vectors)
         return total
 
-    def seen(self, estimates: Sequence[Entries], vectors: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    def seen(
+        self, estimates: Sequence[Entries], vectors: FloatArray | None, out: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """The frame of the mean of several estimates, and the product of each one's frame with some vectors.
 
         Parameters
@@ -133,6 +135,8 @@ class FrameOptics:
             of one light.
         vectors
             (pixels, probes), or None for no products.
+        out
+            (pixels, pixels) zeros, in which the frame is returned; a new array where not given.
 
         Returns
         -------
@@ -141,11 +145,12 @@ class FrameOptics:
         probes = 0 if vectors is None else vectors.shape[1]
         frame, probed = None, np.zeros((self.pixels, len(estimates) * probes))
         for block in self._blocks(estimates):
-            formed = block.frame()
-            frame = formed if frame is None else np.add(frame, formed, out=frame)
+            frame = block.frame(out) if frame is None else np.add(frame, block.frame(), out=frame)
             if vectors is not None:
                 probed += block.probe(vectors)
-        return np.zeros((self.pixels, self.pixels)) if frame is None else frame, probed
+        if frame is None:
+            frame = np.zeros((self.pixels, self.pixels)) if out is None else out
+        return frame, probed
 
     def _blocks(self, estimates: Sequence[Entries]) -> Iterator[_Block]:
         """The light of each layer that holds any."""

@@ -17,8 +17,8 @@ from mitsim.core.seeds import stream
 from mitsim.optics.closed_form import Entries, FrameOptics, IntArray
 from mitsim.rig.patterns import Lighting
 
-_AT_ONCE, _BYTES_AT_ONCE = 32, 2**28
-"""Frames formed at a time: enough to keep all processors busy; and their bytes, where fewer have as many: 8 frames of a
+_AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
+"""Frames formed at a time: enough to keep all processors busy; and their bytes, where fewer have as many: 4 frames of a
 sensor of 2048 pixels."""
 _LARGEST_BASIS, _BASIS_BYTES = 256, 7 * 2**28
 """Classes whose frames are held to be mixed, 512 MiB of a sensor of 512 pixels; and their bytes, of which a process of
@@ -103,14 +103,14 @@ def at_once(pixels: int) -> int:
 
 
 def frames_in_memory(classes: int, shots: int, pixels: int) -> int:
-    """Frames that :class:`ExpectedFrames` holds at once.
+    """Frames that :class:`ExpectedFrames` holds at once: two lots that are in use, and one that is formed.
 
     Parameters
     ----------
     classes, shots, pixels
         of the family, and a side of the sensor.
     """
-    return (classes if mixes(classes, shots, pixels) else 0) + 2 * at_once(pixels)
+    return (classes if mixes(classes, shots, pixels) else 0) + 3 * at_once(pixels)
 
 
 def formed_frames(classes: int, shots: int, pixels: int) -> int:
@@ -328,9 +328,12 @@ class ExpectedFrames:
             spread = float(squared.sum())
             variance = spread / pairs / frame.size if pairs else 0.0
             heaviest = float(squared.max()) / spread if spread else 0.0
+            parts = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
+            if frame.min() >= 0:
+                frame.flags.writeable = False  # of those that are held, which nobody may change
+                return Frame(frame, variance, 0.0, heaviest, parts)
             light = np.maximum(frame, 0)
             total = float(light.sum())
-            parts = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
             return Frame(light, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, parts)
 
         return in_threads(seen, range(len(irradiance)))
@@ -359,13 +362,14 @@ def _formed(
     probed = np.zeros((count, pixels * groups * (0 if probes is None else probes.shape[1])))
 
     def form(row: int) -> None:
-        for optics, parts in mixed:
+        for number, (optics, parts) in enumerate(mixed):
             estimates = [_row(part, row) for part in parts]
             if probes is not None and not with_frames:
                 probed[row] += optics.probe(estimates, probes).ravel()
                 continue
-            frame, seen = optics.seen(estimates, probes)
-            frames[row] += frame
+            frame, seen = optics.seen(estimates, probes, None if number else frames[row])
+            if number:
+                frames[row] += frame
             probed[row] += seen.ravel()
 
     in_threads(form, range(count))
