@@ -49,7 +49,8 @@ two cores. The standard error tells how good it is then."""
 @dataclass(frozen=True)
 class Paces:
     """Seconds of a path or connection of each kind, of a frame and of a multiplication in forming it, of an entry of a
-    wave-optical shadow and of one of filed light, and of a ray of the truth."""
+    wave-optical shadow and of one of filed light, of a ray of the truth, and of a pixel of a shot that is looked
+    through for its brightest and its energy."""
 
     direct: float
     anchored: float
@@ -63,6 +64,7 @@ class Paces:
     entry: float
     filed: float
     ray: float
+    pixel: float = 0.0
 
 
 FIXED = Paces(
@@ -78,6 +80,7 @@ FIXED = Paces(
     entry=3.5e-8,
     filed=1e-8,
     ray=1e-7,
+    pixel=3e-8,
 )
 """Chosen near what was measured of eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios
 decide. Direct light takes half as much where one cell a pixel holds it, and more in many fine ones."""
@@ -157,6 +160,7 @@ def paces_of(evidence: Evidence) -> Paces:
         entry=float(product / FIXED.product * FIXED.entry),
         filed=float(product / FIXED.product * FIXED.filed),
         ray=evidence.direct.seconds * FIXED.ray / FIXED.direct or FIXED.ray,
+        pixel=float(product / FIXED.product * FIXED.pixel),
     )
 
 
@@ -264,7 +268,8 @@ def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
     """
     shadows = paces.entry * _entries(forming, numbers)
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)
-    return shadows + forming_seconds(forming, numbers, frames, paces)
+    seen = paces.pixel * forming.shots * forming.pixels**2
+    return shadows + seen + forming_seconds(forming, numbers, frames, paces)
 
 
 def checking_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:

@@ -125,3 +125,14 @@ def test_light_lies_in_the_cells_that_its_samples_reach() -> None:
         (replace(ONE, followed_anchors=4.0, followed_width=2.0, coarse_layers=3.0), 2 + 2 * 4**2 * 7 / 2**2),
     ):
         assert entries(100, 7, numbers, settings) == 100 * found, numbers
+
+
+def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
+    """For its brightest pixel and its energy, at so much a pixel: shots of 50 x 50 pixels, mixed or not.
+
+    (Planted: a side of the sensor in place of its pixels.)
+    """
+    looked = replace(COUNTED, product=0.0, pixel=1.0)
+    for classes in (FORMING.classes, 9):
+        forming = replace(FORMING, classes=classes)
+        assert optics_seconds(forming, ONE, looked) == pytest.approx(FORMING.shots * 50**2)
