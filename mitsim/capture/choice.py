@@ -7,6 +7,7 @@ paces. The cheapest that fits is taken.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -42,6 +43,7 @@ from mitsim.capture.prices import (
     entries,
     optics_seconds,
     priced,
+    truth_seconds,
 )
 from mitsim.core.arrays import FloatArray
 
@@ -121,20 +123,42 @@ def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], 
     sure
         standard errors that are added to an estimate.
     """
-    best: tuple[tuple[bool, float, float], _Table, int] | None = None
-    counts = [_allowed(evidence, name, switches) for name in COUNTED]
-    rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
-    rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
-    if evidence.occluded:
-        # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
-        rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
-    for effects in _subsets(evidence, switches):
-        table = _Table(accuracy, evidence, effects, rows, _given(switches), sure)
-        index = table.best
-        if best is None or table.rank(index) < best[0]:
-            best = table.rank(index), table, index
-    assert best is not None
-    return best[1].choice(best[2])
+    table, index = Candidates(evidence, switches, sure).best(accuracy)
+    return table.choice(index)
+
+
+class Candidates:
+    """All combinations that the evidence lets choose from, at any accuracy: what they leave is added up once.
+
+    Parameters
+    ----------
+    evidence, switches, sure
+        as for :func:`cheapest`.
+    """
+
+    def __init__(self, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> None:
+        self.evidence = evidence
+        counts = [_allowed(evidence, name, switches) for name in COUNTED]
+        rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
+        rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
+        if evidence.occluded:
+            # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
+            rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
+        given = _given(switches)
+        self._tables = [
+            _Table(math.nan, evidence, effects, rows, given, sure) for effects in _subsets(evidence, switches)
+        ]
+
+    def best(self, accuracy: float) -> tuple[_Table, int]:
+        """The table and row of the choice that :func:`cheapest` makes at an ``accuracy``."""
+        found = [(table, table.best) for table in (each.at(accuracy) for each in self._tables)]
+        return min(found, key=lambda each: each[0].rank(each[1]))
+
+    def seconds(self, accuracy: float) -> tuple[float, bool]:
+        """Seconds at fixed paces of that choice and of its truth, and whether it keeps the ``accuracy``."""
+        table, index = self.best(accuracy)
+        truth = truth_seconds(self.evidence, table.settings(index), FIXED)
+        return float(table.work[index]) + truth, bool(table.fits[index])
 
 
 def predicted(
@@ -225,6 +249,16 @@ class _Table:
         )
         self._follows = bool(effects & names(lambda effect: effect.followed))
 
+    def at(self, accuracy: float) -> _Table:
+        """The same combinations at an ``accuracy``: what does not depend on it is shared.
+
+        To be called before anything else is asked of the table.
+        """
+        self._avoidable  # noqa: B018 - found once, and copied
+        again = copy.copy(self)
+        again.accuracy = accuracy
+        return again
+
     def rank(self, index: int) -> tuple[bool, float, float]:
         """What makes one choice better than another: that it fits, less work, less error."""
         if not self.fits[index]:
@@ -241,8 +275,8 @@ class _Table:
             chosen = error <= _AS_GOOD * error.min()
         return int(np.lexsort((self._avoidable, self.work, ~chosen))[0])
 
-    def choice(self, index: int) -> Choice:
-        """The choice of a row."""
+    def settings(self, index: int) -> Settings:
+        """The settings of a row."""
         numbers = (int(number) for number in self.rows[index])
         anchors, layers, cells, followed, occluded, width, coarse, all_layers = numbers
         settings = Settings(
@@ -263,7 +297,10 @@ class _Table:
             occluded_anchors=occluded,
         )
         samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.samples.items()}
-        settings = replace(settings, **samples)
+        return replace(settings, **samples)
+
+    def choice(self, index: int) -> Choice:
+        """The choice of a row."""
         lacking = {
             "light over sharp lobes": self.evidence.unresolved,
             "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": self.evidence.left_out,
@@ -273,7 +310,7 @@ class _Table:
         rest = (float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE))
         value, bound = (missing + (1 - missing) * error for error in rest)
         return Choice(
-            settings=settings,
+            settings=self.settings(index),
             systematic=Estimate(value, bound),
             lacking=lacking,
             target=float(self.target[index]),

@@ -69,7 +69,7 @@ class Plan:
     Attributes
     ----------
     accuracy
-        relative error asked for.
+        relative error that is to be kept.
     effects
         a row for each effect and discretisation.
     predicted_seconds
@@ -86,6 +86,8 @@ class Plan:
         seconds by stage.
     request, cost
         what it is for, and what that takes; None where it was decided without them.
+    asked_seconds
+        for the whole run, of which the accuracy is the finest that they buy; None where the accuracy was asked for.
     """
 
     accuracy: float
@@ -99,6 +101,7 @@ class Plan:
     predicted: Mapping[str, float] = field(default_factory=dict)
     request: Request | None = None
     cost: Cost | None = None
+    asked_seconds: float | None = None
 
     def row(self, name: str) -> PlanRow:
         """What is said of the effect or discretisation called ``name``; MitsimError when there is none."""
@@ -133,6 +136,7 @@ class Plan:
             "sampling_target": self.sampling_target,
             "systematic_error": self.systematic_error,
             "systematic_bound": self.systematic_bound,
+            "asked_seconds": self.asked_seconds,
             **{f"predicted_{what}_bytes": count for what, count in cost.items()},
         }
 

@@ -9,8 +9,10 @@ from dataclasses import replace
 import drjit as dr
 
 from mitsim.capture import pilot
+from mitsim.capture.affordable import FIRST_LOOK, affordable, told
 from mitsim.capture.bench import Bench
-from mitsim.capture.choice import cheapest, doubt
+from mitsim.capture.choice import Candidates, cheapest, doubt
+from mitsim.capture.cost import frame_seconds
 from mitsim.capture.evidence import GROUPS, Evidence
 from mitsim.capture.plan import Plan, SceneFacts, decide
 from mitsim.capture.request import check_accuracy
@@ -20,6 +22,11 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
 
+OPENING_S = 1.5
+"""Seconds of starting the program and opening a scene (shipped ones: 1.2 to 1.6 on two cores)."""
+_LONGER = 2.0
+"""Seconds of a second, finer look over those of the first (photograph 1.0, corner 1.1, gift_card 1.3, cookie_bag 2.6 at
+a tenth of the accuracy)."""
 _REHEARSED = 2**16
 """Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes."""
 _SELDOM = 3.0
@@ -53,8 +60,7 @@ def make_plan(
         for a scene that the factored estimator cannot render.
     """
     check_accuracy(accuracy)
-    if bench.loaded.unfit.factored is not None:
-        raise bench.loaded.unfit.factored
+    _refuse_unfit(bench)
     started = time.perf_counter()
     look = pilot.Look(bench, lighting, accuracy, seed)
     while True:
@@ -64,10 +70,59 @@ def make_plan(
         if _SELDOM * look.price(stage) > worth:
             break
         look.refine(stage)
-    chosen = cheapest(accuracy, evidence, switches or {}).settings
-    timed = _timed(evidence, Simulation(bench, chosen), lighting.labels, seed)
-    plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches)
-    return plan.taking(plan=time.perf_counter() - started)
+    return _decided(look, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
+
+
+@single_threaded_blas()
+def plan_within(
+    bench: Bench, lighting: Lighting, seconds: float, seed: int, switches: Mapping[str, bool] | None = None
+) -> Plan:
+    """The plan of the finest accuracy whose run is predicted to end within so many seconds.
+
+    Predicted at fixed paces, looking and opening the scene included: the same seconds mean the same plan.
+
+    Parameters
+    ----------
+    bench, lighting, seed, switches
+        as for :func:`make_plan`.
+    seconds
+        from the start of the program to the last file.
+
+    Raises
+    ------
+    MitsimError
+        as :func:`make_plan`.
+    """
+    _refuse_unfit(bench)
+    started, switches = time.perf_counter(), switches or {}
+    around = OPENING_S + sum(frame_seconds(bench, len(lighting.weights)).values())
+    look = pilot.Look(bench, lighting, FIRST_LOOK, seed)
+    around += look.seconds
+    again = _LONGER * look.seconds
+    found = affordable(Candidates(look.evidence, switches), seconds - around, FIRST_LOOK)
+    # What a look tells of finer accuracies than its own is their price, not whether they are kept.
+    aim = affordable(Candidates(look.evidence, switches), seconds - around - again, 0.0, kept=False)
+    if found.fits and aim.fits and aim.accuracy < FIRST_LOOK:
+        around += again
+        look = pilot.Look(bench, lighting, aim.accuracy, seed)
+        finer = affordable(Candidates(look.evidence, switches), seconds - around, aim.accuracy)
+        found = finer if finer.fits else found
+    plan = _decided(look, found.accuracy, switches).taking(plan=time.perf_counter() - started)
+    return replace(plan, asked_seconds=seconds, warnings=(*told(found, seconds, around), *plan.warnings))
+
+
+def _refuse_unfit(bench: Bench) -> None:
+    """MitsimError for a ``bench`` that the factored estimator cannot render."""
+    if bench.loaded.unfit.factored is not None:
+        raise bench.loaded.unfit.factored
+
+
+def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
+    """The plan at an ``accuracy`` of what a ``look`` found, with the paces of its choice measured."""
+    evidence, bench = look.evidence, look.bench
+    chosen = cheapest(accuracy, evidence, switches).settings
+    timed = _timed(evidence, Simulation(bench, chosen), look.lighting.labels, look.seed)
+    return decide(accuracy, timed, SceneFacts.of(bench, switches), switches)
 
 
 def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 """Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
 worth its name."""
+LONGEST_S = 1e6
+"""Seconds that may be asked for: eleven days, far beyond what any accuracy takes."""
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
 
@@ -75,6 +77,7 @@ class Request(BaseModel):
 
     patterns: str = Field("dots:7", description=NAMES)
     accuracy: float = Field(1e-3, description="relative rms error of the expected frames")
+    seconds: float | None = Field(None, description="take the finest accuracy that a run of so many seconds buys")
     seed: int = Field(0, description="root of every random stream")
     exposure: float | Literal["auto"] = Field("auto", description="seconds a frame, or auto")
     exposure_fraction: float = Field(0.8, description="brightest pixel, as a part of full well")
@@ -98,7 +101,12 @@ class Request(BaseModel):
 
     def changed(self, **values: object) -> Request:
         """The same request with other ``values``; MitsimError as :meth:`of`."""
-        return Request.of(**{**self.model_dump(), **values})
+        return Request.of(**{**self.model_dump(exclude_unset=True), **values})
+
+    @property
+    def deciding(self) -> dict[str, Any]:
+        """What is asked, as the manifest's configuration holds it: an accuracy or seconds."""
+        return self.model_dump(mode="json", exclude={"accuracy" if self.seconds is not None else "seconds"})
 
     @field_validator("patterns")
     @classmethod
@@ -109,6 +117,13 @@ class Request(BaseModel):
     @classmethod
     def _promised(cls, accuracy: float) -> float:
         return check_accuracy(accuracy)
+
+    @field_validator("seconds")
+    @classmethod
+    def _some_time(cls, seconds: float | None) -> float | None:
+        if seconds is not None and not 0 < seconds <= LONGEST_S:
+            raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
+        return seconds
 
     @field_validator("effects")
     @classmethod
@@ -141,8 +156,19 @@ class Request(BaseModel):
         return shots
 
     def model_post_init(self, _: object) -> None:
-        """MitsimError for an exposure that no camera has."""
+        """MitsimError for an exposure that no camera has, and for seconds beside what they decide."""
         self.timing  # noqa: B018 - checks itself
+        if self.seconds is None:
+            return
+        if "accuracy" in self.model_fields_set:
+            raise ArgumentError(
+                "seconds", f"{self.seconds:g}: the accuracy is what they buy; give seconds or an accuracy, not both"
+            )
+        if self.noise_fraction is not None:
+            raise ArgumentError(
+                "noise_fraction",
+                f"{self.noise_fraction:g}: stops sampling by another rule than seconds; give one of both",
+            )
 
     @property
     def timing(self) -> Exposure:

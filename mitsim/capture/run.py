@@ -20,7 +20,7 @@ from mitsim.capture.exposer import Exposer, NoiseTarget
 from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.losses import known_losses
 from mitsim.capture.plan import Plan
-from mitsim.capture.planning import make_plan
+from mitsim.capture.planning import make_plan, plan_within
 from mitsim.capture.request import Request
 from mitsim.capture.shooting import Shooting, Totals
 from mitsim.core.errors import ArgumentError
@@ -68,8 +68,12 @@ def plan_request(bench: Bench, request: Request) -> Plan:
 
 def _planned(bench: Bench, lighting: Lighting, request: Request) -> Plan:
     """The plan of a capture, with what exposing and writing its frames takes."""
-    plan = make_plan(bench, lighting, request.accuracy, request.seed, request.effects)
-    return plan.taking(**frame_seconds(bench, len(lighting.weights)))
+    exposing, effects = frame_seconds(bench, len(lighting.weights)), request.effects
+    if request.seconds is None:
+        plan = make_plan(bench, lighting, request.accuracy, request.seed, effects)
+    else:
+        plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
+    return plan.taking(**exposing)
 
 
 def trace_request(bench: Bench, plan: Plan, job: Job | None = None) -> Light:
@@ -98,7 +102,7 @@ def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
     if isinstance(plan, str):
         return Request.of(patterns=plan, **changes)
     request = _request(plan).changed(**changes)
-    for name in ("patterns", "accuracy", "effects"):
+    for name in ("patterns", "accuracy", "seconds", "effects"):
         if getattr(request, name) != getattr(_request(plan), name):
             raise ArgumentError(
                 name, f"{changes[name]!r}: the plan was made for {getattr(plan.request, name)!r}; plan anew"
@@ -212,7 +216,7 @@ def capture(
 def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
     """All that decides the frames."""
     deciding = {name: version for name, version in versions().items() if name in DECIDING}
-    return {**bench.provenance(), **bench.identity(), **request.model_dump(mode="json"), "versions": deciding}
+    return {**bench.provenance(), **bench.identity(), **request.deciding, "versions": deciding}
 
 
 @contextmanager

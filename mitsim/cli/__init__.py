@@ -19,6 +19,7 @@ import mitsim
 from mitsim.cli.options import (
     DAY,
     Accuracy,
+    AccuracyOrSeconds,
     Camera,
     Defines,
     Effects,
@@ -31,6 +32,7 @@ from mitsim.cli.options import (
     Quiet,
     Resume,
     Scene,
+    Seconds,
     Seed,
     Variant,
     bench_of,
@@ -141,7 +143,8 @@ def demo(
 def plan(
     scene: Scene,
     patterns: Patterns = "dots:7",
-    accuracy: Accuracy = 1e-3,
+    accuracy: AccuracyOrSeconds = None,
+    seconds: Seconds = None,
     seed: Seed = 0,
     camera: Camera = None,
     projector: Projector = None,
@@ -155,7 +158,7 @@ def plan(
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.core.resources import running_seconds
 
-    request = request_of(patterns=patterns, accuracy=accuracy, seed=seed, effects=effects)
+    request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     bench = bench_of(scene, variant, camera, projector, define, outside)
     starting = running_seconds()
     plan = bench.plan(**request).taking(start=starting)
@@ -169,7 +172,8 @@ def capture(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
     patterns: Patterns,
-    accuracy: Accuracy = 1e-3,
+    accuracy: AccuracyOrSeconds = None,
+    seconds: Seconds = None,
     camera: Camera = None,
     projector: Projector = None,
     exposure: Annotated[str, typer.Option(help="seconds a frame, or auto", metavar="auto|SECONDS")] = "auto",
@@ -200,6 +204,7 @@ def capture(
     request = request_of(
         patterns=patterns,
         accuracy=accuracy,
+        seconds=seconds,
         seed=seed,
         exposure=number_of("exposure", exposure),
         exposure_fraction=exposure_fraction,
@@ -215,15 +220,20 @@ def capture(
         held = memory_in_use()
         shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
     payload = {**shots.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
-    seconds = payload["seconds"]
+    taken = payload["seconds"]
     lines = [
-        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {seconds['total']:.1f} s "
-        f"(transport {seconds['transport']:.2f}, optics {seconds['optics']:.2f}, sensor {seconds['sensor']:.2f}, "
-        f"write {seconds['write']:.2f}): {payload['output']}",
+        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {taken['total']:.1f} s "
+        f"(transport {taken['transport']:.2f}, optics {taken['optics']:.2f}, sensor {taken['sensor']:.2f}, "
+        f"write {taken['write']:.2f}): {payload['output']}",
         f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
         f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
         f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
     ]
+    if seconds is not None:
+        lines.append(
+            f"Asked for {seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken {taken['total']:.1f}: "
+            f"accuracy {payload['accuracy']:g}, total error up to {payload['total_error_bound']:.1e}"
+        )
     if payload["ambient_frame"]:
         ambient = payload["ambient_frame"]
         lines.append(

@@ -35,6 +35,12 @@ Variant = Annotated[
 ]
 Patterns = Annotated[str, typer.Option(help="uniform, dots:K, dots:RxC, hadamard:K or random:K")]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
+AccuracyOrSeconds = Annotated[
+    float | None, typer.Option("--accuracy", help="relative rms error of the expected frames", show_default="0.001")
+]
+Seconds = Annotated[
+    float | None, typer.Option("--seconds", help="the finest accuracy that a run of so long buys", metavar="S")
+]
 Seed = Annotated[int, typer.Option(help="root of every random stream")]
 Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
 Camera = Annotated[str | None, typer.Option(help="camera electronics: name or TOML file", metavar="NAME|FILE")]
@@ -66,9 +72,10 @@ def variant_of(name: str) -> str:
 
 
 def request_of(**values: object) -> dict[str, Any]:
-    """Checked ``values`` of a request's fields: refused before anything is opened."""
+    """Checked ``values`` of a request's fields, without an accuracy that was not given; refused before work."""
     from mitsim.capture.request import Request
 
+    values = {name: value for name, value in values.items() if name != "accuracy" or value is not None}
     request = Request.of(**values).model_dump()
     return {name: request[name] for name in values}
 

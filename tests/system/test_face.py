@@ -339,6 +339,7 @@ def test_parameters_that_python_takes_for_others(refused: Callable[..., str], be
 
 TYPOS = (
     (["plan", "photograph", "--accuracy", "5"], "--accuracy 5"),
+    (["plan", "photograph", "--accuracy", "1e-3", "--seconds", "5"], "--seconds 5"),
     (["plan", "photograph", "--effects", "+x"], "--effects '+x'"),
     (["plan", "photograph", "--camera", "nosuch"], "nosuch"),
     (["plan", "photograph", "--projector", "nosuch"], "nosuch"),

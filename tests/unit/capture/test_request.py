@@ -35,9 +35,23 @@ def test_a_request_is_a_value() -> None:
     assert Request.of(**request.model_dump(mode="json")) == request, "as the manifest holds it"
 
 
+def test_seconds_or_an_accuracy() -> None:
+    """Not both; the manifest holds the one that was asked for, and reads back as the same request."""
+    request = Request.of(seconds=10.0, seed=2)
+    assert request.changed(patterns="uniform") == Request.of(seconds=10.0, seed=2, patterns="uniform")
+    assert Request.of(**request.deciding) == request and "accuracy" not in request.deciding
+    assert "seconds" not in Request.of().deciding and Request.of().deciding["accuracy"] == 1e-3
+    for other in ({"accuracy": 1e-3}, {"noise_fraction": 0.1}):
+        with pytest.raises(ArgumentError, match=r"give (seconds or an accuracy, not both|one of both)"):
+            Request.of(seconds=10.0, **other)
+        with pytest.raises(ArgumentError, match="give"):
+            request.changed(**other)
+
+
 @pytest.mark.parametrize(
     ("argument", "value", "allowed"),
     [
+        *(("seconds", value, "above 0, at most 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),
         *(("accuracy", value, "from 1e-06 to 0.3") for value in (0.0, -1e-3, 0.5, math.nan, math.inf)),
         *(("noise_fraction", value, "from 0.001 to 1") for value in (1e-300, 0.0, -0.1, 1.5, math.nan, 5e-324)),
         *(("exposure", value, "to 1e+06") for value in (0.0, -1.0, 1e7, math.nan, math.inf)),

@@ -187,6 +187,40 @@ def test_resume_makes_the_missing_frames_and_keeps_the_rest(bench: Bench, captur
     assert all(checksum(folder / name) == value for name, value in checksums.items())
 
 
+def test_seconds_buy_an_accuracy_that_the_manifest_states(
+    bench: Bench, captured: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The choice knows no clock: made again by a machine that looks far slower, it is the same."""
+    shots = bench.capture("dots:3", tmp_path / "run", seconds=3.0, seed=5)
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["configuration"]["seconds"] == 3.0 and "accuracy" not in manifest["configuration"]
+    summary = shots.summary()
+    assert summary["asked_seconds"] == manifest["plan"]["asked_seconds"] == 3.0
+    assert summary["accuracy"] == manifest["plan"]["accuracy"] < 0.3 and summary["predicted_seconds"] > 0
+    assert summary["total_error_bound"] <= summary["accuracy"] and not shots.warnings
+    assert captured.summary()["asked_seconds"] is None and captured.summary()["accuracy"] == ACCURACY
+
+    monkeypatch.setattr("mitsim.capture.planning._seconds", lambda *_: 100.0)
+    whole = pixels(tmp_path / "run")
+    for name in FILES[3:]:
+        (tmp_path / "run" / name).unlink()
+    with pytest.raises(MitsimError, match="other"):
+        bench.capture("dots:3", tmp_path / "run", seconds=4.0, seed=5, resume=True)
+    resumed = bench.capture("dots:3", tmp_path / "run", seconds=3.0, seed=5, resume=True)
+    assert pixels(tmp_path / "run") == whole and resumed.summary()["accuracy"] == summary["accuracy"]
+
+
+def test_too_few_seconds_flag_the_loosest_plan(bench: Bench) -> None:
+    plan = bench.plan("dots:3", seconds=0.01, seed=5)
+    assert plan.accuracy == 0.3 and any("0.01 seconds are too few" in line for line in plan.warnings)
+    finer = bench.plan("dots:3", seconds=30.0, seed=5)
+    assert finer.accuracy < 1e-3 and not finer.warnings, "worth a second, finer look"
+    assert finer.payload()["asked_seconds"] == 30.0
+    for other, said in (({"seconds": 20.0}, "30.0; plan anew"), ({"accuracy": 1e-3}, "not both")):
+        with pytest.raises(MitsimError, match=said):
+            bench.capture(finer, **other)
+
+
 def test_frames_of_another_run_are_not_kept(bench: Bench, captured: Capture, tmp_path: Path) -> None:
     folder = copied(captured, tmp_path)
     whole = pixels(folder)
