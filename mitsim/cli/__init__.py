@@ -395,9 +395,9 @@ def study(
     quiet: Quiet = False,
 ) -> int:
     """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `sweep`
-    of any knob; what `accuracy` costs in time, what `diffraction` at the mask does; `merge` joins the parts of --shard.
+    of any knob; what `accuracy` costs in time, what the `solver`'s does, what `diffraction` at the mask does; `merge` joins the parts of --shard.
     """
-    from mitsim.study import find_study, is_experiment
+    from mitsim.study import OF_NO_SCENE, find_study, is_experiment
 
     with job_of(quiet or as_json) as job:
         if name == "merge":
@@ -414,7 +414,13 @@ def study(
         else:
             run_study = find_study(name)
             request = mitsim.Request.of(patterns=patterns, seed=seed)
-            bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
+            bench = None
+            if name in OF_NO_SCENE:
+                if scenes:
+                    raise MitsimError(f"study {name} {' '.join(scenes)}: it is of no scene; leave the scene out")
+            else:
+                with job.clock.stage("open scene"):
+                    bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
             result = run_study(bench, output, request, job)
     return finish(as_json, result.payload(), result.lines(), ())
 

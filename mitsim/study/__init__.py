@@ -14,9 +14,13 @@ if TYPE_CHECKING:
     from mitsim.study.experiment import Experiment
     from mitsim.study.runner import Study
 
-STUDIES: Mapping[str, str] = MappingProxyType({"accuracy": "accuracy:measure", "diffraction": "diffraction:measure"})
+STUDIES: Mapping[str, str] = MappingProxyType(
+    {"accuracy": "accuracy:measure", "diffraction": "diffraction:measure", "solver": "solver:measure"}
+)
 """Studies of one bench by name, as ``module:function``; the function takes (bench, request, job) and gives
 :class:`mitsim.study.runner.Findings`."""
+OF_NO_SCENE = ("solver",)
+"""Those whose bench is None."""
 PAPER = (
     "patterns",
     "distance",

@@ -5,7 +5,7 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -29,7 +29,7 @@ _PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 """Seven of each, so that as many curves can be told apart."""
-_GRID, _LINK, _GREY = "#e5e7eb", "#d1d5db", "#6b7280"
+_GRID, LINK, GREY = "#e5e7eb", "#d1d5db", "#6b7280"
 """Lines behind the data, between them, and beside them: lighter than any curve."""
 FONT = 11.0
 """Points: as large as the text of a page of 8.6 inches."""
@@ -120,18 +120,9 @@ def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> F
     return figure
 
 
-def error_bars(
-    errors: Mapping[str, float], limit: float | None = None, seconds: Mapping[str, float] | None = None
-) -> Figure:
-    """Relative errors on a logarithmic axis, largest on top; numbers stand beside the axes, where no line crosses them.
-
-    Parameters
-    ----------
-    errors, limit
-        by name, >= 0 (one of 0 has no dot), and the accuracy asked for.
-    seconds
-        what each takes, a second column; the errors are then those of leaving it out.
-    """
+def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figure:
+    """Relative ``errors`` by name, >= 0 (one of 0 has no dot), on a logarithmic axis, largest on top, and the ``limit``
+    asked for; numbers stand beside the axes, where no line crosses them."""
     ordered = sorted(errors.items(), key=lambda item: item[1])
     figure, axes = figure_of(0.7 + 0.36 * len(ordered))
     values = np.array([value for _, value in ordered], dtype=np.float64)
@@ -139,15 +130,10 @@ def error_bars(
     low, high = (shown.min(), shown.max()) if shown.size else (1e-3, 1e-3)
     left = 10.0 ** np.floor(np.log10(low) - 0.3)
     seen = np.flatnonzero(values > 0)
-    axes.hlines(seen, left, values[seen], color=_LINK, lw=2)
+    axes.hlines(seen, left, values[seen], color=LINK, lw=2)
     axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
-    for row, (name, value) in enumerate(ordered):
+    for row, (_, value) in enumerate(ordered):
         _beside(axes, row, 8, f"{value:.1e}" if value > 0 else "0")
-        if seconds is not None:
-            _beside(axes, row, 76, f"{seconds[name]:.2g} s")
-    if seconds is not None:
-        for points, heading in ((8, "error"), (76, "takes")):
-            _beside(axes, len(ordered) - 0.2, points, heading, color=_GREY)
     if limit is not None:
         axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
         where: Any = axes.get_xaxis_transform()
@@ -157,7 +143,7 @@ def error_bars(
     axes.set_xlim(left, 3.0 * high)
     axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=FONT)
     axes.set_ylim(-0.6, len(values) - 0.4)
-    label_axes(axes, f"relative error{'' if seconds is None else ' of the frames if left out'} [1]", "", grid="x")
+    label_axes(axes, "relative error [1]", "", grid="x")
     return figure
 
 
@@ -168,32 +154,6 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
         if not front or error < front[-1][1]:
             front.append((seconds, error))
     return front
-
-
-def pareto(series: Mapping[str, Sequence[Point]], noise: float | None = None, apart: Collection[str] = ()) -> Figure:
-    """Error against wall seconds of several ways to the same result, log-log.
-
-    Points that nothing beats are ringed and joined by a staircase: the best error to be had in a given time.
-
-    Parameters
-    ----------
-    series, noise, apart
-        points (seconds, error) by name; the sensor's relative noise, a horizontal line; names of series that are no
-        steps of one thing, and are not joined.
-    """
-    figure, axes = figure_of(0.55 * WIDTH)
-    for index, (name, points) in enumerate(series.items()):
-        seconds, error = zip(*sorted(points), strict=True)
-        colour, marker = _PALETTE[index % len(_PALETTE)], _MARKERS[index % len(_MARKERS)]
-        line = "" if name in apart else "-"
-        axes.plot(seconds, error, marker, ls=line, color=colour, lw=1.2, ms=7, label=name, zorder=3)
-    _draw_front(axes, [point for points in series.values() for point in points])
-    if noise is not None:
-        axes.axhline(noise, color=_GREY, lw=1.8, ls="--", label=f"sensor noise, {noise:.1e}")
-    _log_log(axes)
-    label_axes(axes, "wall time for all frames [s]", "relative error of the frames [1]")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    return figure
 
 
 def solver_costs(rows: Sequence[SolverRow]) -> Figure:
@@ -246,7 +206,7 @@ def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> 
     figure, axes = figure_of(1.3 + 0.46 * len(systems))
     for place, system in enumerate(systems):
         values = [value for name, _, value in rows if name == system]
-        axes.plot([min(values), max(values)], [place, place], color=_LINK, lw=2, zorder=1)
+        axes.plot([min(values), max(values)], [place, place], color=LINK, lw=2, zorder=1)
     for index, name in enumerate(factors):
         points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
         style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
@@ -295,8 +255,8 @@ def _beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> N
 def _draw_front(axes: Axes, points: Sequence[Point]) -> None:
     """Rings around the points that nothing beats, and the staircase that joins them."""
     seconds, error = zip(*pareto_front(points), strict=True)
-    style: dict[str, Any] = {"color": _GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
-    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=_GREY, mew=1.3, label=_BEST, **style)
+    style: dict[str, Any] = {"color": GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
+    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=GREY, mew=1.3, label=_BEST, **style)
 
 
 def _log_log(axes: Axes) -> None:

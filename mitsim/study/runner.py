@@ -37,11 +37,11 @@ class Findings(Protocol):
 
 @dataclass(frozen=True)
 class StudyResult:
-    """Findings, of which scene and patterns they are, and the folder ``output`` that holds them."""
+    """Findings, of which scene and patterns they are (None: of none), and the folder ``output`` that holds them."""
 
     findings: Findings
-    scene: str
-    patterns: str
+    scene: str | None
+    patterns: str | None
     output: str
 
     def payload(self) -> dict[str, Any]:
@@ -54,14 +54,14 @@ class StudyResult:
         return [*self.findings.lines(), f"JSON and plots: {self.output}"]
 
 
-Measure = Callable[[Bench, Request, Job], Findings]
-Study = Callable[[Bench, Path | str, Request | None, Job | None], StudyResult]
+Measure = Callable[[Any, Request, Job], Findings]
+Study = Callable[[Bench | None, Path | str, Request | None, Job | None], StudyResult]
 
 
 def run_study(
     name: str,
     measure: Measure,
-    bench: Bench,
+    bench: Bench | None,
     output: Path | str,
     request: Request | None = None,
     job: Job | None = None,
@@ -75,14 +75,15 @@ def run_study(
     name, measure
         of the study.
     bench, request, job
-        what is studied: the scene, patterns and seed; clock, progress and limits.
+        what is studied: the scene, patterns and seed; clock, progress and limits. None for a study of no scene.
     output
         new or empty folder, or one with an earlier study of that name, which is replaced.
     """
     request = request or Request.of()
     with study_folder(output, name, ("*.png",)) as folder:
         findings = measure(bench, request, job or Job())
-        result = StudyResult(findings, str(bench.loaded.path), request.patterns, str(folder))
+        scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
+        result = StudyResult(findings, scene, patterns, str(folder))
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         for file, figure in findings.figures().items():

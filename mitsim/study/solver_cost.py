@@ -68,8 +68,9 @@ _MOST_STEPS = 20
 class SolverRow:
     """One form of the solution at one lambda.
 
-    ``lambda_rel`` is lambda over the largest squared singular value; ``seconds`` wall time of one reconstruction;
-    ``error`` relative, against the exact image; ``judge_error`` what that image is uncertain by, relative.
+    ``lambda_rel`` is lambda over the largest squared singular value; ``seconds`` wall time of one reconstruction,
+    the least of its ``repeats``, the longest of which took ``most_s``; ``error`` relative, against the exact image;
+    ``judge_error`` what that image is uncertain by, relative.
     """
 
     method: str
@@ -80,6 +81,8 @@ class SolverRow:
     error: float
     judge_error: float
     seed: int
+    most_s: float = 0.0
+    repeats: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +173,8 @@ def time_solver(
             error=relative_error(rounds[-1][index][1], answers[index][0]),
             judge_error=answers[index][1],
             seed=seed,
+            most_s=max(timed[index][0] for timed in rounds),
+            repeats=repeats,
         )
         for (method, layout, precision), rounds in measured.items()
         for index, relative in enumerate(LAMBDAS)

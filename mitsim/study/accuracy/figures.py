@@ -1,0 +1,161 @@
+"""Figures of the accuracy study: rows and parts in, matplotlib figures out, one message each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from mitsim.study.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, figure_of, label_axes
+
+if TYPE_CHECKING:
+    from mitsim.study.accuracy.findings import PartCost, Row
+
+_FAINT = "#f3f4f6"
+"""Behind the data: what no error can be told in."""
+_NARROW = 30.0
+"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
+_ROOM = 2.0
+"""Factor between the smallest error and the lower end of the axis."""
+_ROW_IN, _AROUND_IN = 0.36, 1.3
+"""Inches of a row of the chart of parts, and of title and axes."""
+
+
+def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
+    """Error against time: whole runs on the left, the reference on the right, hollow where it is extrapolated.
+
+    Parameters
+    ----------
+    rows
+        whole runs, and those of the reference.
+    judge, noise
+        error of the judge, below which no error means anything, and the sensor's noise at equal peak.
+    """
+    runs = [row for row in rows if row.estimator == "factored"]
+    others = [row for row in rows if row.estimator != "factored"]
+    figure, _ = figure_of(0.5 * WIDTH)
+    figure.clear()
+    ratios = {"width_ratios": (3, 2)} if others else None
+    panels: Any = figure.subplots(1, 2 if others else 1, sharey=True, squeeze=False, gridspec_kw=ratios)[0]
+    _draw(panels[0], runs, BLUE, "o")
+    titles = ["whole runs: opening the scene to the last file"]
+    if others:
+        _draw(panels[1], others, VERMILION, "s")
+        panels[1].plot([], [], "s", mfc="white", mec=VERMILION, label="extrapolated")
+        panels[1].legend(fontsize=FONT - 1, frameon=False, loc="upper right")
+        titles.append("reference: light alone")
+    least = min(row.error for row in rows)
+    for axes, title in zip(panels, titles, strict=True):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.margins(x=0.16, y=0.1)
+        axes.set_ylim(bottom=min(least, judge) / _ROOM)
+        axes.axhspan(axes.get_ylim()[0], judge, color=_FAINT, zorder=0)
+        if noise is not None:
+            axes.axhline(noise, color=GREY, lw=1.5, ls="--", zorder=1)
+        axes.set_title(title, fontsize=FONT)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=FONT - 1)
+        _ticks(axes)
+        label_axes(axes, "wall time of all frames [s]", "")
+    panels[0].set_ylabel("relative error of the frames [1]", fontsize=FONT)
+    said = {"the judge's own error": judge} | ({"sensor noise at equal peak": noise} if noise is not None else {})
+    for text, error in said.items():
+        where: Any = panels[0].get_yaxis_transform()
+        style = {"fontsize": FONT - 2, "color": GREY, "xycoords": where, "textcoords": "offset points"}
+        panels[0].annotate(f"{text}, {error:.1e}", (0.01, error), (2, 3), **style)
+    return figure
+
+
+def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
+    """What each part buys, and what it takes: the error that is left without it beside the seconds, row by row.
+
+    Parameters
+    ----------
+    costs
+        of parts, those first that matter most.
+    accuracy
+        whose samples they were timed with.
+    """
+    figure, _ = figure_of(_AROUND_IN + _ROW_IN * max(len(costs), 1))
+    figure.clear()
+    panels: Any = figure.subplots(1, 2, sharey=True)
+    places = range(len(costs))[::-1]
+    errors, seconds = panels
+    told = [part.error_if_off for part in costs if part.error_if_off > 0]
+    floor = min(told, default=1e-6) / 3
+    spans = [part.extra.most for part in costs if part.extra is not None and part.extra.most > 0]
+    shortest = min(spans, default=0.01) / 10
+    for place, part in zip(places, costs, strict=True):
+        face = BLUE if part.in_plan else "white"
+        dot = {"color": BLUE, "mfc": face, "ms": 8, "zorder": 3}
+        if part.error_if_off > 0:
+            errors.plot([floor, part.error_if_off], [place, place], color=LINK, lw=2, zorder=1)
+            errors.plot([part.error_if_off], [place], "o", **dot)
+            _beside(errors, part.error_if_off, place, f"{part.error_if_off:.1e}")
+        else:
+            _beside(errors, floor, place, "none")
+        extra = part.extra
+        if extra is None:
+            _beside(seconds, shortest, place, "not timed")
+        elif extra.within_noise:
+            most = max(extra.most, shortest)
+            seconds.plot([shortest, most], [place, place], color=LINK, lw=2, ls=":", zorder=1)
+            _beside(seconds, most, place, f"within noise, below {extra.most:.1g} s")
+        else:
+            seconds.plot([extra.least, extra.most], [place, place], color=VERMILION, lw=2, zorder=2)
+            seconds.plot([extra.median], [place], "o", **{**dot, "color": VERMILION, "mfc": VERMILION})
+            _beside(seconds, extra.most, place, f"{extra.median:.2g} s")
+    for axes, title in ((errors, "error that is left without it"), (seconds, "seconds that it takes")):
+        axes.set_xscale("log")
+        axes.set_title(title, fontsize=FONT)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=FONT - 1)
+        axes.margins(x=0.05)
+        low, high = axes.get_xlim()
+        axes.set_xlim(low, high * (high / low) ** 0.55)  # room for the numbers beside the dots
+    errors.set_yticks(list(places), [part.name for part in costs], fontsize=FONT)
+    errors.set_ylim(-0.7, len(costs) - 0.3)
+    label_axes(errors, "relative error of the frames [1]", "", grid="x")
+    label_axes(seconds, f"wall time of light and frames at {accuracy:g} [s]", "", grid="x")
+    if not all(part.in_plan for part in costs):
+        errors.plot([], [], "o", color=BLUE, mfc="white", ms=8, label="left out by the plan")
+        figure.legend(fontsize=FONT - 1, frameon=False, loc="outside lower center")
+    return figure
+
+
+def _draw(axes: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:
+    """Points with the spread of their time, joined; extrapolated ones hollow, with their settings beside them."""
+    ordered = sorted(rows, key=lambda row: row.spread.median)
+    axes.plot(
+        [row.spread.median for row in ordered],
+        [row.error for row in ordered],
+        color=colour,
+        lw=1.0,
+        ls=":" if any(row.extrapolated for row in rows) else "-",
+        zorder=2,
+    )
+    for row in ordered:
+        spread = row.spread
+        around = np.array([[spread.median - spread.least], [spread.most - spread.median]])
+        face = "white" if row.extrapolated else colour
+        style: dict[str, Any] = {"fmt": marker, "color": colour, "mfc": face, "ms": 8, "capsize": 3, "zorder": 3}
+        axes.errorbar([spread.median], [row.error], xerr=around, **style)
+        said = row.setting.removeprefix("accuracy ") + (" (once)" if spread.repeats == 1 else "")
+        axes.annotate(said, (spread.median, row.error), (6, 6), textcoords="offset points", fontsize=FONT - 2)
+
+
+def _beside(axes: Axes, at: float, place: float, text: str) -> None:
+    axes.annotate(text, (at, place), (8, 0), textcoords="offset points", va="center", fontsize=FONT - 1)
+
+
+def _ticks(axes: Axes) -> None:
+    low, high = axes.get_xlim()
+    if high < _NARROW * low:
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())

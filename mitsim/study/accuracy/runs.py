@@ -1,0 +1,142 @@
+"""Whole runs of `mitsim capture`: accuracies in; seconds from opening the scene to the last file, and error, out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from mitsim.capture.cost import frame_seconds
+from mitsim.capture.effects import present
+from mitsim.capture.evidence import Settings
+from mitsim.capture.request import Request
+from mitsim.capture.run import capture
+from mitsim.core.arrays import FloatArray
+from mitsim.core.job import Job
+from mitsim.core.runs import Capture
+from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.study.accuracy.findings import Row
+from mitsim.study.accuracy.judge import Judge
+from mitsim.study.knobs import Stand
+from mitsim.study.metrics import relative_error
+from mitsim.study.spreads import Budget, Timed
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """One run and its repeats: the ``accuracies`` that lead to it, its frames' error, and seconds of light alone."""
+
+    accuracies: tuple[float, ...]
+    timed: Timed
+    light: list[float]
+    found: list[tuple[float, float]]
+
+
+class Runs:
+    """Whole runs at several accuracies, each measured at least once.
+
+    Parameters
+    ----------
+    stand, request, judge
+        scene and family, what else is asked of a run, and what its frames are held against.
+    opening
+        seconds that count for every run.
+    """
+
+    def __init__(self, stand: Stand, request: Request, judge: Judge, opening: float) -> None:
+        self._stand, self._judge, self._opening = stand, judge, opening
+        # Speckle is drawn anew in every frame and is no error of the light.
+        off = {"speckle": False} if "speckle" in present(stand.bench) else {}
+        self._request = request.changed(effects={**request.effects, **off})
+        self._runs: list[_Run] = []
+
+    def measure(self, accuracies: Sequence[float], quoted: float, budget: Budget, share: float) -> None:
+        """Run each of the ``accuracies`` once that fits; those that lead to the same settings are one run.
+
+        Parameters
+        ----------
+        accuracies, quoted
+            to be run; the one that is run first, and whatever it takes.
+        budget, share
+            time that is left, and the part of it that one run may take.
+        """
+        groups = list(self._groups(accuracies))
+        ordered = sorted(groups, key=lambda group: (quoted not in group[0], group[1]))
+        for group, predicted in ordered:
+            name = f"accuracy {_listed(group)}"
+            if quoted in group or budget.allows(name, predicted, share):
+                run = self._begun(group)
+                run.timed.seconds.append(run.timed.again())
+                self._runs.append(run)
+
+    @property
+    def timed(self) -> list[Timed]:
+        """What can be repeated."""
+        return [run.timed for run in self._runs]
+
+    @property
+    def rows(self) -> list[Row]:
+        """Of all runs, the loosest first."""
+        return [
+            Row(
+                "factored",
+                "accuracy",
+                f"accuracy {_listed(run.accuracies)}",
+                run.timed.spread + self._opening,
+                *run.found[0],
+                accuracies=run.accuracies,
+            )
+            for run in sorted(self._runs, key=lambda run: -min(run.accuracies))
+        ]
+
+    def light_seconds(self, accuracy: float) -> float:
+        """Seconds of transport and optics of the run at an ``accuracy``."""
+        return next(median(run.light) for run in self._runs if accuracy in run.accuracies)
+
+    def _groups(self, accuracies: Sequence[float]) -> Iterator[tuple[tuple[float, ...], float]]:
+        """Accuracies by the settings that they lead to, and the seconds that a run of them is predicted to take."""
+        groups: dict[Settings, list[float]] = {}
+        lit: dict[Settings, float] = {}
+        for accuracy in sorted(accuracies, reverse=True):
+            plan = self._stand.plan(accuracy)
+            groups.setdefault(plan.settings, []).append(accuracy)
+            lit[plan.settings] = plan.predicted_seconds
+        around = self._stand.look.seconds + sum(
+            frame_seconds(self._stand.bench, len(self._stand.family.shots)).values()
+        )
+        for settings, group in groups.items():
+            yield tuple(group), lit[settings] + around
+
+    def _begun(self, accuracies: tuple[float, ...]) -> _Run:
+        """A run at the tightest of its ``accuracies`` that was not made yet."""
+        request = self._request.changed(accuracy=min(accuracies))
+        light: list[float] = []
+        found: list[tuple[float, float]] = []
+
+        def again() -> float:
+            """Seconds of the run."""
+            job = Job()
+            with TemporaryDirectory(prefix="mitsim-study-") as folder:
+                shots = capture(self._stand.bench, request, job, Path(folder) / "run")
+                seconds = job.clock.seconds()
+                if not found:
+                    error = relative_error(self._irradiance(shots), self._judge.frames)
+                    found.append((error, shots.manifest.mc_error or 0.0))
+            light.append(seconds["transport"] + seconds["optics"])
+            return seconds["total"]
+
+        return _Run(accuracies, Timed(again), light, found)
+
+    def _irradiance(self, shots: Capture) -> FloatArray:
+        """(shots, pixels, pixels) expected irradiance that a capture was exposed to [W m^-2]."""
+        rig = self._stand.bench.rig
+        unit = electrons_from_irradiance(1.0, shots.exposure_s, rig.sensor, rig.projector.effective_wavelength_nm)
+        return np.asarray(shots.electrons, dtype=np.float64) / unit
+
+
+def _listed(accuracies: Sequence[float]) -> str:
+    return ", ".join(f"{accuracy:g}" for accuracy in accuracies)
