@@ -395,7 +395,8 @@ def study(
     quiet: Quiet = False,
 ) -> int:
     """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `sweep`
-    of any knob; what `accuracy` costs in time, what the `solver`'s does, what `diffraction` at the mask does; `merge` joins the parts of --shard.
+    of any knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask
+    does; `merge` joins the parts of --shard.
     """
     from mitsim.study import OF_NO_SCENE, find_study, is_experiment
 

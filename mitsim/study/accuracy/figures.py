@@ -52,8 +52,8 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
     for axes, title in zip(panels, titles, strict=True):
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.margins(x=0.16, y=0.1)
-        axes.set_ylim(bottom=min(least, judge) / _ROOM)
+        axes.margins(x=0.2)
+        axes.set_ylim(min(least, judge) / _ROOM, _ROOM * max(*(row.error for row in rows), noise or 0.0))
         axes.axhspan(axes.get_ylim()[0], judge, color=_FAINT, zorder=0)
         if noise is not None:
             axes.axhline(noise, color=GREY, lw=1.5, ls="--", zorder=1)

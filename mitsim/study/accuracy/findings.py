@@ -83,7 +83,7 @@ class PartCost:
         what leaving it out changes in the frames, relative, by the pilot's looks (``lines``: by the judge's light); at
         most, at 95 %.
     with_it, without
-        seconds of transport and optics of all frames; ``without`` None where it was not timed.
+        seconds of transport and optics of all frames; None where that was not timed.
     in_plan
         whether the plan at the quoted accuracy has it.
     """
@@ -91,19 +91,26 @@ class PartCost:
     name: str
     error_if_off: float
     error_bound: float
-    with_it: Spread
+    with_it: Spread | None
     without: Spread | None
     in_plan: bool
 
     @property
     def extra(self) -> Extra | None:
         """What it takes."""
-        return Extra.between(self.with_it, self.without) if self.without else None
+        return Extra.between(self.with_it, self.without) if self.with_it and self.without else None
 
     @property
     def cost(self) -> str:
         """That in words."""
-        return "not timed" if self.extra is None else str(self.extra)
+        if self.extra is None:
+            return "not timed"
+        return f"{self.extra}, {'once' if self.repeats == 1 else f'{self.repeats} runs each'}"
+
+    @property
+    def repeats(self) -> int:
+        """Of the one that was measured less often."""
+        return min(self.with_it.repeats, self.without.repeats) if self.with_it and self.without else 0
 
     def payload(self) -> dict[str, Any]:
         """As JSON; ``seconds`` is None where noise hides it or nobody timed it."""
@@ -117,7 +124,7 @@ class PartCost:
             "least_s": max(extra.least, 0.0) if extra else None,
             "most_s": max(extra.most, 0.0) if extra else None,
             "within_noise": None if extra is None else extra.within_noise,
-            "repeats": min(self.with_it.repeats, self.without.repeats) if self.without else 0,
+            "repeats": self.repeats,
             "in_plan": self.in_plan,
         }
 
@@ -189,14 +196,15 @@ class AccuracyFindings:
     def lines(self) -> list[str]:
         """For people."""
         parts = [
-            f"{part.name:<18} without it the error is {part.error_if_off:.1e}; it takes {part.cost}"
-            f"{'' if part.in_plan else f'; the plan at {self.quoted:g} leaves it out'}"
+            f"{part.name:<18} error without it {part.error_if_off:.1e}, time {part.cost}"
+            f"{'' if part.in_plan else f'; not in the plan at {self.quoted:g}'}"
             for part in self.effects
         ]
         noise = [f"The sensor's noise is {self.sensor_noise:.1e} at equal peak."] if self.sensor_noise else []
-        opening = sum(self.opening.values())
+        at = f"At the error of the run at {self.quoted:g} the reference would take"
+        speedup, opening = self.speedup_at_equal_error, sum(self.opening.values())
+        equal = [f"{at} {speedup:.1e} times as long (extrapolated)."] if speedup else []
         counted = f"opening the scene ({opening:.1f} s, once)" if opening else "planning (opening was not timed)"
-        speedup = self.speedup_at_equal_error
         return [
             f"Whole runs, from {counted} to the last file; the reference, light alone:",
             *(row.line() for row in self.rows),
@@ -206,13 +214,7 @@ class AccuracyFindings:
             f"The judge's own error: Monte Carlo {self.judge.mc_error:.1e}, discretisation predicted "
             f"{self.judge.systematic_error:.1e} ({self.judge.seconds:.1f} s); below it no error means anything.",
             *noise,
-            *(
-                [
-                    f"At the error of the run at {self.quoted:g} the reference would take {speedup:.1e} times as long (extrapolated)."
-                ]
-                if speedup
-                else []
-            ),
+            *equal,
             *(f"Left out, too slow: {name}" for name in self.left_out),
             f"What the solver's precision costs is the same for all scenes: {SOLVER}",
         ]

@@ -79,15 +79,13 @@ class Parts:
 
     @property
     def costs(self) -> tuple[PartCost, ...]:
-        """What each part buys and takes, those first that matter most; empty where nothing was timed."""
-        if not self._whole.seconds:
-            return ()
+        """What each part buys and takes, those first that matter most."""
         return tuple(
             PartCost(
                 name=part.name,
                 error_if_off=part.error.value,
                 error_bound=part.error.bound,
-                with_it=self._whole.spread,
+                with_it=self._whole.spread if self._whole.seconds else None,
                 without=part.timed.spread if part.timed.seconds else None,
                 in_plan=_has(self._plan.settings, part.name),
             )
