@@ -120,6 +120,7 @@ def test_reconstruct_refuses(refused: Refused, lab: Any, options: list[str], fra
     ("arguments", "fragments"),
     [
         (["study", "weather", "photograph", *NEW], ["'weather'", "accuracy"]),
+        (["study", "solver", "photograph", *NEW], ["study solver photograph", "leave the scene out"]),
         (["plan", "photograph", "--accuracy", "0"], ["--accuracy 0"]),
         (["plan", "photograph", "--patterns", "dots:129"], ["dots:129", "128"]),
         (["plan", "photograph", "--seed", "-1"], ["-1"]),

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.study import accuracy
+from mitsim.study import accuracy, solver
 from mitsim.study.solver_cost import make_problem, time_solver
 
 VERBS = ("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "doctor")
@@ -142,27 +142,52 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
 
 
 def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two accuracies and a small solver: that all rows are right is held by unit/study/test_accuracy.py."""
-    problem = make_problem(np.random.default_rng(1).random((12, 8)), 2, 0)
+    """Of two accuracies: that all rows are right is held by unit/study/test_accuracy.py."""
     monkeypatch.setattr(accuracy, "ACCURACIES", (1e-2, accuracy.QUOTED))
-    monkeypatch.setattr(accuracy, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
     scene = lab.write_scene("grey", reflectance=None)
     options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
     outcome = call("study", "accuracy", scene, *options)
     study = outcome.payload
-    assert {"rows", "speedup_at_equal_error"} <= study.keys()
+    assert {"rows", "speedup_at_equal_error", "left_out", "took", "opening", "solver"} <= study.keys()
     assert number(study["speedup_at_equal_error"], 1)
     for row in study["rows"]:
         assert {"estimator", "setting", "seconds", "error", "mc_error"} <= row.keys()
         assert row["estimator"] in ("factored", "reference") and isinstance(row["setting"], str)
         assert number(row["seconds"], 1e-6) and number(row["error"], 1e-9) and number(row["mc_error"], 1e-9)
+        assert 0 < row["least_s"] <= row["seconds"] <= row["most_s"] and row["repeats"] >= 1
         assert isinstance(row["knob"], str) and isinstance(row["on_front"], bool)
+        assert row["extrapolated"] is bool(row["by"])
     assert {row["estimator"] for row in study["rows"]} == {"factored", "reference"}
-    assert study["effects"] and all({"name", "error_if_off", "seconds"} <= effect.keys() for effect in study["effects"])
-    assert study["solver"] and number(study["sensor_noise"], 1e-6, 1)
+    keys = {"name", "error_if_off", "error_bound", "seconds", "least_s", "most_s", "within_noise", "repeats", "in_plan"}
+    assert study["effects"] and all(keys == effect.keys() for effect in study["effects"])
+    assert number(study["sensor_noise"], 1e-6, 1)
     assert {"mc_error", "systematic_error", "seconds", "seed"} <= study["judge"].keys()
     written = {path.name for path in (tmp_path / "study").iterdir()}
-    assert written == {"accuracy.json", "accuracy.png", "effects.png", "solver.png"}
+    assert written == {"accuracy.json", "accuracy.png", "effects.png"}
+
+
+def test_study_solver(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of no scene, and of a small problem here."""
+    problem = make_problem(np.random.default_rng(1).random((12, 8)), 2, 0)
+    monkeypatch.setattr(solver, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
+    study = call("study", "solver", "-o", tmp_path / "study", "--json", "--quiet").payload
+    assert study["scene"] is None and study["patterns"] is None
+    keys = {
+        "method",
+        "precision",
+        "layout",
+        "lambda_rel",
+        "seconds",
+        "most_s",
+        "repeats",
+        "error",
+        "judge_error",
+        "seed",
+    }
+    assert study["rows"] and all(keys == row.keys() for row in study["rows"])
+    assert {path.name for path in (tmp_path / "study").iterdir()} == {"solver.json", "solver.png"}
+    text = call("study", "solver", "-o", tmp_path / "study", "--quiet").out
+    assert "lambda 1e-04  svd" in text and "runs)" in text
 
 
 def test_study_diffraction(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ QUOTED = 1e-3
 """The default accuracy."""
 BUDGET_S = 100.0
 """Seconds of the whole study on a quiet machine: with starting, opening and figures below two minutes."""
-_JUDGE_PART, _FRONT_PART, _PARTS_PART = 0.25, 0.5, 0.8
+_JUDGE_PART, _FRONT_PART, _PARTS_PART = 0.15, 0.4, 0.8
 """Of what is left, what the judge, one whole run, and one look at all parts may take."""
 
 

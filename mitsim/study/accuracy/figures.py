@@ -19,6 +19,10 @@ _FAINT = "#f3f4f6"
 """Behind the data: what no error can be told in."""
 _NARROW = 30.0
 """Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
+_FEWEST, _FEW, _MANY = 8.0, (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+"""Range below which more ticks are needed, and ticks in a decade above and below it."""
+_BESIDE, _BESIDE_PARTS = 0.2, 0.7
+"""Part of an axis that is left free for what stands beside its last point."""
 _ROOM = 2.0
 """Factor between the smallest error and the lower end of the axis."""
 _ROW_IN, _AROUND_IN = 0.36, 1.3
@@ -40,20 +44,22 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
     figure, _ = figure_of(0.5 * WIDTH)
     figure.clear()
     ratios = {"width_ratios": (3, 2)} if others else None
-    panels: Any = figure.subplots(1, 2 if others else 1, sharey=True, squeeze=False, gridspec_kw=ratios)[0]
+    panels: Any = figure.subplots(1, 2 if others else 1, squeeze=False, gridspec_kw=ratios)[0]
     _draw(panels[0], runs, BLUE, "o")
-    titles = ["whole runs: opening the scene to the last file"]
+    titles = [f"whole runs, opening the scene to the last file\n{_counted(runs)}"]
     if others:
         _draw(panels[1], others, VERMILION, "s")
         panels[1].plot([], [], "s", mfc="white", mec=VERMILION, label="extrapolated")
-        panels[1].legend(fontsize=FONT - 1, frameon=False, loc="upper right")
-        titles.append("reference: light alone")
-    least = min(row.error for row in rows)
-    for axes, title in zip(panels, titles, strict=True):
+        panels[1].legend(fontsize=FONT - 1, frameon=False, loc="lower left")
+        titles.append("reference, light alone\n(one frame was measured)")
+    for axes, title, shown in zip(panels, titles, (runs, others), strict=False):
+        errors = [row.error for row in shown]
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.margins(x=0.2)
-        axes.set_ylim(min(least, judge) / _ROOM, _ROOM * max(*(row.error for row in rows), noise or 0.0))
+        axes.margins(x=0.12)
+        low, high = axes.get_xlim()
+        axes.set_xlim(low, high * (high / low) ** _BESIDE)
+        axes.set_ylim(min(*errors, judge) / _ROOM, _ROOM * max(*errors, noise or 0.0))
         axes.axhspan(axes.get_ylim()[0], judge, color=_FAINT, zorder=0)
         if noise is not None:
             axes.axhline(noise, color=GREY, lw=1.5, ls="--", zorder=1)
@@ -86,6 +92,7 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     panels: Any = figure.subplots(1, 2, sharey=True)
     places = range(len(costs))[::-1]
     errors, seconds = panels
+    figure.suptitle("What each part of the light buys, and what it takes", fontsize=FONT + 1)
     told = [part.error_if_off for part in costs if part.error_if_off > 0]
     floor = min(told, default=1e-6) / 3
     spans = [part.extra.most for part in costs if part.extra is not None and part.extra.most > 0]
@@ -117,7 +124,7 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
         axes.tick_params(labelsize=FONT - 1)
         axes.margins(x=0.05)
         low, high = axes.get_xlim()
-        axes.set_xlim(low, high * (high / low) ** 0.55)  # room for the numbers beside the dots
+        axes.set_xlim(low, high * (high / low) ** _BESIDE_PARTS)
     errors.set_yticks(list(places), [part.name for part in costs], fontsize=FONT)
     errors.set_ylim(-0.7, len(costs) - 0.3)
     label_axes(errors, "relative error of the frames [1]", "", grid="x")
@@ -130,7 +137,8 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
 
 def _draw(axes: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:
     """Points with the spread of their time, joined; extrapolated ones hollow, with their settings beside them."""
-    ordered = sorted(rows, key=lambda row: row.spread.median)
+    ordered = sorted(rows, key=lambda row: -row.error)
+    alike = len({row.spread.repeats for row in rows}) == 1
     axes.plot(
         [row.spread.median for row in ordered],
         [row.error for row in ordered],
@@ -145,8 +153,20 @@ def _draw(axes: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:
         face = "white" if row.extrapolated else colour
         style: dict[str, Any] = {"fmt": marker, "color": colour, "mfc": face, "ms": 8, "capsize": 3, "zorder": 3}
         axes.errorbar([spread.median], [row.error], xerr=around, **style)
-        said = row.setting.removeprefix("accuracy ") + (" (once)" if spread.repeats == 1 else "")
+        said = row.setting.removeprefix("accuracy ") + ("" if alike else f" ({_times(spread.repeats)})")
         axes.annotate(said, (spread.median, row.error), (6, 6), textcoords="offset points", fontsize=FONT - 2)
+
+
+def _counted(rows: Sequence[Row]) -> str:
+    """What the points stand for."""
+    repeats = {row.spread.repeats for row in rows}
+    if repeats == {1}:
+        return "beside each run, once: the accuracy asked for"
+    return f"median, least and most of {repeats.pop() if len(repeats) == 1 else 'repeats'}; accuracy asked for"
+
+
+def _times(repeats: int) -> str:
+    return "once" if repeats == 1 else f"{repeats} runs"
 
 
 def _beside(axes: Axes, at: float, place: float, text: str) -> None:
@@ -156,6 +176,6 @@ def _beside(axes: Axes, at: float, place: float, text: str) -> None:
 def _ticks(axes: Axes) -> None:
     low, high = axes.get_xlim()
     if high < _NARROW * low:
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_locator(LogLocator(subs=_FEW if high > _FEWEST * low else _MANY))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())

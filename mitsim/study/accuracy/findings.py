@@ -26,7 +26,7 @@ class Row:
     spread
         wall seconds; of the reference those of one frame, times their number.
     error, mc_error
-        against the judge, and the row's own Monte Carlo error.
+        against the judge, whose noise is taken off, and the row's own Monte Carlo error.
     accuracies
         that lead to this run.
     extrapolated
@@ -211,8 +211,8 @@ class AccuracyFindings:
             "* nothing measured is as good in less time",
             f"Parts of transport and optics, at the samples of {self.parts_accuracy:g}:",
             *parts,
-            f"The judge's own error: Monte Carlo {self.judge.mc_error:.1e}, discretisation predicted "
-            f"{self.judge.systematic_error:.1e} ({self.judge.seconds:.1f} s); below it no error means anything.",
+            f"The judge's own error: Monte Carlo {self.judge.mc_error:.1e}, taken off above, discretisation "
+            f"predicted {self.judge.systematic_error:.1e} ({self.judge.seconds:.1f} s).",
             *noise,
             *equal,
             *(f"Left out, too slow: {name}" for name in self.left_out),

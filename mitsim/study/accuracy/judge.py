@@ -3,6 +3,7 @@ rows out."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -64,6 +65,12 @@ class Judge:
         frames, mc_error = stacked(expected)
         facts = JudgeFacts(mc_error, stand.discretisation(finest.settings), time.perf_counter() - started, seed)
         return cls(stand, light, expected, frames, facts)
+
+    def error(self, frames: FloatArray) -> float:
+        """Relative error of all ``frames``, without the judge's own noise: seeds differ, so squares add. At least half
+        that noise, below which chance decides."""
+        distance, noise = relative_error(frames, self.frames), self.facts.mc_error
+        return max(math.sqrt(max(distance**2 - noise**2, 0.0)), noise / 2)
 
     def reference(self, budget: Budget) -> Iterator[Row]:
         """Rows of the reference, against light with the effects that it has, as far as the ``budget`` goes."""

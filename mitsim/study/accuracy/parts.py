@@ -50,8 +50,7 @@ class Parts:
     def __init__(self, stand: Stand, judge: Judge) -> None:
         self._stand, self._judge = stand, judge
         self._plan = stand.plan(stand.accuracy)
-        full = replace(stand.finest(self._plan).settings, subdivision=self._plan.settings.subdivision)
-        full = replace(full, effects=frozenset(present(stand.bench)))
+        full = _filled(self._plan.settings, stand.finest(self._plan).settings)
         self.accuracy, self._seconds, settings = _sampled(stand, full)
         self._full = replace(self._plan, settings=settings)
         self._whole = self._timed(Trial("parts", "all", stand.bench, self._full, at_once))
@@ -123,6 +122,20 @@ class Parts:
             return time.perf_counter() - started
 
         return Timed(again)
+
+
+def _filled(now: Settings, finer: Settings) -> Settings:
+    """The settings ``now`` with what they leave out as ``finer`` ones have it."""
+    return replace(
+        now,
+        effects=finer.effects,
+        anchors=max(now.anchors, finer.anchors if now.anchors == 1 else 1),
+        followed_anchors=max(now.followed_anchors, finer.followed_anchors if now.followed_anchors == 1 else 1),
+        followed_width=finer.followed_width if now.followed_anchors == 1 else now.followed_width,
+        occluded_anchors=max(now.occluded_anchors, finer.occluded_anchors if now.occluded_anchors == 1 else 1),
+        layers=now.layers or finer.layers,
+        subdivision=max(now.subdivision, finer.subdivision if now.subdivision == 1 else 1),
+    )
 
 
 def _sampled(stand: Stand, settings: Settings) -> tuple[float, float, Settings]:

@@ -22,7 +22,6 @@ from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.study.accuracy.findings import Row
 from mitsim.study.accuracy.judge import Judge
 from mitsim.study.knobs import Stand
-from mitsim.study.metrics import relative_error
 from mitsim.study.spreads import Budget, Timed
 
 
@@ -125,7 +124,7 @@ class Runs:
                 shots = capture(self._stand.bench, request, job, Path(folder) / "run")
                 seconds = job.clock.seconds()
                 if not found:
-                    error = relative_error(self._irradiance(shots), self._judge.frames)
+                    error = self._judge.error(self._irradiance(shots))
                     found.append((error, shots.manifest.mc_error or 0.0))
             light.append(seconds["transport"] + seconds["optics"])
             return seconds["total"]

@@ -1,4 +1,4 @@
-"""The accuracy study on a small scene: knobs turn one thing, errors behave as theory has it, the judge says its own."""
+"""The accuracy study on a small scene: whole runs keep what they promise, parts cost what can be told, time is kept."""
 
 import json
 import math
@@ -9,21 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture import pilot
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Request
-from mitsim.core.job import Job
+from mitsim.core.job import Clock, Job
 from mitsim.study import accuracy, find_study, plots
-from mitsim.study.accuracy import AccuracyFindings
-from mitsim.study.knobs import Stand, at_once, reformed, sampled, trials, without
+from mitsim.study.accuracy import judge
+from mitsim.study.accuracy.findings import AccuracyFindings, PartCost
+from mitsim.study.accuracy.judge import Judge
+from mitsim.study.knobs import Stand, at_once, one_line, reformed, sampled, without
 from mitsim.study.runner import StudyResult
-from mitsim.study.solver_cost import make_problem, time_solver
+from mitsim.study.spreads import ROUNDS, Budget, Spread
 
 pytestmark = pytest.mark.usefixtures("variant")
 PATTERNS, SEED = "dots:2", 5
+OPENING = 0.25
+TRIED = (3e-2, 2.9e-2, accuracy.QUOTED)
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +42,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(bench: Bench, folder: Path) -> StudyResult:
-    """The whole study at three accuracies of five; the solver's part on a small problem."""
-    problem = make_problem(np.random.default_rng(1).random((12, 8)), 2, SEED)
+    """The whole study at three accuracies, parts with few samples, the opening taken for a quarter of a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(accuracy, "ACCURACIES", (3e-2, 1e-2, accuracy.QUOTED))
-        patch.setattr(accuracy, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
-        return find_study("accuracy")(bench, folder, Request.of(patterns=PATTERNS, seed=SEED), None)
+        patch.setattr(accuracy, "ACCURACIES", TRIED)
+        patch.setattr(accuracy.parts, "_LONGEST_S", 0.0)
+        patch.setattr(accuracy, "_JUDGE_PART", 0.02)
+        request = Request.of(patterns=PATTERNS, seed=SEED)
+        return find_study("accuracy")(bench, folder, request, Job(Clock(OPENING)))
 
 
 @pytest.fixture(scope="module")
@@ -53,88 +57,108 @@ def study(result: StudyResult) -> AccuracyFindings:
     return result.findings
 
 
-def test_every_knob_has_rows(study: AccuracyFindings) -> None:
-    knobs = {row.knob for row in study.rows}
-    assert {"accuracy", "samples", "cells", "anchors", "bounces", "wavelengths", "spp"} <= knobs
+def test_every_accuracy_is_in_one_row(study: AccuracyFindings) -> None:
+    """Those that lead to the same settings share theirs, and no two rows are one run."""
+    runs = [row for row in study.rows if row.estimator == "factored"]
+    assert sorted(each for row in runs for each in row.accuracies) == sorted(TRIED)
+    assert [row.accuracies for row in runs] == [(3e-2, 2.9e-2), (accuracy.QUOTED,)]
+    for row in runs:
+        assert all(f"{each:g}" in row.setting for each in row.accuracies)
+        assert OPENING < row.spread.least <= row.spread.median <= row.spread.most and row.spread.repeats == ROUNDS
+        assert not row.extrapolated
+
+
+def test_whole_runs_keep_their_accuracy(study: AccuracyFindings) -> None:
+    """Against an independent answer, with room for that answer's own error; sampled, so not by far."""
     for row in study.rows:
-        assert row.seconds > 0 and np.isfinite(row.error) and 0 < row.mc_error < 10
-    assert len({(row.knob, row.setting) for row in study.rows}) == len(study.rows)
+        if row.estimator == "factored":
+            assert 0.3 * row.mc_error < row.error <= 1.25 * np.hypot(min(row.accuracies), study.judge.error), row
 
 
-def test_whole_plans_keep_their_accuracy(study: AccuracyFindings) -> None:
-    """Against an independent answer, with room for that answer's own error."""
-    own = np.hypot(study.judge.mc_error, study.judge.systematic_error)
-    for row in study.rows:
-        if row.knob == "accuracy":
-            asked = float(row.setting.split()[1])
-            assert row.error <= 1.25 * np.hypot(asked, own), row
+def test_the_reference_is_unbiased_and_says_what_is_extrapolated(study: AccuracyFindings) -> None:
+    *measured, equal = (row for row in study.rows if row.estimator == "reference")
+    assert [row.setting for row in measured] == ["16 spp", "64 spp"]
+    for row in measured:
+        assert 0.8 < row.error / row.mc_error < 1.25, row
+        assert "one of 4 frames was measured" in row.extrapolated and row.payload()["extrapolated"] is True
+    quoted = next(row for row in study.rows if accuracy.QUOTED in row.accuracies)
+    assert equal.error == quoted.error and "1/sqrt(samples) from 64 spp" in equal.extrapolated
+    assert equal.spread.median == pytest.approx(measured[-1].spread.median * (measured[-1].error / equal.error) ** 2)
+    assert study.speedup_at_equal_error is not None and study.speedup_at_equal_error > 1
 
 
-def test_more_samples_leave_less(study: AccuracyFindings) -> None:
-    errors = [row.mc_error for row in study.rows if row.knob == "samples"]
-    assert len(errors) == 3
-    # Independent samples gain 8^0.5 = 2.8 a step; stratified ones up to 8.
-    assert errors[0] > 2 * errors[1] > 4 * errors[2]
+def test_parts_say_what_they_buy_and_never_cost_less_than_nothing(study: AccuracyFindings) -> None:
+    found = {part.name: part for part in study.effects}
+    assert {"diffraction", "interreflection", "black-level", "anchors", "cells"} <= found.keys()
+    assert study.effects[0].name == "diffraction" and study.effects[0].error_if_off > 0.02
+    assert found["interreflection"].error_if_off == pytest.approx(0, abs=1e-9), "one flat sheet lights the camera alone"
+    assert found["diffraction"].in_plan
+    for part in study.effects:
+        assert part.error_if_off <= part.error_bound and part.repeats == ROUNDS
+        block = part.payload()
+        assert block["within_noise"] is (block["seconds"] is None)
+        assert block["least_s"] >= 0 and (block["seconds"] is None or block["seconds"] > 0)
 
 
-def test_the_reference_is_unbiased_against_its_own_judge(study: AccuracyFindings) -> None:
-    for row in study.rows:
-        if row.estimator == "reference":
-            assert 0.8 < row.error / row.mc_error < 1.25, row
+def test_a_part_within_noise_is_said_to_be() -> None:
+    one, more = Spread.of([1.0, 1.1, 1.2]), Spread.of([2.0, 2.1, 2.2])
+    dear, free = (PartCost("fog", 0.1, 0.1, with_it, one, True) for with_it in (more, one))
+    assert dear.cost == "1 s (0.8 to 1.2), 3 runs each" and dear.payload()["seconds"] == pytest.approx(1.0)
+    assert free.cost.startswith("within noise") and free.payload()["seconds"] is None
+    untimed = PartCost("fog", 0.1, 0.1, more, None, True)
+    assert untimed.cost == "not timed" and untimed.payload()["within_noise"] is None
 
 
-def test_leaving_out_diffraction_shows_in_rows_of_effects(study: AccuracyFindings) -> None:
-    found = {effect.name: effect.error_if_off for effect in study.effects}
-    assert {"diffraction", "interreflection", "black-level"} <= found.keys()
-    assert max(found, key=lambda name: found[name]) == "diffraction" and found["diffraction"] > 0.02
-    assert found["interreflection"] == pytest.approx(0, abs=1e-9), "one flat sheet lights nothing but the camera"
+def test_the_judges_own_noise_is_taken_off(bench: Bench) -> None:
+    """Frames of the judge's mean light and of independent noise: what is left is that noise."""
+    stand = Stand(bench, bench.family("uniform"), SEED, Job(), 3e-2)
+    answer = Judge.trace(stand, stand.plan(3e-2), 0.0)
+    size = np.linalg.norm(answer.frames) / answer.frames.size**0.5
+    rng, noise = np.random.default_rng(0), answer.facts.mc_error
+    for own in (3 * noise, 0.01 * noise):
+        apart = answer.frames + rng.normal(0, np.hypot(own, noise) * size, answer.frames.shape)
+        assert answer.error(apart) == pytest.approx(max(own, noise / 2), rel=0.05)
 
 
-def test_the_front_is_marked(study: AccuracyFindings) -> None:
-    marked = sorted((row.seconds, row.error) for row in study.rows if row.on_front)
-    assert marked == plots.pareto_front([(row.seconds, row.error) for row in study.rows]) and marked
-
-
-def test_speedup_is_that_of_equal_error(study: AccuracyFindings) -> None:
-    quoted = next(row for row in study.rows if row.setting == "accuracy 0.001")
-    slow = study.rows[-1]
-    expected = slow.seconds * (slow.error / quoted.error) ** 2 / quoted.seconds
-    assert study.speedup_at_equal_error == pytest.approx(expected) and expected > 1
+def test_the_front_is_marked_among_what_was_measured(study: AccuracyFindings) -> None:
+    runs = [row for row in study.rows if row.estimator == "factored"]
+    marked = sorted((row.spread.median, row.error) for row in study.rows if row.on_front)
+    assert marked == plots.pareto_front([(row.spread.median, row.error) for row in runs]) and marked
 
 
 def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: Path) -> None:
-    assert {path.name for path in folder.iterdir()} == {"accuracy.json", "accuracy.png", "effects.png", "solver.png"}
+    assert {path.name for path in folder.iterdir()} == {"accuracy.json", "accuracy.png", "effects.png"}
     assert result.payload()["output"] == str(folder) and result.payload()["patterns"] == PATTERNS
     kept = json.loads((folder / "accuracy.json").read_text())
     assert len(kept["rows"]) == len(study.rows) and kept["judge"]["seed"] == SEED + 1
+    assert {row["extrapolated"] for row in kept["rows"] if row["estimator"] == "factored"} == {False}
+    assert kept["opening"] == {"start": OPENING} and kept["solver"] == "mitsim study solver"
     assert kept["sensor_noise"] == pytest.approx(study.sensor_noise) and 1e-4 < kept["sensor_noise"] < 1
     text = "\n".join(result.lines())
-    assert "diffraction buys" in text and "judge's own error" in text and str(folder) in text
+    assert "diffraction        error without it" in text and "judge's own error" in text and str(folder) in text
+    assert "extrapolated: one of 4 frames" in text and "mitsim study solver" in text
 
 
-def test_knobs_turn_one_thing_at_a_time(bench: Bench) -> None:
-    lighting = bench.family(PATTERNS).lighting
-    plan = make_plan(bench, lighting, 1e-3, SEED)
-    evidence = pilot.measure(bench, lighting, 1e-3, SEED)
-    kinds = ("direct", "anchored", "indirect", "from_camera", "followed", "occluded")
-    samples = {f"{name}_samples" for name in kinds}
-    turned = {
-        "samples": samples,
-        "cells": {"subdivision"},
-        "anchors": {"anchors"},
-        "bounces": {"effects"},
-        "layers": {"layers"},
-    }
-    tried = list(trials(bench, plan, evidence, 100.0))
-    assert {trial.knob for trial in tried} >= {"samples", "cells", "anchors", "bounces", "wavelengths"}
-    for trial in tried:
-        now, then = plan.settings, trial.plan.settings
-        differ = {name for name in now.__dataclass_fields__ if getattr(now, name) != getattr(then, name)}
-        assert differ <= turned.get(trial.knob, set())
-        assert (trial.bench is bench) == (trial.knob != "wavelengths")
-        assert trial.bench.spectrum.weights.sum() == pytest.approx(1)
-    fewer = list(trials(bench, plan, evidence, 0.0))
-    assert len(fewer) < len(tried), "what takes longer than the patience and than the plan itself is left out"
+def test_extrapolated_points_are_hollow(study: AccuracyFindings) -> None:
+    runs, reference = study.figures()["accuracy.png"].axes
+    faces = [
+        [line.get_markerfacecolor() for line in axes.lines if line.get_marker() in "os"] for axes in (runs, reference)
+    ]
+    assert len(faces[0]) == len([row for row in study.rows if not row.extrapolated]) and "white" not in faces[0]
+    assert len(faces[1]) == 3 + 1 and set(faces[1]) == {"white"}, "three points and the legend's"
+
+
+def test_what_does_not_fit_is_left_out_and_named(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accuracy, "BUDGET_S", 0.0)
+    monkeypatch.setattr(accuracy, "ACCURACIES", (3e-2, accuracy.QUOTED))
+    found = accuracy.measure(bench, Request.of(patterns=PATTERNS, seed=SEED), Job())
+    [row] = found.rows
+    assert row.accuracies == (accuracy.QUOTED,) and row.spread.repeats == 1, "the default is run whatever it takes"
+    said = "\n".join(found.left_out)
+    assert "accuracy 0.03 " in said and "time of diffraction" in said and "reference at 16 spp" in said
+    assert found.speedup_at_equal_error is None and not found.opening
+    assert all(part.cost == "not timed" and part.error_if_off >= 0 for part in found.effects)
+    assert any("(once)" in line for line in found.lines()) and found.figures()
 
 
 def test_sampled_fixes_the_number_of_samples(bench: Bench) -> None:
@@ -154,6 +178,12 @@ def test_without_names_each_effect_once(bench: Bench) -> None:
     switched = dict(without(settings, present))
     assert present - switched.keys() == {"speckle"}, "it is not part of expected frames"
     assert "anchors" in switched and switched["anchors"] == replace(settings, anchors=1)
+    finest = replace(settings, followed_anchors=2, followed_width=2, subdivision=4, coarse_cells=2, layers=(3.0, 2.0))
+    fallen = dict(without(finest, frozenset()))
+    assert fallen["followed-anchors"] == replace(finest, followed_anchors=1, followed_width=1)
+    assert fallen["cells"] == replace(finest, subdivision=1, coarse_cells=1)
+    assert fallen["layers"] == replace(finest, layers=())
+    assert one_line(bench).spectrum.weights.shape == (1,)
     for name in present & switched.keys():
         assert switched[name].effects == settings.effects - {name}
 
@@ -183,9 +213,9 @@ def test_the_judge_of_the_reference_has_what_the_registry_says(
         )
     bench = open_bench(scene, variant, projector=projector)
     stand = Stand(bench, bench.family("hadamard:2"), SEED, Job(), 1e-2)
-    judge = accuracy._Judge.trace(stand, stand.plan(1e-2))
-    monkeypatch.setattr(accuracy, "_SAMPLES", (64, 2048))
-    for row in judge.reference():
+    answer = Judge.trace(stand, stand.plan(1e-2), 1.0)
+    monkeypatch.setattr(judge, "_SAMPLES", (64, 2048))
+    for row in answer.reference(Budget(600.0)):
         assert 0.8 < row.error / row.mc_error < 1.25, row
 
 
