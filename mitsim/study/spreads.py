@@ -97,32 +97,38 @@ class Timed:
 class Budget:
     """Wall seconds that a study may take, from now on, and what did not fit in them.
 
-    ``seconds`` is all that it may take.
+    ``seconds`` is all that it may take; ``slower`` what work takes here over what it is predicted to, by what was seen.
     """
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._started = time.perf_counter()
         self.left_out: list[str] = []
+        self.slower = 1.0
 
     @property
     def left(self) -> float:
         """Seconds that are left."""
         return self.seconds - (time.perf_counter() - self._started)
 
-    def allows(self, name: str, seconds: float, share: float = 1.0) -> bool:
+    def saw(self, taken: float, predicted: float) -> None:
+        """Work took so many seconds, and was ``predicted`` to take others; a faster machine is not believed."""
+        self.slower = max(taken / predicted, 1.0)
+
+    def allows(self, name: str, seconds: float, share: float = 1.0, kept: float = 0.0) -> bool:
         """Whether work of so many predicted seconds fits; what does not is kept under its ``name``.
 
         Parameters
         ----------
         name, seconds
             of the work.
-        share
-            part of what is left that it may take.
+        share, kept
+            part of what is left that it may take, less seconds that are kept for other work.
         """
-        if seconds <= share * self.left:
+        left = share * self.left - kept
+        if seconds <= left:
             return True
-        self.left_out.append(f"{name} (predicted {seconds:.0f} s, {max(share * self.left, 0.0):.0f} s were left)")
+        self.left_out.append(f"{name} (predicted {seconds:.0f} s, {max(left, 0.0):.0f} s were left)")
         return False
 
     def repeat(self, works: Iterable[Timed]) -> None:

@@ -15,6 +15,7 @@ What the solver's precision costs is no matter of the scene: `mitsim study solve
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 from mitsim.capture.bench import Bench
@@ -38,6 +39,10 @@ _JUDGE_PART, _FRONT_PART, _PARTS_PART = 0.15, 0.4, 0.8
 """Of what is left, what the judge, one whole run, and one look at all parts may take."""
 
 
+_SHORTEST_LOOK_S = 1.0
+"""Shorter looks tell more of kernels than of the machine's pace."""
+
+
 def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
     """Error against time.
 
@@ -53,7 +58,10 @@ def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
     opening = {name: seconds for name, seconds in job.clock.seconds().items() if name in ("start", "open scene")}
     stand = Stand(bench, bench.family(request.patterns, request.seed), request.seed, job, QUOTED)
     job.progress("judge", 0.1)
-    judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left)
+    started = time.perf_counter()
+    looked = stand.look.seconds
+    budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_LOOK_S))
+    judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
     runs, parts = Runs(stand, request, judge, sum(opening.values())), Parts(stand, judge)
     job.progress("whole runs", 0.3)
     runs.measure(ACCURACIES, QUOTED, budget, _FRONT_PART)

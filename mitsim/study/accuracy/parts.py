@@ -19,8 +19,8 @@ from mitsim.study.knobs import Stand, Trial, at_once, one_line, stacked, warmed,
 from mitsim.study.metrics import relative_error
 from mitsim.study.spreads import Budget, Timed
 
-_LONGEST_S = 3.0
-"""Seconds of light with all parts in: a dozen parts are then timed three times each in less than the study has."""
+_LONGEST_S = 3.5
+"""Seconds of light with all parts in: a dozen parts are then timed once in less than the study has."""
 _ACCURACIES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1)
 """Whose samples are tried, the default first."""
 _LINES = "lines"
@@ -64,11 +64,11 @@ class Parts:
         budget, share
             time that is left, and the part of it that all of them may take.
         """
-        kept = budget.left * (1 - share)
+        kept = max(budget.left, 0.0) * (1 - share)
         for name, timed in (("all", self._whole), *((part.name, part.timed) for part in self._left)):
             # The rehearsal that compiles kernels takes about as long as the work.
-            predicted_s = 2 * (self._whole.spread.most if self._whole.seconds else self._seconds)
-            if budget.allows(f"time of {name}", predicted_s + kept):
+            predicted_s = 2 * (self._whole.spread.most if self._whole.seconds else budget.slower * self._seconds)
+            if budget.allows(f"time of {name}", predicted_s, kept=kept):
                 timed.seconds.append(timed.again())
 
     @property

@@ -63,15 +63,15 @@ class Runs:
         budget, share
             time that is left, and the part of it that one run may take.
         """
-        groups, slower = list(self._groups(accuracies)), 1.0
+        groups = list(self._groups(accuracies))
         ordered = sorted(groups, key=lambda group: (quoted not in group[0], group[1]))
         for group, predicted in ordered:
             name = f"accuracy {_listed(group)}"
-            if quoted in group or budget.allows(name, slower * predicted, share):
+            if quoted in group or budget.allows(name, budget.slower * predicted, share):
                 run = self._begun(group)
                 run.timed.seconds.append(run.timed.again())
                 self._runs.append(run)
-                slower = max(run.timed.spread.median / predicted, 1.0)  # of a busy machine
+                budget.saw(run.timed.spread.median, predicted)
 
     @property
     def timed(self) -> list[Timed]:

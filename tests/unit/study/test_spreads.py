@@ -40,6 +40,15 @@ def test_what_does_not_fit_is_named() -> None:
     assert not budget.allows("long", 11.0)
     assert [line.split(" (predicted")[0] for line in budget.left_out] == ["short", "long"]
     assert "11 s" in budget.left_out[1] and 9.5 < budget.left <= 10.0
+    assert not budget.allows("other", 4.0, kept=7.0) and "3 s were left" in budget.left_out[2]
+
+
+def test_a_slow_machine_is_believed_and_a_fast_one_is_not() -> None:
+    budget = Budget(10.0)
+    budget.saw(6.0, 2.0)
+    assert budget.slower == 3.0
+    budget.saw(1.0, 2.0)
+    assert budget.slower == 1.0
 
 
 def test_repeats_go_round_by_round_and_stop_with_the_time() -> None:
