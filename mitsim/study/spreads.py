@@ -112,7 +112,7 @@ class Budget:
         return self.seconds - (time.perf_counter() - self._started)
 
     def saw(self, taken: float, predicted: float) -> None:
-        """Work took so many seconds, and was ``predicted`` to take others; a faster machine is not believed."""
+        """Work has ``taken`` so many seconds and was ``predicted`` to take others; a faster machine is not believed."""
         self.slower = max(taken / predicted, 1.0)
 
     def allows(self, name: str, seconds: float, share: float = 1.0, kept: float = 0.0) -> bool:
