@@ -5,10 +5,10 @@ is cheap is repeated:
 
 1. the *judge*, one factored answer of its own seed with every effect of the scene and more anchors, layers and cells
    than the plans, that all errors are measured against (:mod:`.judge`);
-2. whole runs of `mitsim capture` at several accuracies, from opening the scene to the last file (:mod:`.runs`);
+2. a whole run of `mitsim capture` at the default accuracy, from opening the scene to the last file (:mod:`.runs`);
 3. each effect, the anchors, layers, cells and the projector's lines left out in turn (:mod:`.parts`);
-4. the reference on one frame, extrapolated to all;
-5. repeats of 2 and 3.
+4. whole runs at other accuracies, and the reference on one frame, extrapolated to all;
+5. repeats of all but the reference.
 
 What the solver's precision costs is no matter of the scene: `mitsim study solver`.
 """
@@ -35,7 +35,7 @@ QUOTED = 1e-3
 """The default accuracy."""
 BUDGET_S = 100.0
 """Seconds of the whole study on a quiet machine: with starting, opening and figures below two minutes."""
-_JUDGE_PART, _FRONT_PART, _PARTS_PART = 0.15, 0.4, 0.8
+_JUDGE_PART, _FRONT_PART, _PARTS_PART = 0.12, 0.6, 0.6
 """Of what is left, what the judge, one whole run, and one look at all parts may take."""
 
 
@@ -64,9 +64,11 @@ def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
     judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
     runs, parts = Runs(stand, request, judge, sum(opening.values())), Parts(stand, judge)
     job.progress("whole runs", 0.3)
-    runs.measure(ACCURACIES, QUOTED, budget, _FRONT_PART)
-    job.progress("parts", 0.5)
+    runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
+    job.progress("parts", 0.4)
     parts.measure(budget, _PARTS_PART)
+    job.progress("whole runs", 0.6)
+    runs.measure(ACCURACIES, budget, _FRONT_PART)
     job.progress("reference", 0.7)
     reference = list(judge.reference(budget))
     job.progress("repeats", 0.8)

@@ -50,7 +50,7 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
     if others:
         _draw(panels[1], others, VERMILION, "s")
         panels[1].plot([], [], "s", mfc="white", mec=VERMILION, label="extrapolated")
-        panels[1].legend(fontsize=FONT - 1, frameon=False, loc="lower left")
+        panels[1].legend(fontsize=FONT - 1, frameon=True, loc="lower left")
         titles.append("reference, light alone\n(one frame was measured)")
     for axes, title, shown in zip(panels, titles, (runs, others), strict=False):
         errors = [row.error for row in shown]
@@ -108,6 +108,7 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
             _beside(errors, floor, place, "none")
         extra = part.extra
         if extra is None:
+            seconds.plot([shortest], [place], ls="")  # an axis that holds the words
             _beside(seconds, shortest, place, "not timed")
         elif extra.within_noise:
             most = max(extra.most, shortest)
@@ -161,8 +162,8 @@ def _counted(rows: Sequence[Row]) -> str:
     """What the points stand for."""
     repeats = {row.spread.repeats for row in rows}
     if repeats == {1}:
-        return "beside each run, once: the accuracy asked for"
-    return f"median, least and most of {repeats.pop() if len(repeats) == 1 else 'repeats'}; accuracy asked for"
+        return "(each once; beside it the accuracy asked for)"
+    return "(median, least and most; beside it the accuracy asked for)"
 
 
 def _times(repeats: int) -> str:

@@ -53,21 +53,27 @@ class Runs:
         self._request = request.changed(effects={**request.effects, **off})
         self._runs: list[_Run] = []
 
-    def measure(self, accuracies: Sequence[float], quoted: float, budget: Budget, share: float) -> None:
-        """Run each of the ``accuracies`` once that fits; those that lead to the same settings are one run.
+    def measure(
+        self, accuracies: Sequence[float], budget: Budget, share: float, whatever_it_takes: float | None = None
+    ) -> None:
+        """Run each of the ``accuracies`` once that fits and was not run; those that lead to the same settings are one.
 
         Parameters
         ----------
-        accuracies, quoted
-            to be run; the one that is run first, and whatever it takes.
+        accuracies
+            all that the study knows: some of them may share their settings.
         budget, share
             time that is left, and the part of it that one run may take.
+        whatever_it_takes
+            run the group of this accuracy alone, and without asking for time.
         """
-        groups = list(self._groups(accuracies))
-        ordered = sorted(groups, key=lambda group: (quoted not in group[0], group[1]))
-        for group, predicted in ordered:
+        known = {accuracy for run in self._runs for accuracy in run.accuracies}
+        for group, predicted in sorted(self._groups(accuracies), key=lambda group: group[1]):
+            first = whatever_it_takes in group
+            if known.intersection(group) or (whatever_it_takes is not None and not first):
+                continue
             name = f"accuracy {_listed(group)}"
-            if quoted in group or budget.allows(name, budget.slower * predicted, share):
+            if first or budget.allows(name, budget.slower * predicted, share):
                 run = self._begun(group)
                 run.timed.seconds.append(run.timed.again())
                 self._runs.append(run)
