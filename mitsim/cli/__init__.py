@@ -199,7 +199,7 @@ def capture(
     quiet: Quiet = False,
 ) -> int:
     """Render, expose and write one frame for each pattern."""
-    from mitsim.core.resources import memory_in_use, peak_memory
+    from mitsim.core.resources import memory_from_here, peak_memory
 
     request = request_of(
         patterns=patterns,
@@ -217,7 +217,7 @@ def capture(
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
-        held = memory_in_use()
+        held = memory_from_here()
         shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
     payload = {**shots.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
     taken = payload["seconds"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,13 +99,15 @@ def free_memory() -> float:
     return max(min(left), 0.0)
 
 
-def memory_in_use() -> float:
-    """Bytes of memory that this process holds."""
+def memory_from_here() -> float:
+    """Bytes of memory that this process holds; :func:`peak_memory` counts anew from here, where the system lets it."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # proc(5): the peak becomes what is held now
     return float(psutil.Process().memory_info().rss)
 
 
 def peak_memory() -> float:
-    """Most bytes of memory that this process has held since it began."""
+    """Most bytes of memory that this process has held since it began, or since :func:`memory_from_here`."""
     try:
         # Not getrusage, where there is this: its peak is inherited from the process that started this one.
         lines = Path("/proc/self/status").read_text().splitlines()

@@ -11,7 +11,7 @@ from mitsim.capture.prices import FIXED, truth_seconds
 from mitsim.capture.request import HIGHEST_ACCURACY
 from tests.unit.capture.invented_evidence import EVIDENCE
 
-TIMES = (0.01, 0.3, 0.6, 1.0, 2.0, 4.0, 10.0, 40.0, 1e5)
+TIMES = (0.01, 0.3, 0.95, 1.0, 2.0, 4.0, 10.0, 40.0, 1e5)
 
 
 @pytest.fixture(scope="module")
