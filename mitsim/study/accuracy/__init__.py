@@ -3,8 +3,8 @@
 The whole study has BUDGET_S seconds. What is worth most comes first, what does not fit is left out and named, and what
 is cheap is repeated:
 
-1. the *judge*, one factored answer of its own seed with every effect of the scene and more anchors, layers and cells
-   than the plans, that all errors are measured against (:mod:`.judge`);
+1. the *judge*, one factored answer of its own seed with every effect of the scene and, where time allows, more anchors,
+   layers and cells than the plans, that all errors are measured against (:mod:`.judge`);
 2. a whole run of `mitsim capture` at the default accuracy, from opening the scene to the last file (:mod:`.runs`);
 3. each effect, the anchors, layers, cells and the projector's lines left out in turn (:mod:`.parts`);
 4. whole runs at other accuracies, and the reference on one frame, extrapolated to all;

@@ -59,7 +59,10 @@ class Judge:
             at fixed paces.
         """
         started, seed = time.perf_counter(), stand.seed + 1
-        finest = _within(stand, stand.finest(plan), seconds)
+        finest, work = _within(stand, stand.finest(plan), seconds)
+        if work > seconds:
+            # With a plan's own numbers; what they leave is stated with the judge.
+            finest, _ = _within(stand, plan, seconds)
         light = stand.trace(Trial("judge", "", stand.bench, finest), seed)
         expected = light.frames(stand.family.lighting, seed)
         frames, mc_error = stacked(expected)
@@ -110,12 +113,13 @@ class Judge:
         return NoiseTarget(self.stand.bench.rig, Exposure(), 1.0)(self.expected)
 
 
-def _within(stand: Stand, plan: Plan, seconds: float) -> Plan:
-    """The ``plan`` with the least noise whose light is predicted to take at most so many ``seconds``."""
+def _within(stand: Stand, plan: Plan, seconds: float) -> tuple[Plan, float]:
+    """The ``plan`` with the least noise whose light is predicted to take at most so many ``seconds``, or with the
+    noise of its accuracy, and what its light takes."""
     accuracy = plan.accuracy / _FINEST_OVER
     while True:
         # What its numbers leave is stated; sampling alone is given the time.
         choice = predicted(accuracy, stand.evidence, plan.settings, {})
         if choice.work <= seconds or accuracy > plan.accuracy:
-            return replace(plan, settings=choice.settings, sampling_target=choice.target)
+            return replace(plan, settings=choice.settings, sampling_target=choice.target), choice.work
         accuracy *= _STEP
