@@ -31,7 +31,7 @@ from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta, launches
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
 from mitsim.transport.repeats import Turns, by_pixel
-from mitsim.transport.sampling import panchromatic, stratified, streams
+from mitsim.transport.sampling import generator, panchromatic, stratified, streams
 
 
 class IndirectTracer(Tracer):
@@ -85,7 +85,8 @@ class IndirectTracer(Tracer):
     def board(self) -> float:
         """Irradiance [W m^-2] by a pixel's light from a white board at the rig's distance, to which light compares."""
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
-        flux = np.array(panchromatic(self.rays.flux(pixel, mi.Color0f())))
+        wavelengths, spectral = sampled_wavelengths(self.receiver.camera, generator(mi.UInt32(0), pixel))
+        flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.receiver.geometry.scene_distance**2)
 
     def trace_into(self, ledger: Ledger, seed: int, first: int, samples: int) -> Deposits:

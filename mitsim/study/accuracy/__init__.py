@@ -37,8 +37,6 @@ BUDGET_S = 100.0
 """Seconds of the whole study on a quiet machine: with starting, opening and figures below two minutes."""
 _JUDGE_PART, _FRONT_PART, _PARTS_PART = 0.12, 0.6, 0.6
 """Of what is left, what the judge, one whole run, and one look at all parts may take."""
-
-
 _SHORTEST_LOOK_S = 1.0
 """Shorter looks tell more of kernels than of the machine's pace."""
 
