@@ -11,6 +11,8 @@ import pytest
 
 from mitsim.core.framefile import read_frame
 from tests.system.conftest import ACCURACY
+from tests.unit.transport.test_indirect import MATT
+from tests.unit.transport.test_neighbours import WALL
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_spectral")
 
@@ -64,6 +66,20 @@ def test_capture_in_every_variant(
     assert outcome.payload["exposure_s"] == pytest.approx(lab.captured.payload["exposure_s"], rel=gate)
     truths = [read_frame(run / "truth.exr")[0]["reflectance"] for run in (tmp_path / "run", lab.run)]
     assert np.sqrt(np.mean((truths[0] - truths[1]) ** 2)) < gate
+
+
+def test_sampled_wavelengths_leave_indirect_light(
+    call: Callable[..., Any], shell: Callable[..., Any], shared_scene: Callable[..., Path], tmp_path: Path
+) -> None:
+    """A corner of two walls, where light is filed on the device: frames of both variants keep the accuracy."""
+    scene = shared_scene("spectral corner", extra=WALL.format(turn=90, x=-30, bsdf=MATT))
+    options = scene, "--patterns", "uniform", "--accuracy", 0.05, "--json", "-o"
+    assert call("capture", *options, tmp_path / "mono").code == 0
+    outcome = shell("capture", *options, tmp_path / "spectral", "--variant", "llvm_ad_spectral")
+    assert outcome.err == "" and outcome.code == 0
+    frames = [read_frame(tmp_path / name / "frame_00000.exr")[0]["electrons"] for name in ("spectral", "mono")]
+    ours, theirs = (frame.astype(float) / np.linalg.norm(frame.astype(float)) for frame in frames)
+    assert 0 < np.linalg.norm(ours - theirs) < 2 * 0.05
 
 
 def test_a_variant_that_is_not_on_this_machine(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
