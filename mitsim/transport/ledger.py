@@ -45,7 +45,8 @@ class Ledger:
     Attributes
     ----------
     sums
-        (rows * places + 1,) on the device, in units.
+        (places * rows + 1,) on the device, in units. A place's rows lie side by side: neighbouring pixels, which are of
+        different rows, bring light to one place at a time.
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
@@ -107,7 +108,7 @@ class Ledger:
         units = light * dr.opaque(mi.Float, 1 / self._unit)
         fits = (units >= 0) & (units < 2.0**_MOST_BITS)
         row = dr.gather(mi.UInt32, self._labels, pixel, active)
-        index = dr.select(fits, row * dr.opaque(mi.UInt32, self._width) + place, self._rows * self._width)
+        index = dr.select(fits, place * dr.opaque(mi.UInt32, self._rows) + row, self._rows * self._width)
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
@@ -126,13 +127,12 @@ class Ledger:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        places = np.flatnonzero(counted[:-1])
-        light = counted[places] * self._unit
-        starts = np.searchsorted(places, self._width * np.arange(self._rows + 1))
-        places -= np.repeat(self._width * np.arange(self._rows), np.diff(starts))
+        by_row = np.ascontiguousarray(counted[:-1].reshape(self._width, self._rows).T)
+        row, places = np.nonzero(by_row)
+        light = by_row[row, places] * self._unit
         inside = places < self._bundle.size
         outside = float(light[~inside].sum())
-        starts -= np.append(0, np.cumsum(~inside))[starts] if outside else 0
+        starts = np.append(0, np.cumsum(np.bincount(row[inside], minlength=self._rows)))
         shape = self._rows + 1, self._bundle.size
         entries = light[inside], places[inside].astype(np.int32), np.append(starts, starts[-1])
         return sparse.csr_array(entries, shape=shape), float(light.sum()), outside

@@ -25,6 +25,11 @@ def metal(alpha: float) -> str:
     return f'<bsdf type="roughconductor"><string name="material" value="none"/>{rough}</bsdf>'
 
 
+def varnish(alpha: float) -> str:
+    """A matt surface, a twentieth of whose light is metal's."""
+    return f'<bsdf type="blendbsdf"><float name="weight" value="0.95"/>{metal(alpha)}<bsdf type="diffuse"/></bsdf>'
+
+
 def plate(bsdf: str) -> str:
     """A plate of 60 mm that would mirror the projector into the sensor."""
     place = '<scale x="30" y="30"/><rotate y="1" angle="180"/><translate x="30" z="395"/>'
@@ -131,6 +136,33 @@ def test_a_highlight_that_few_rays_meet_is_looked_at_again(lit: Callable[..., tu
     assert (error < 0.1 * irradiance).all()
     whole, expected = irradiance + [each.rest for each in found], on_ball(5e-3, np.zeros(3))
     assert abs(whole.mean() - expected) < 5 * np.linalg.norm(error) / 4 < 0.15 * expected
+
+
+def test_the_width_of_a_lobe_is_not_that_of_its_share(lit: Callable[..., tuple[Bench, np.ndarray]]) -> None:
+    """A lobe that takes a twentieth of the light is as wide as one that takes all, and calls for as many anchors.
+
+    (Planted: the density of the turn by itself, which takes it for 4.5 times as wide.)"""
+    widths = []
+    for bsdf in (metal(3e-3), varnish(3e-3)):
+        bench, _ = lit(plate(bsdf))
+        parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, bench.geometry
+        widths.append(sharp_light(*parts, 5, 2**20 // N**2).width)
+    assert widths[1] == pytest.approx(widths[0], rel=0.1)
+
+
+def test_a_faint_highlight_that_few_turns_meet_is_found(lit: Callable[..., tuple[Bench, np.ndarray]]) -> None:
+    """Varnish on a ball sends one of 1e7 of the projector's rays to the sensor; connections meet its lobe.
+
+    Of a GGX lobe of alpha a that takes a twentieth, 1 - a sqrt(4 pi 10 / 0.05) is above 10 / sr, where it counts as
+    sharp. (Planted: no search by connections. All four looks find nothing.)
+    """
+    bench, _ = lit(ball(varnish(5e-3)))
+    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, bench.geometry
+    found = [sharp_light(*parts, seed, 2**22 // N**2) for seed in range(4)]
+    irradiance, error = (np.array([getattr(each, name) for each in found]) for name in ("irradiance", "error"))
+    expected = 0.05 * on_ball(5e-3, np.zeros(3)) * (1 - 5e-3 * np.sqrt(4 * np.pi * 10 / 0.05))
+    assert (irradiance > 0).all()
+    assert abs(irradiance.mean() - expected) < 5 * np.linalg.norm(error) / 4 < 0.8 * expected
 
 
 def test_aimed_rays_find_sharp_lobes_faster(lit: Callable[[str], tuple[Bench, np.ndarray]]) -> None:
