@@ -90,16 +90,35 @@ class Tray:
         the camera.
     spectrum
         light whose diffraction is simulated; None: the mask's shadow is geometric.
+    places
+        pixels along both axes of the sensor whose frames are formed; None: all.
     """
 
-    def __init__(self, bundle: Bundle, geometry: CameraGeometry, spectrum: Spectrum | None) -> None:
-        self.bundle, self._geometry, self._spectrum = bundle, geometry, spectrum
+    def __init__(
+        self,
+        bundle: Bundle,
+        geometry: CameraGeometry,
+        spectrum: Spectrum | None,
+        places: tuple[int, ...] | None = None,
+    ) -> None:
+        self.bundle, self._geometry, self._spectrum, self._places = bundle, geometry, spectrum, places
+
+    @property
+    def key(self) -> tuple[Bundle, CameraGeometry, Spectrum | None, tuple[int, ...] | None]:
+        """Equal for trays that form the same light alike."""
+        return self.bundle, self._geometry, self._spectrum, self._places
+
+    @property
+    def of_mean(self) -> Tray:
+        """The same cells for what the sensor sees on average: with one anchor."""
+        return Tray(replace(self.bundle, anchors=1), *self.key[1:])
 
     @cached_property
     def optics(self) -> FrameOptics:
         """From light in these cells to frames."""
         bundle = self.bundle
-        return FrameOptics(self._geometry, bundle.rows, bundle.columns, bundle.depths, bundle.anchors, self._spectrum)
+        parts = bundle.rows, bundle.columns, bundle.depths, bundle.anchors
+        return FrameOptics(self._geometry, *parts, self._spectrum, self._places)
 
     def file(self, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
         """(classes + 1, places) light per sample.
@@ -128,6 +147,8 @@ class Trays:
     one_line
         whether diffraction is that of the light's mean wavelength alone: for what hardly hangs on it, in a third of the
         time.
+    places
+        pixels along both axes of the sensor whose frames are formed; None: all.
 
     Attributes
     ----------
@@ -138,8 +159,15 @@ class Trays:
         cells of ``fine`` and of ``followed``.
     """
 
-    def __init__(self, bench: Bench, settings: Settings, pixels: int | None = None, one_line: bool = False) -> None:
-        self.bench, self.settings = bench, settings
+    def __init__(
+        self,
+        bench: Bench,
+        settings: Settings,
+        pixels: int | None = None,
+        one_line: bool = False,
+        places: tuple[int, ...] | None = None,
+    ) -> None:
+        self.bench, self.settings, self.places = bench, settings, places
         self.physics = Physics.simulated(bench, settings.effects)
         if one_line and self.physics.spectrum:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
@@ -164,7 +192,7 @@ class Trays:
     def _tray(self, bundle: Bundle, light: Spectrum | None = None) -> Tray:
         """``light`` None: the projector's. All light diffracts or none."""
         spectrum = self.physics.spectrum
-        return Tray(bundle, self.physics.geometry, (light or spectrum) if spectrum else None)
+        return Tray(bundle, self.physics.geometry, (light or spectrum) if spectrum else None, self.places)
 
     @property
     def reach(self) -> float:
@@ -195,9 +223,9 @@ class Trays:
     @cached_property
     def sharp_weights(self) -> FloatArray:
         """(anchors,) weight of each of the sharp pixels' anchors in the mean over the sensor."""
-        return self._mean_weights(self.sharp.bundle.anchors)
+        return self.mean_weights(self.sharp.bundle.anchors)
 
-    def _mean_weights(self, anchors: int) -> FloatArray:
+    def mean_weights(self, anchors: int) -> FloatArray:
         """(anchors,) weight of each anchor in the mean over the sensor."""
         edges = self.physics.geometry.pixel_edges
         positions = anchor_positions(anchors, self.physics.geometry.half_width)
@@ -249,7 +277,7 @@ class Trays:
 
     def _less_mean(self, bundle: Bundle, light: sparse.csr_array) -> sparse.csr_array:
         """``light`` that was filed by a ``bundle``, beyond its mean over the sensor."""
-        return light - bundle.repeated(bundle.averaged(light, self._mean_weights(bundle.anchors)))
+        return light - bundle.repeated(bundle.averaged(light, self.mean_weights(bundle.anchors)))
 
     def file_followed(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`indirect` or :attr:`from_camera`, per sample.

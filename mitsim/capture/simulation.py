@@ -8,14 +8,15 @@ samples the choice that the plan made.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.capture.effects import Physics
 from mitsim.capture.filing import FiledLight, Trays
-from mitsim.core.arrays import Labels
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.aimed import AimedTracer
@@ -201,7 +202,10 @@ class Simulation(Trays):
         """
         if not self.physics.mirrors:
             return None
-        return self.bench.glint.frames(labels, self.physics.geometry, self.physics.spectrum)
+        found = self.bench.glint.frames(labels, self.physics.geometry, self.physics.spectrum)
+        if found is None or self.places is None:
+            return found
+        return replace(found, irradiance=found.irradiance[(slice(None), *np.ix_(self.places, self.places))])
 
     def expected(
         self, groups: Sequence[FiledLight], rows: Labels, lighting: Lighting, seed: int, leaking: bool = True
@@ -241,10 +245,22 @@ def expected_of(
     rows, lighting, seed, leaking
         as for :meth:`Simulation.expected`.
     """
-    physics = parts[0][0].physics
-    black = physics.black_level if leaking else 0.0
-    emitted = black + (1 - black) * lighting.weights
+    light = emitted(parts[0][0].physics, lighting, leaking)
     filed = [simulation.filed(groups, len(rows)) for simulation, groups in parts]
     lights, ambient = ([each for part in filed for each in part[kind]] for kind in (0, 1))
     glint = parts[-1][0].glint_frames(lighting.labels)
-    return ExpectedFrames(lights, Lighting(rows, emitted), seed, ambient, glint)
+    return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint)
+
+
+def emitted(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:
+    """(shots, classes) light of each class of pixels in each shot, as a part of its full power.
+
+    Parameters
+    ----------
+    physics
+        of the projector.
+    lighting, leaking
+        as for :meth:`Simulation.expected`.
+    """
+    black = physics.black_level if leaking else 0.0
+    return np.asarray(black + (1 - black) * lighting.weights)

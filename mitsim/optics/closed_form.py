@@ -58,14 +58,14 @@ class _Block:
             return np.matmul(np.concatenate(lefts).T, np.concatenate([mean @ right for right in rights]), out=out)
         return np.matmul(np.concatenate([mean.T @ left for left in lefts]).T, np.concatenate(rights), out=out)
 
-    def probe(self, vectors: FloatArray) -> FloatArray:
-        """(pixels, estimates * probes) products of each estimate's frame with ``vectors`` (pixels, probes)."""
+    def probe(self, vectors: FloatArray | None) -> FloatArray:
+        """(pixels, estimates * probes) products of each estimate's frame with ``vectors`` (pixels, probes); without
+        them the frames themselves, side by side."""
         count, rows, columns = self.lights.shape
-        flat = self.lights.reshape(count * rows, columns)
-        total = np.zeros((len(vectors), count * vectors.shape[1]))
+        flat, total = self.lights.reshape(count * rows, columns), np.zeros(())
         for left, right in self.factors:
-            seen = (flat @ (right @ vectors)).reshape(count, rows, -1)
-            total += left.T @ np.moveaxis(seen, 0, 1).reshape(rows, -1)
+            seen = (flat @ (right if vectors is None else right @ vectors)).reshape(count, rows, -1)
+            total = total + left.T @ np.moveaxis(seen, 0, 1).reshape(rows, -1)
         return total
 
 
@@ -84,6 +84,8 @@ class FrameOptics:
         points a side of the sensor from which light is seen.
     spectrum
         lines of a wave-optical shadow; None: geometric.
+    places
+        (m,) pixels along both axes, increasing, of which the sensor then consists; None: all.
     """
 
     def __init__(
@@ -94,10 +96,12 @@ class FrameOptics:
         depths: Sequence[float],
         anchors: int,
         spectrum: Spectrum | None = None,
+        places: tuple[int, ...] | None = None,
     ) -> None:
-        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), geometry.pixel_centres)
+        centres = geometry.pixel_centres if places is None else geometry.pixel_centres[np.asarray(places)]
+        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), centres)
         self.anchors = anchors
-        self.pixels = geometry.pixels
+        self.pixels = len(centres)
         self.cells = (len(rows.centres), len(columns.centres))
         self.shape = (anchors * self.cells[0], anchors * self.cells[1])
         # Stored with the light's index first, so that picking lit rows copies contiguous memory.
@@ -105,7 +109,7 @@ class FrameOptics:
         self._layers = [
             [
                 (stack(left, weights), stack(right, weights))
-                for left, right in _shadow(geometry, rows, columns, depth, spectrum)
+                for left, right in _shadow(geometry, rows, columns, depth, spectrum, places)
             ]
             for depth in depths
         ]
@@ -114,12 +118,12 @@ class FrameOptics:
         """(pixels, pixels) irradiance of ``light`` [W m^-2] at distinct indices ``flat`` into (layers, *shape)."""
         return self.seen([(flat, light)], None)[0]
 
-    def probe(self, estimates: Sequence[Entries], vectors: FloatArray) -> FloatArray:
+    def probe(self, estimates: Sequence[Entries], vectors: FloatArray | None = None) -> FloatArray:
         """Frames of several ``estimates`` times ``vectors`` (pixels, probes): (pixels, estimates * probes).
 
-        The frames, which would cost far more, are never formed.
+        The frames, which would cost far more, are never formed; but without ``vectors`` they are, side by side.
         """
-        total = np.zeros((self.pixels, len(estimates) * vectors.shape[1]))
+        total = np.zeros((self.pixels, len(estimates) * (self.pixels if vectors is None else vectors.shape[1])))
         for block in self._blocks(estimates):
             total += block.probe(vectors)
         return total

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
 from mitsim.optics.diffraction import wave_terms
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.rig.camera import CameraGeometry
@@ -9,7 +14,12 @@ from mitsim.rig.projector import Spectrum
 
 
 def shadow_terms(
-    geometry: CameraGeometry, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None = None
+    geometry: CameraGeometry,
+    rows: Directions,
+    columns: Directions,
+    depth: float,
+    spectrum: Spectrum | None = None,
+    places: Sequence[int] | None = None,
 ) -> SeparableTerms:
     """Shadow on each pixel of directions at one depth, as separable terms: [(left (m, r), right (m, c)), ...].
 
@@ -26,8 +36,12 @@ def shadow_terms(
         where they end [mm].
     spectrum
         wave-optical with one: each wavelength has terms of its own, weighted by its share. None: geometric.
+    places
+        (m,) pixels along an axis, increasing; None: all.
     """
     shadow = ShadowGeometry.of(geometry, depth)
+    if places is not None:
+        shadow = replace(shadow, pixel_centres_mm=shadow.pixel_centres_mm[np.asarray(places)])
     terms = geometric_terms(shadow, rows, columns) if spectrum is None else wave_terms(shadow, rows, columns, spectrum)
     if geometry.pixel_fill_factor == 1:
         return terms

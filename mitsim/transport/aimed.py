@@ -103,7 +103,7 @@ class AimedTracer(DirectTracer):
         """Connections of one sample: all near pairs of pixel and anchor, and one of a few others."""
         return len(self._near) - (-len(self.far) // _SELDOM)
 
-    def _pair(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+    def _pair(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         near, far = (dr.opaque(mi.UInt32, len(pairs)) for pairs in (self._near, self.far))
         _, rng = streams(seed, lane, sample)
         one_of = (lane - near) * _SELDOM + dr.minimum(mi.UInt32(rng.next_float32() * _SELDOM), _SELDOM - 1)

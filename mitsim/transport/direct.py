@@ -61,11 +61,11 @@ class DirectTracer(Tracer):
         """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
 
-    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         return [Deposits.fetched(*self._sightings(seed, sample, lane))]
 
     def _sightings(
-        self, seed: int, sample: mi.UInt32, lane: mi.UInt32
+        self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32
     ) -> tuple[Sightings, int, tuple[mi.UInt32, mi.UInt32]]:
         """Light of each lane, its kind, and its anchor."""
         number, anchor, share = self._pair(seed, sample, lane)
@@ -119,7 +119,7 @@ class DirectTracer(Tracer):
         reception = self.receiver.receive(si, -direction, sensor, active)
         return reception, panchromatic(reception.irradiance * light)
 
-    def _pair(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+    def _pair(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """A lane's place in the list of pixels, its anchor, and its weight."""
         del seed, sample
         count = dr.opaque(mi.UInt32, len(self._pixels))

@@ -93,7 +93,7 @@ class FromCameraTracer(Tracer):
         """Paths in one sample: one per cell and anchor."""
         return self.grid.shape[0] * self.grid.shape[1] * self.points.count
 
-    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         further = self.paths.mirrors or self.paths.interreflection or self.passage.open
         return CameraWalk(self, seed, sample, lane).deposits(further)
 
@@ -106,7 +106,7 @@ class CameraWalk(Walk):
         *("straight", "since", "behind_glass", "rng", "inverse_depth", "came_from", "came_pdf", "kept"),
     )
 
-    def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
+    def __init__(self, tracer: FromCameraTracer, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> None:
         """Paths before their first surface.
 
         Parameters

@@ -76,6 +76,8 @@ class Deposits:
         (m,) irradiance [W m^-2].
     kind
         (m,) :data:`DIRECT` or :data:`INDIRECT` light of the projector, or :data:`AMBIENT` light.
+    lane
+        (m,) number of each path in its launch, increasing; None where that is not known.
     """
 
     pixel: IntArray
@@ -86,12 +88,13 @@ class Deposits:
     inverse_depth: FloatArray
     value: FloatArray
     kind: npt.NDArray[np.int16]
+    lane: IntArray | None = None
 
     @classmethod
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
         """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS))
 
     @classmethod
     def fetched(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> Deposits:
@@ -130,6 +133,7 @@ class Deposits:
             inverse_depth=lit_ones(seen.inverse_depth, np.float64),
             value=lit_ones(light, np.float64),
             kind=np.full(lit.size, kind, dtype=np.int16),
+            lane=lit,
         )
 
     @classmethod
@@ -146,7 +150,17 @@ class Deposits:
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> Deposits:
         """The entries that are ``chosen`` (m,)."""
-        return Deposits(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        return Deposits(*(getattr(self, name)[chosen] for name in _ARRAYS))
+
+    def of_lanes(self, first: int, last: int) -> Deposits:
+        """The entries of lanes ``first`` .. ``last`` - 1."""
+        assert self.lane is not None, "known of what one launch brought"
+        inside = slice(*np.searchsorted(self.lane, (first, last)))
+        return Deposits(*(getattr(self, name)[inside] for name in _ARRAYS))
+
+
+_ARRAYS = tuple(name for name in Deposits.__dataclass_fields__ if name != "lane")
+"""What is told of each entry."""
 
 
 @dataclass(frozen=True)
@@ -207,13 +221,31 @@ class Bundle:
         samples
             that the light is divided by.
         """
+        flat, values, pixel = self.entries(deposits, samples)
+        count = int(labels.max()) + 1
+        shape = (count + 1, self.size)
+        index = _index_type(*shape)
+        row = np.append(labels, count)[pixel]
+        light = sparse.coo_array((values, (row.astype(index), flat.astype(index))), shape=shape)
+        # By way of columns, for two passes of counting take half the time of sorting; but a count takes a word a place.
+        light = light.tocsc().tocsr() if self.size < _COUNTED else light.tocsr()
+        light.sum_duplicates()
+        light.eliminate_zeros()
+        return light
+
+    def entries(self, deposits: Deposits, samples: int = 1) -> tuple[IntArray, FloatArray, IntArray]:
+        """(e,) place, light and projector pixel of all that is filed, in no order and not summed.
+
+        Parameters
+        ----------
+        deposits, samples
+            as for :meth:`file`.
+        """
         inside = self._inside(deposits)
         if not inside.all():
             deposits = deposits.where(inside)
         width = self.anchors * self.cells[1]
         plane = self.anchors * self.cells[0] * width
-        count = int(labels.max()) + 1
-        row = np.append(labels, count)[deposits.pixel]
         parts = [
             (layer * plane + (first + line) * width + second + place, share * line_share * place_share)
             for first, second in [(deposits.anchor_row * self.cells[0], deposits.anchor_column * self.cells[1])]
@@ -222,16 +254,7 @@ class Bundle:
             for layer, share in self._layers(deposits.inverse_depth)
         ]
         values = np.concatenate([deposits.value * (share / samples) for _, share in parts])
-        flat = np.concatenate([place for place, _ in parts])
-        shape = (count + 1, self.size)
-        index = _index_type(*shape)
-        entries = values, (np.tile(row, len(parts)).astype(index), flat.astype(index))
-        light = sparse.coo_array(entries, shape=shape)
-        # By way of columns, for two passes of counting take half the time of sorting; but a count takes a word a place.
-        light = light.tocsc().tocsr() if self.size < _COUNTED else light.tocsr()
-        light.sum_duplicates()
-        light.eliminate_zeros()
-        return light
+        return np.concatenate([place for place, _ in parts]), values, np.tile(deposits.pixel, len(parts))
 
     def outside(self, deposits: Deposits) -> float:
         """Light of ``deposits`` from beyond all cells, which is not filed [W m^-2]."""

@@ -103,10 +103,10 @@ class IndirectTracer(Tracer):
         launched = [self._walk(seed, *launch).file(ledger) for launch in lanes]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
-    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         return self._walk(seed, sample, lane).deposits(further=True)
 
-    def _walk(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> IndirectWalk:
+    def _walk(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> IndirectWalk:
         return IndirectWalk(self, seed, sample, lane)
 
 
@@ -115,7 +115,7 @@ class IndirectWalk(Walk):
 
     STATE = ("active", "ray", "strength", "bounce", "scattered", "straight", "rng", "kept")
 
-    def __init__(self, tracer: IndirectTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
+    def __init__(self, tracer: IndirectTracer, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> None:
         """Paths before their first surface.
 
         Parameters
@@ -146,7 +146,7 @@ class IndirectWalk(Walk):
         self.anchor, self.sample = (row, column), sample
         return weight
 
-    def _begin(self, seed: int) -> None:
+    def _begin(self, seed: int | mi.UInt32) -> None:
         """Random numbers of each path, and the points that its first turn is drawn by."""
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, self.rng = streams(seed, self.pixel, self.sample)

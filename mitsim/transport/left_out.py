@@ -118,7 +118,7 @@ class _LeftOutTracer(FromCameraTracer):
     """Light that a lens would bring, filed under shapes: that which no connection finds as indirect light, that over a
     mirror and a lobe as direct light, with what a connection brings in the row's stead."""
 
-    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         return _LeftOutWalk(self, seed, sample, lane).deposits(further=True)
 
 

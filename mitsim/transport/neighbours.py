@@ -36,7 +36,7 @@ from mitsim.transport.ledger import Ledger
 from mitsim.transport.paths import KINDS, camera_part
 from mitsim.transport.receiver import Way
 from mitsim.transport.repeats import MEMBERS, SIDE, blocks_of
-from mitsim.transport.sampling import generator, panchromatic, stratified
+from mitsim.transport.sampling import generator, panchromatic, seed_of, stratified
 
 if TYPE_CHECKING:
     Store = Callable[[mi.UInt32, mi.UInt32, list[mi.Float], mi.Bool], None]
@@ -67,6 +67,10 @@ class NeighbourTracer(IndirectTracer):
     def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same, as :meth:`IndirectTracer.repeating`; ``repeats`` (blocks^2,)."""
         return self._taking(np.asarray(repeats, dtype=np.int64))
+
+    def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
+        """Light of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
+        return [self.trace(seed, 0, samples) for seed in seeds]
 
     def shares(self) -> bool:
         """Whether what is to be followed can be shared: as the module says."""
@@ -113,8 +117,8 @@ class _Block(IndirectWalk):
         self.anchor = dr.zeros(mi.UInt32, dr.width(lane)), dr.zeros(mi.UInt32, dr.width(lane))
         return dr.select(inside, mi.Float(weight), 0)
 
-    def _begin(self, seed: int) -> None:
-        shared, sample = dr.opaque(mi.UInt32, seed), self.sample
+    def _begin(self, seed: int | mi.UInt32) -> None:
+        shared, sample = seed_of(seed), self.sample
         self.rng = generator(shared ^ (sample * 0x9E3779B9 + 1), self.pixel)
         place = (self.member + sample * _STEP + sample // _TURN) % MEMBERS
         self.first_turn = stratified(sample * MEMBERS + place, generator(shared, self.block))

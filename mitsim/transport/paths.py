@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -17,6 +17,9 @@ KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMB
 """Kinds of light by their names in a walk."""
 LANES_PER_LAUNCH = 2**22
 """Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
+_TOGETHER, _ALL = 4, 2**30
+"""Seeds whose paths one kernel follows at most, and samples of one seed beyond any that are asked for; the first times
+the second fits 32 bits."""
 _SHARP = 1.0
 """Density [1/sr] of sampling a turn above which its light is looked for from the camera.
 
@@ -56,6 +59,18 @@ def launches(
         yield mi.UInt32(index // per_sample), mi.UInt32(index % per_sample)
 
 
+def _seeds(few: Sequence[int], samples: int, sample: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """Seed of each path, and the number of its sample, where ``samples`` of each of a ``few`` seeds follow each other.
+
+    No division, and one kernel for one seed and for several.
+    """
+    count, look = dr.opaque(mi.UInt32, samples), mi.UInt32(0)
+    for before in range(1, _TOGETHER):
+        look += dr.select(sample >= before * count, mi.UInt32(1), 0)
+    seeds = mi.UInt32([*few, *[0] * (_TOGETHER - len(few))])
+    return dr.gather(mi.UInt32, seeds, look), sample - look * count
+
+
 def camera_part(pdf: mi.Float) -> mi.Float:
     """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
 
@@ -89,8 +104,8 @@ class Tracer(ABC):
         """Paths, or connections, of one sample."""
 
     @abstractmethod
-    def _launch(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        """Light of the paths of one kernel."""
+    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        """Light of the paths of one kernel, a ``seed`` for each."""
 
     def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
         """Light of some samples, their sum.
@@ -108,8 +123,22 @@ class Tracer(ABC):
             when the scene sends NaN or infinite light to the camera.
         """
         lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
-        launched = [self._launch(seed, *launch) for launch in lanes]
+        launched = [self._launch(_seeds([seed], _ALL, sample)[0], sample, lane) for sample, lane in lanes]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
+
+    def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
+        """The same as :meth:`trace` finds for each of some ``seeds``, in as few kernels as may be."""
+        each, found = self.lanes * samples, list[Deposits]()
+        together = min(self.lanes_per_launch // each, _TOGETHER)
+        if together < 2:
+            return [self.trace(seed, 0, samples) for seed in seeds]
+        for start in range(0, len(seeds), together):
+            few = seeds[start : start + together]
+            ((sample, lane),) = launches(self.lanes, 0, samples * len(few), self.lanes_per_launch)
+            parts = self._launch(*_seeds(few, samples, sample), lane)
+            for look in range(len(few)):
+                found.append(Deposits.joined([part.of_lanes(look * each, (look + 1) * each) for part in parts]))
+        return found
 
 
 class Walk(ABC):

@@ -21,18 +21,24 @@ def generator(seed: mi.UInt32, stream: mi.UInt32) -> mi.PCG32:
     return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 
 
-def streams(seed: int, stream: mi.UInt32, sample: mi.UInt32) -> tuple[mi.PCG32, mi.PCG32]:
+def streams(seed: int | mi.UInt32, stream: mi.UInt32, sample: mi.UInt32) -> tuple[mi.PCG32, mi.PCG32]:
     """Two generators for one sample of a stream.
 
     Parameters
     ----------
     seed, stream
-        of the one that all the stream's samples share, which :func:`stratified` scrambles them by.
+        of the one that all the stream's samples share, which :func:`stratified` scrambles them by; one seed, or one for
+        each lane.
     sample
         number of the sample, which has the other for its own.
     """
-    shared = dr.opaque(mi.UInt32, seed)
+    shared = seed_of(seed)
     return generator(shared, stream), generator(shared ^ (sample * 0x9E3779B9 + 1), stream)
+
+
+def seed_of(seed: int | mi.UInt32) -> mi.UInt32:
+    """One ``seed``, the same kernel for any, or one for each lane."""
+    return dr.opaque(mi.UInt32, seed) if isinstance(seed, int) else seed
 
 
 def stratified(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:

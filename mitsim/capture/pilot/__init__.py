@@ -132,6 +132,7 @@ class Look:
         """Repeat a ``stage`` with so many more samples that its standard errors are halved."""
         self.samples[stage] = self._finer(stage)
         self._measure(stage)
+        vars(self).pop("evidence", None)
 
     def price(self, stage: str) -> float:
         """Work of repeating a ``stage``, in seconds at fixed paces; infinite where it has all the samples it may."""
@@ -173,8 +174,7 @@ class Look:
     @property
     def _rough(self) -> bool:
         """Whether a few anchors may leave too much: light that is hidden from part of the sensor, or sharp gloss."""
-        seen = {part: change for part, change in self.anchored.changes.items() if part.name == "anchors"}
-        few = Changes.between(seen, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
+        few = Changes.between(self.anchored.few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
         return few.bound > _ROUGH * self.accuracy
 
     def _finer(self, stage: str) -> Sample:
@@ -214,7 +214,7 @@ class Look:
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
-    @property
+    @cached_property
     def evidence(self) -> Evidence:
         """What has been found."""
         fine, switched, anchored = self.fine, self.switched, self.anchored

@@ -13,9 +13,9 @@ from scipy import sparse
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Effort, Forming, Noise, Part, Settings
-from mitsim.capture.filing import FiledLight, Tray
-from mitsim.capture.pilot.looks import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, ladder, noise, norm
-from mitsim.capture.simulation import Simulation
+from mitsim.capture.filing import Tray
+from mitsim.capture.pilot.looks import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, known, ladder, noise, norm
+from mitsim.capture.simulation import Simulation, emitted
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer
@@ -64,9 +64,9 @@ class FineLight:
     def __init__(self, bench: Bench, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self._seeds = [integer(seed, "pilot", "fine", look) for look in range(LOOKS)]
-        self._tracer = _tracer(Simulation(bench, base), _shown(base, sample), base.anchors)
+        self._simulation = simulation = sample.simulation(bench, base)
+        self._tracer = _tracer(simulation, _shown(base, sample), base.anchors)
         self._deposits = [self._tracer.trace(seed, 0, sample.fine) for seed in self._seeds]
-        simulation = Simulation(bench, base)
         apart, samples = simulation.apart, sample.sharp(simulation)
         self._sharp = [apart.trace(seed, 0, samples) for seed in self._seeds] if apart else []
 
@@ -129,7 +129,7 @@ class FineLight:
     @cached_property
     def _whole(self) -> FloatArray:
         """(looks, ...) frames of the light in the cells and layers of the base."""
-        return self._formed(Simulation(self.bench, self.base), self._deposits, self.sample.fine)
+        return self._formed(self._simulation, self._deposits, self.sample.fine)
 
     @cached_property
     def _noise(self) -> tuple[float, float]:
@@ -137,21 +137,21 @@ class FineLight:
 
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
-        tracer = _tracer(Simulation(self.bench, self.base), _shown(self.base, self.sample), 1, spread=True)
+        tracer = _tracer(self._simulation, _shown(self.base, self.sample), 1, spread=True)
         seen = [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds]
-        return self._noise_of(tracer, self._formed(Simulation(self.bench, self.base), seen, self.sample.fine))
+        return self._noise_of(tracer, self._formed(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
         """Error of a look of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
         few = [tracer.trace(seed, 0, self._fewer) for seed in self._seeds]
-        return noise(many), noise(self._formed(Simulation(self.bench, self.base), few, self._fewer))
+        return noise(many), noise(self._formed(self._simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
         """What forming frames of a ``family`` takes; timed with one cell a pixel, its optics prepared."""
         simulation = Simulation(self.bench, self.base)
         rows, weights = self.sample.rows, self.sample.lighting.weights
-        light = simulation.file_direct(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
-        filed = Filed(simulation.fine.optics, (light.fine[: len(rows)],) * GROUPS)
+        light = simulation.fine.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        filed = Filed(simulation.fine.optics, (light[: len(rows)],) * GROUPS)
         started = time.perf_counter()
         list(ExpectedFrames([filed], Lighting(rows, weights), 0))
         seconds = (time.perf_counter() - started) / len(weights)
@@ -168,27 +168,24 @@ class FineLight:
             product=_product_seconds(),
         )
 
-    def _lit(self, simulation: Simulation, light: FiledLight) -> float:
+    def _lit(self, simulation: Simulation, light: sparse.csr_array) -> float:
         """Rows of cells that hold light in a shot, their mean."""
-        shots = (self.sample.lighting.weights @ (light.fine[: len(self.sample.rows)] != 0)) != 0
+        shots = (self.sample.lighting.weights @ (light[: len(self.sample.rows)] != 0)) != 0
         width = simulation.fine.bundle.cells[1]
         places = [np.flatnonzero(shot) if isinstance(shot, np.ndarray) else shot.indices for shot in shots]
         return max(1.0, float(np.mean([len(np.unique(place // width)) for place in places])))
 
     def _frames(self, layers: tuple[float, ...], subdivision: int) -> FloatArray:
-        simulation = Simulation(self.bench, replace(self.base, layers=layers, subdivision=subdivision))
+        settings = replace(self.base, layers=layers, subdivision=subdivision)
+        simulation = self.sample.simulation(self.bench, settings)
         return self._formed(simulation, self._deposits, self.sample.fine, self._sharp)
 
     def _formed(
         self, simulation: Simulation, deposits: list[Deposits], samples: int, sharp: Sequence[Deposits] = ()
     ) -> FloatArray:
-        labels = self.sample.lighting.labels
-        lights = [simulation.file_direct(look, labels, samples) for look in deposits]
-        if sharp:
-            few = self.sample.sharp(simulation)
-            apart = [simulation.file_sharp(look, labels, few) for look in sharp]
-            lights = [light + more for light, more in zip(lights, apart, strict=True)]
-        return self.sample.frames(simulation, lights)
+        sample, light = self.sample, emitted(simulation.physics, self.sample.lighting)
+        frames = sample.frames(simulation.fine, deposits, samples, light)
+        return frames + sample.frames(simulation.sharp, sharp, sample.sharp(simulation), light) if sharp else frames
 
 
 def _product_seconds() -> float:
@@ -247,9 +244,17 @@ class AnchoredLight:
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], self.tolerance)
         coarse = coarsened(self._name, self._beyond, self.layers)
-        return {**{Part(self._part, count): change for count, change in found.items()}, **coarse}
+        return {**self._until(self.tolerance), **coarse}
+
+    @property
+    def few(self) -> dict[Part, FloatArray]:
+        """Change of the frames by the numbers of anchors that are always tried, as far as they tell."""
+        return self._until(math.inf)
+
+    def _until(self, tolerance: float) -> dict[Part, FloatArray]:
+        found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], tolerance)
+        return {Part(self._part, count): change for count, change in found.items()}
 
     def effort(self, light: float) -> Effort:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
@@ -264,31 +269,32 @@ class AnchoredLight:
     def _noise(self) -> float:
         return noise(self._beyond(1, ()))
 
+    @known
     def _beyond(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
         """Frames of what a few anchors see beyond their mean, in coarse cells and layers."""
         coarse = replace(self.base, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        simulation, labels = self._simulation(self._few_anchors, coarse), self.sample.lighting.labels
-        return self._formed(simulation, [self._filed(simulation, look, labels) for look in self._few])
+        simulation = self._simulation(self._few_anchors, coarse)
+        tray, weights = self._tray(simulation), simulation.mean_weights(self._few_anchors)
+        mean = [look.averaged(weights) for look in self._few]
+        frames = self._frames(self._few_anchors) if coarse == self.base else self._formed(tray, self._few)
+        return frames - self._formed(tray.of_mean, mean)
 
     @cached_property
     def _few(self) -> list[Deposits]:
         return self._traced(self._simulation(self._few_anchors, self.base))
 
+    @known
     def _frames(self, anchors: int) -> FloatArray:
-        simulation, labels = self._simulation(anchors, self.base), self.sample.lighting.labels
-        traced, tray = self._traced(simulation), self._tray(simulation)
-        return self._formed(simulation, [tray.file(look, labels, self._samples) for look in traced])
+        simulation = self._simulation(anchors, self.base)
+        traced = self._few if anchors == self._few_anchors else self._traced(simulation)
+        return self._formed(self._tray(simulation), traced)
 
     def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        return Simulation(self.bench, replace(settings, anchors=anchors), one_line=True)
+        return self.sample.simulation(self.bench, replace(settings, anchors=anchors), one_line=True)
 
     def _tray(self, simulation: Simulation) -> Tray:
         """Where light of these pixels is filed."""
         return simulation.coarse
-
-    def _filed(self, simulation: Simulation, look: Deposits, labels: Labels) -> sparse.csr_array:
-        """Light of a ``look`` beyond its mean over the sensor."""
-        return simulation.file_anchored(look, labels, self._samples).coarse
 
     def _traced(self, simulation: Simulation) -> list[Deposits]:
         """Light to every anchor, look by look."""
@@ -296,11 +302,9 @@ class AnchoredLight:
         tracer = _tracer(simulation, self.pixels, anchors)
         return [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
 
-    def _formed(self, simulation: Simulation, lights: list[sparse.csr_array]) -> FloatArray:
-        """(looks, shots, pixels, columns) frames of light to every anchor."""
-        rows = self.sample.rows
-        filed = Filed(self._tray(simulation).optics, tuple(light[: len(rows)] for light in lights))
-        return ExpectedFrames([filed], Lighting(rows, self.sample.lighting.weights), 0).by_group(self.sample.columns)
+    def _formed(self, tray: Tray, looks: list[Deposits]) -> FloatArray:
+        """(looks, shots, places, places) frames of light in a ``tray``."""
+        return self.sample.frames(tray, looks, self._samples)
 
 
 class OccludedLight(AnchoredLight):
@@ -318,13 +322,10 @@ class OccludedLight(AnchoredLight):
         return len(self.base.occluded)
 
     def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        return Simulation(self.bench, replace(settings, occluded_anchors=anchors), one_line=True)
+        return self.sample.simulation(self.bench, replace(settings, occluded_anchors=anchors), one_line=True)
 
     def _tray(self, simulation: Simulation) -> Tray:
         return simulation.occluded
-
-    def _filed(self, simulation: Simulation, look: Deposits, labels: Labels) -> sparse.csr_array:
-        return simulation.file_occluded(look, labels, self._samples).occluded
 
 
 def _shown(settings: Settings, sample: Sample) -> Labels:

@@ -6,16 +6,15 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
-from scipy import sparse
+import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
-from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, ladder, noise, norm
+from mitsim.capture.filing import Tray
+from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, known, ladder, noise, norm
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames, Filed
-from mitsim.rig.patterns import Lighting
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Tracer
 
@@ -91,12 +90,15 @@ class FollowedLight:
         wide = {width: layered + missing - self._beyond_mean(followed_width=width) for width in WIDTHS[1:]}
         return {Part("followed_width", width): change for width, change in {1: missing, **wide}.items()}
 
+    @known
     def _beyond_mean(self, **cells: Any) -> FloatArray:
         """Frames of what a few anchors see beyond their mean, in such ``cells``."""
         simulation = self._simulation(followed_anchors=_FEW_ANCHORS, **cells)
-        labels, samples = self.sample.lighting.labels, self.sample.followed
-        filed = [simulation.file_at_anchors(look, labels, samples).followed for look in self._few]
-        return self._formed(simulation, filed)
+        weights = simulation.mean_weights(_FEW_ANCHORS)
+        mean = [look.averaged(weights) for look in self._few]
+        trays = simulation.followed, simulation.followed_ambient
+        frames = self._formed(trays, self._few) if cells else self._frames(_FEW_ANCHORS)
+        return frames - self._formed((trays[0].of_mean, trays[1].of_mean), mean)
 
     @cached_property
     def _few(self) -> list[Deposits]:
@@ -104,29 +106,30 @@ class FollowedLight:
         tracers, samples = self._tracers(self._simulation(followed_anchors=_FEW_ANCHORS)), self.sample.followed
         return [Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers]) for seed in self._seeds]
 
+    @known
     def _frames(self, anchors: int) -> FloatArray:
         simulation, samples = self._simulation(followed_anchors=anchors), self.sample.followed
         tracers = self._tracers(simulation)
         each = max(1, _AT_ONCE // sum(tracer.lanes for tracer in tracers))
         parts = [(first, min(each, samples - first)) for first in range(0, samples, each)]
 
-        def filed(seed: int) -> sparse.csr_array:
-            traced = (tracer.trace(seed, *part) for part in parts for tracer in tracers)
-            return sum(simulation.followed.file(some, self.sample.lighting.labels, samples) for some in traced)
-
-        return self._formed(simulation, [filed(seed) for seed in self._seeds])
+        trays = simulation.followed, simulation.followed_ambient
+        if anchors == _FEW_ANCHORS:
+            return self._formed(trays, self._few)
+        found = []
+        for part in parts:
+            traced = [[tracer.trace(seed, *part) for tracer in tracers] for seed in self._seeds]
+            found.append(self._formed(trays, [Deposits.joined(looks) for looks in traced]))
+        return np.asarray(sum(found))
 
     def _simulation(self, **numbers: Any) -> Simulation:
-        return Simulation(self.bench, replace(self.everything, **numbers), one_line=True)
+        return self.sample.simulation(self.bench, replace(self.everything, **numbers), one_line=True)
 
     @staticmethod
     def _tracers(simulation: Simulation) -> list[Tracer]:
         return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
-    def _formed(self, simulation: Simulation, lights: list[sparse.csr_array]) -> FloatArray:
-        """(looks, shots, pixels, columns) frames of light to every anchor."""
-        rows, lighting = self.sample.rows, Lighting(self.sample.rows, self.sample.lighting.weights)
-        filed = Filed(simulation.followed.optics, tuple(light[: len(rows)] for light in lights))
-        lamps = Filed(simulation.followed_ambient.optics, tuple(light[len(rows) :] for light in lights))
-        ambient = [lamps] if simulation.physics.lamps else []
-        return ExpectedFrames([filed], lighting, 0, ambient).by_group(self.sample.columns)
+    def _formed(self, trays: tuple[Tray, Tray], looks: list[Deposits]) -> FloatArray:
+        """(looks, shots, places, places) frames of the projector's light, and lamps', in ``trays``."""
+        samples = self.sample.followed
+        return self.sample.frames(trays[0], looks, samples) + self.sample.lamps(trays[1], looks, samples)

@@ -6,24 +6,37 @@ Looks see the same change with independent noise, so the mean product of two dif
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from mitsim.capture.evidence import Part
-from mitsim.capture.filing import FiledLight
+from mitsim.capture.bench import Bench
+from mitsim.capture.evidence import Part, Settings
+from mitsim.capture.filing import Tray
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.parallel import in_threads
+from mitsim.optics.closed_form import Entries
 from mitsim.rig.patterns import Lighting
+from mitsim.transport.histogram import Deposits
 
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+Known = dict[Hashable, tuple[Sequence[Deposits], FloatArray]]
+"""Frames that were formed, with the light that they show."""
 _SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
 """Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming; but more
 where they show fewer pixels than this all together, which are no fair sample of the scene, or a mirror does."""
-_COLUMNS = 64
-"""Columns of pixels that the pilot looks at: a frame's neighbours are alike, and each column costs its forming."""
+_PLACES = 96
+"""Rows and columns of pixels that the pilot looks at: a frame's neighbours are alike, and each costs its forming."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 """Steps by it never meet a mask's features in one phase."""
+_DIGITS = 12
+"""Of a pattern's light, all but those that rounding makes."""
+_SPARSE = 8
+"""Places for each entry of light beyond which entries are sorted, and places not counted."""
 _PIXELS = 64**2
 """Few pixels are sampled more often, until they take as many samples as so many pixels."""
 _MOST_PATHS = 2**20
@@ -43,20 +56,34 @@ GOOD_ENOUGH = 0.3
 """Part of the accuracy below which a finer step is not tried: its square is a tenth of the budget's."""
 
 
+def known(method: _Method) -> _Method:
+    """A ``method`` that remembers for each object what it returned for which arguments."""
+
+    @wraps(method)
+    def remembering(self: Any, *counts: Any, **cells: Any) -> Any:
+        found = vars(self).setdefault(f"known {method.__name__}", {})
+        key = counts, tuple(sorted(cells.items()))
+        if key not in found:
+            found[key] = method(self, *counts, **cells)
+        return found[key]
+
+    return cast("_Method", remembering)
+
+
 @dataclass(frozen=True)
 class Sample:
-    """The shots and columns of pixels that the pilot looks at, and how many samples it takes to.
+    """The shots that the pilot looks at, the rows and columns of pixels (the same ones), and how many samples it takes.
 
     ``effort`` multiplies the samples of the first, shortest look.
     """
 
     lighting: Lighting
-    columns: Labels
+    places: tuple[int, ...]
     effort: int = 1
 
     @classmethod
     def of(cls, lighting: Lighting, pixels: int, mirrors: bool) -> Sample:
-        """A few shots of a family and columns of the sensor, evenly spread.
+        """A few shots of a family, and rows and columns of the sensor, evenly spread.
 
         Parameters
         ----------
@@ -67,13 +94,13 @@ class Sample:
         mirrors
             whether a shot's light may be that of few of the pixels that it shows, in a mirror.
         """
-        shots, count = len(lighting.weights), min(pixels, _COLUMNS)
-        columns = (np.arange(count) + (np.arange(count) * _GOLDEN) % 1) * pixels / count
+        shots, count = len(lighting.weights), min(pixels, _PLACES)
+        places = (np.arange(count) + (np.arange(count) * _GOLDEN) % 1) * pixels / count
         lit = np.bincount(lighting.labels, minlength=lighting.weights.shape[1]) @ (lighting.weights[0] != 0)
         few = _MOST_SHOTS if mirrors else _SHOWN // max(int(lit), 1)
         wanted = min(max(_SHOTS, few), _MOST_SHOTS, shots)
         chosen = np.unique(np.linspace(0, shots - 1, wanted).astype(int))
-        return cls(lighting.shots(chosen), columns.astype(np.int64))
+        return cls(lighting.shots(chosen), tuple(places.astype(int).tolist()))
 
     @property
     def rows(self) -> Labels:
@@ -118,9 +145,86 @@ class Sample:
     def _within(self, samples: int, pixels: int) -> int:
         return max(1, min(samples, _MOST_PATHS // pixels))
 
-    def frames(self, simulation: Simulation, lights: Sequence[FiledLight]) -> FloatArray:
-        """(looks, shots, pixels, columns) frames of each look's light among ``lights``, formed by a ``simulation``."""
-        return simulation.expected(lights, self.rows, self.lighting, 0).by_group(self.columns)
+    def simulation(self, bench: Bench, settings: Settings, one_line: bool = False) -> Simulation:
+        """A simulation whose frames are formed at the sample's pixels.
+
+        Parameters
+        ----------
+        bench, settings, one_line
+            as for :class:`mitsim.capture.filing.Trays`.
+        """
+        return Simulation(bench, settings, one_line=one_line, places=self.places)
+
+    def frames(
+        self,
+        tray: Tray,
+        looks: Sequence[Deposits],
+        samples: int,
+        emitted: FloatArray | None = None,
+        known: Known | None = None,
+    ) -> FloatArray:
+        """(looks, shots, places, places) frames of light in each look, nothing set to zero that came out below it.
+
+        A shot's pattern and what all pixels emit at least make a frame each.
+
+        Parameters
+        ----------
+        tray
+            where the light is filed.
+        looks
+            light of each.
+        samples
+            that it is divided by.
+        emitted
+            (shots, classes) part of its full power that each class emits; None: what the shots show.
+        known
+            holds what was formed, and is not formed again.
+        """
+        emitted = self.lighting.weights if emitted is None else emitted
+        least, most = emitted.min(axis=1), emitted.max(axis=1)
+        span = np.where(most > least, most - least, 1.0)
+        pattern = (emitted - least[:, None]) / span[:, None]
+        frames = span[:, None, None] * self._lit(tray, looks, pattern, known)
+        if least.any():
+            frames += least[:, None, None] * self._lit(tray, looks, np.ones((1, emitted.shape[1])), known)
+        return frames / samples
+
+    def lamps(self, tray: Tray, looks: Sequence[Deposits], samples: int, known: Known | None = None) -> FloatArray:
+        """(looks, 1, places, places) frames of lamps' light in each look.
+
+        Parameters
+        ----------
+        tray, looks, samples, known
+            as for :meth:`frames`.
+        """
+        pattern = np.zeros((1, self.lighting.weights.shape[1] + 1))
+        pattern[:, -1] = 1
+        return self._lit(tray, looks, pattern, known) / samples
+
+    def _lit(self, tray: Tray, looks: Sequence[Deposits], patterns: FloatArray, known: Known | None) -> FloatArray:
+        """(looks, rows, places, places) frames of classes that are lit in ``patterns`` (rows, classes), where lamps are
+        the last class; else as for :meth:`frames`."""
+        known = {} if known is None else known
+        count, classes = self.lighting.weights.shape
+        patterns = np.pad(patterns, ((0, 0), (0, classes + 1 - patterns.shape[1])))
+        light = tray.key, *map(id, looks)
+        keys = [(*light, np.round(row, _DIGITS).tobytes()) for row in patterns]
+        missing = [place for place, key in enumerate(keys) if key not in known]
+        classes_of, size = np.append(self.lighting.labels, classes), tray.bundle.size
+        entries = [tray.bundle.entries(look) for look in looks] if missing else []
+        optics = tray.optics if any(len(place) for place, *_ in entries) else None
+
+        def form(row: int) -> None:
+            frames = np.zeros((len(looks), len(self.places), len(self.places)))
+            if optics:
+                share = patterns[row][classes_of]
+                seen = optics.probe([gathered(place, value * share[pixel], size) for place, value, pixel in entries])
+                frames = np.moveaxis(seen.reshape(len(frames[0]), len(frames), -1), 1, 0)
+            # The looks are held with the frames: their numbers must not be given to others.
+            known[keys[row]] = looks, frames
+
+        in_threads(form, missing)
+        return np.stack([known[key][1] for key in keys], axis=1)
 
 
 def ladder(
@@ -180,6 +284,26 @@ def coarsened(
     one, two = frames(1, ()), frames(2, ())
     changes = {Part(f"{name} cells", 1): (two - one) / (1 - EVEN_CELLS)}
     return {**changes, Part(f"{name} layers", 1): frames(1, layers) - one} if layers else changes
+
+
+def gathered(places: Labels, values: FloatArray, size: int) -> Entries:
+    """Distinct places that hold light, increasing, and the light of each.
+
+    Parameters
+    ----------
+    places, values
+        of light in any order.
+    size
+        number of all places.
+    """
+    lit = values != 0
+    places, values = places[lit], values[lit]
+    if size > _SPARSE * len(places):
+        found, index = np.unique(places, return_inverse=True)
+        return found, np.bincount(index, values, len(found))
+    light = np.bincount(places, values, size)
+    found = np.flatnonzero(light)
+    return found, light[found]
 
 
 def product(one: FloatArray, other: FloatArray) -> float:

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
-from mitsim.capture.pilot.looks import Sample, coarsened, noise, norm
+from mitsim.capture.pilot.looks import Known, Sample, coarsened, noise, norm
 from mitsim.capture.pilot.sharp import SHARP_RATE
 from mitsim.capture.prices import SHARED_COST
-from mitsim.capture.simulation import Simulation
+from mitsim.capture.simulation import Simulation, emitted
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.transport import histogram
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.neighbours import NeighbourTracer
+from mitsim.transport.paths import KINDS
 from mitsim.transport.repeats import block_moments, chosen_repeats, effect_of
 
-_KINDS = {"indirect": histogram.INDIRECT, "ambient": histogram.AMBIENT}
 _TRACERS = ("indirect", "from_camera")
 _WORTH_REPEATING = 0.85
 """Variance times paths, over that of even ones, below which blocks are followed unevenly: short looks tell it so
@@ -50,11 +51,13 @@ class SwitchedEffects:
     ) -> None:
         self.bench, self.everything, self.sample, self.layers = bench, everything, sample, layers
         self.seeds = [integer(seed, "pilot", "effects", look) for look in range(LOOKS)]
-        self.simulation = Simulation(bench, everything)
+        self.simulation = sample.simulation(bench, everything)
         self.direct = self._direct(self.simulation)
         self.followed = {name: self._follow(self.simulation, name) for name in _TRACERS}
         self.sharp = self._sharp(self.simulation)
-        self.frames = self._form(self.simulation, self.direct, self._joined(self.followed), self.sharp)
+        self._known: Known = {}
+        self._kinds = self._by_kind(self.followed)
+        self.frames = self._form(self.simulation, self.direct, self._kinds, self.sharp)
         self.light = norm(self.frames)
         """Norm of the frames of all light."""
 
@@ -63,14 +66,18 @@ class SwitchedEffects:
         """Change of the frames by each effect that they have, and by coarse cells for indirect light."""
         shown = [name for name in EFFECTS if name in self.everything.effects and EFFECTS[name].in_frames]
         found = {Part(name): self.frames - self._without(EFFECTS[name]) for name in shown}
-        bounced = any((light.kind == histogram.INDIRECT).any() for light in self.followed["indirect"])
+        bounced = any(light.value.size for light in self._bounced)
         return {**found, **coarsened("indirect", self._indirect, self.layers)} if bounced else found
 
     def _indirect(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
         """Frames of indirect light in coarse cells and layers."""
         coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        indirect = [light.where(light.kind == histogram.INDIRECT) for light in self.followed["indirect"]]
-        return self._form(Simulation(self.bench, coarse), [Deposits.none()] * LOOKS, indirect)
+        return self._form(self.sample.simulation(self.bench, coarse), followed={"indirect": self._bounced})
+
+    @cached_property
+    def _bounced(self) -> list[Deposits]:
+        """Indirect light from the projector's side, look by look."""
+        return [light.where(light.kind == histogram.INDIRECT) for light in self.followed["indirect"]]
 
     @property
     def received(self) -> float:
@@ -111,8 +118,7 @@ class SwitchedEffects:
     def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
         """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other looks."""
         pixels = self.bench.n
-        light = [look.where(look.kind == histogram.INDIRECT) for look in self.followed["indirect"]]
-        moments = [block_moments(look.pixel, look.value, pixels) for look in light]
+        moments = [block_moments(look.pixel, look.value, pixels) for look in self._bounced]
         repeats = chosen_repeats(np.sum(moments, axis=0))
         # Judged by looks that had no say, a half each: a single heavy path recommends only its own block.
         halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
@@ -128,47 +134,49 @@ class SwitchedEffects:
             return plain, False
         samples = max(1, self.sample.followed // SHARED_COST)
         seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
-        error = noise(self._form(self._sharing, [Deposits.none()] * LOOKS, seen, samples=samples)) / self.light
+        error = noise(self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples))
+        error /= self.light
         shared = Effort(Noise(error, samples, 0.5), SHARED_COST * tracer.lanes)
         less = shared.variance * shared.paths < plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
 
     @cached_property
     def _sharing(self) -> Simulation:
-        return Simulation(self.bench, replace(self.everything, shared=True))
+        return self.sample.simulation(self.bench, replace(self.everything, shared=True))
 
     def sharp_effort(self) -> Effort:
         """The same of pixels that are traced apart, their rate being that of stratified rays."""
         tracer = self.simulation.apart
         if tracer is None:
             return Effort.none()
-        nothing, samples = [Deposits.none()] * LOOKS, self.sample.sharp(self.simulation)
-        error = noise(self._form(self.simulation, nothing, nothing, self.sharp))
+        samples = self.sample.sharp(self.simulation)
+        error = noise(self._form(self.simulation, sharp=self.sharp))
         relative = error / self.light if self.light else 0.0
         return Effort(Noise(relative, samples, SHARP_RATE), tracer.lanes)
 
     @cached_property
     def _noise(self) -> dict[str, tuple[float, int]]:
         """Error of a look by each tracer, and its paths in a sample."""
-        nothing = [Deposits.none()] * LOOKS
         return {
-            name: (noise(self._form(self.simulation, nothing, self.followed[name])), stage.tracer.lanes)
+            name: (
+                noise(self._form(self.simulation, followed=self._by_kind({name: self.followed[name]}))),
+                stage.tracer.lanes,
+            )
             for name, stage in self.simulation.tracers().items()
             if name in _TRACERS
         }
 
     def _without(self, effect: Effect) -> FloatArray:
-        simulation = Simulation(self.bench, replace(self.everything, effects=self.everything.effects - {effect.name}))
+        effects = self.everything.effects - {effect.name}
+        simulation = self.sample.simulation(self.bench, replace(self.everything, effects=effects))
         retraced = effect.retraced(simulation.physics)
         direct, sharp = self.direct, self.sharp
         if DIRECT in retraced:
             direct, sharp = self._direct(simulation), self._sharp(simulation)
         if FOLLOWED in retraced:
-            followed = self._joined({name: self._follow(simulation, name) for name in _TRACERS})
+            followed = self._by_kind({name: self._follow(simulation, name) for name in _TRACERS})
         else:
-            followed = self._joined(self.followed)
-            if effect.kind:
-                followed = [light.where(light.kind != _KINDS[effect.kind]) for light in followed]
+            followed = {kind: light for kind, light in self._kinds.items() if kind != effect.kind}
         return self._form(simulation, direct, followed, sharp)
 
     def _direct(self, simulation: Simulation) -> list[Deposits]:
@@ -182,8 +190,10 @@ class SwitchedEffects:
         return [tracer.trace(integer(seed, name), 0, self.sample.followed) for seed in self.seeds]
 
     @staticmethod
-    def _joined(followed: dict[str, list[Deposits]]) -> list[Deposits]:
-        return [Deposits.joined(looks) for looks in zip(*followed.values(), strict=True)]
+    def _by_kind(followed: dict[str, list[Deposits]]) -> dict[str, list[Deposits]]:
+        """Light of several tracers together by its kind, look by look."""
+        looks = [Deposits.joined(looks) for looks in zip(*followed.values(), strict=True)]
+        return {name: [look.where(look.kind == kind) for look in looks] for name, kind in KINDS.items()}
 
     def _sharp(self, simulation: Simulation) -> list[Deposits]:
         """Light of pixels that are traced apart, look by look."""
@@ -195,19 +205,25 @@ class SwitchedEffects:
     def _form(
         self,
         simulation: Simulation,
-        direct: list[Deposits],
-        followed: list[Deposits],
+        direct: Sequence[Deposits] = (),
+        followed: Mapping[str, Sequence[Deposits]] = MappingProxyType({}),
         sharp: Sequence[Deposits] = (),
         samples: int | None = None,
     ) -> FloatArray:
-        """Frames of light look by look; ``samples`` of followed light, if not as many as of all."""
-        sample, labels = self.sample, self.sample.lighting.labels
-        lights = [
-            simulation.file_direct(one, labels, sample.direct)
-            + simulation.file_followed(other, labels, samples or sample.followed)
-            for one, other in zip(direct, followed, strict=True)
-        ]
-        if sharp:
-            apart = [simulation.file_sharp(look, labels, sample.sharp(simulation)) for look in sharp]
-            lights = [light + more for light, more in zip(lights, apart, strict=True)]
-        return sample.frames(simulation, lights)
+        """Frames of light look by look, where there is any; ``samples`` of followed light, if not as many as of all."""
+        sample, known, physics = self.sample, self._known, simulation.physics
+        light, few = emitted(physics, sample.lighting), samples or sample.followed
+        parts = [(simulation.fine, direct, sample.direct), (simulation.fine, followed.get("direct", ()), few)]
+        parts.append((simulation.sharp, sharp, sample.sharp(simulation)))
+        if physics.interreflection:
+            parts.append((simulation.smooth, followed.get("indirect", ()), few))
+        side = len(sample.places)
+        frames = np.zeros((LOOKS, len(light), side, side))
+        for tray, looks, count in parts:
+            if any(look.value.size for look in looks):
+                frames += sample.frames(tray, looks, count, light, known)
+        lamps = followed.get("ambient", ())
+        if physics.lamps and lamps:
+            frames += sample.lamps(simulation.ambient, lamps, few, known)
+        glint = simulation.glint_frames(sample.lighting.labels)
+        return frames if glint is None else frames + np.tensordot(light[:, glint.classes], glint.irradiance, 1)
