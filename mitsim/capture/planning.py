@@ -32,9 +32,9 @@ _REHEARSED = 2**16
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
-_LONG, _MORE = 5.0, 16
-"""Seconds of a stage from which its pace is told by so many times as many paths: a hundredth of what it takes, and the
-cost of launches and of filing few entries no longer counts as if it grew with the paths."""
+_LONG, _MORE = 5.0, 4
+"""Seconds of a stage from which its pace is told by what so many times as many paths take longer: the cost of launches
+does not count as if it grew with the paths."""
 
 
 @single_threaded_blas()
@@ -140,14 +140,15 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
     own, found = integer(seed, "pilot", "paces"), {}
     at_anchors = [0.0, 0]
     for name, stage in simulation.tracers().items():
-        samples, taken = max(1, _REHEARSED // stage.tracer.lanes), []
-        # The first, small one compiles the kernel; of the others the shorter was less disturbed.
-        for count in (1, samples, samples):
-            taken.append(_seconds(stage, own, labels, count))
-        seconds = min(taken[1:]) / samples
+        samples = max(1, _REHEARSED // stage.tracer.lanes)
+        _seconds(stage, own, labels, 1)  # compiles the kernel
+        once = _seconds(stage, own, labels, samples)
+        seconds = once / samples
         if GROUPS * stage.predicted * seconds > _LONG:
-            again = (_seconds(stage, own, labels, _MORE * samples) for _ in range(2))
-            seconds = min(seconds, min(again) / (_MORE * samples))
+            more = _seconds(stage, own, labels, _MORE * samples)
+            # What disturbs either of the two may not halve the pace, nor hide that more paths take less for each.
+            most = min(seconds, more / (_MORE * samples))
+            seconds = min(max((more - once) / ((_MORE - 1) * samples), most / 2), most)
         if name in AT_ANCHORS:
             at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
             continue
