@@ -267,9 +267,18 @@ class Bench:
         """The same on a plane at ``depth`` [mm]."""
         if depth == self.geometry.scene_distance:
             return self.windows
-        from mitsim.scene.projector import window_at
+        if depth not in self._windows:
+            from mitsim.scene.projector import window_at
 
-        return window_at(str(self.loaded.path), self.loaded.projector, self.loaded.camera, self.loaded.pixels, depth)
+            loaded = self.loaded
+            found = window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)
+            self._windows[depth] = found
+        return self._windows[depth]
+
+    @cached_property
+    def _windows(self) -> dict[float, tuple[tuple[float, float], tuple[float, float]]]:
+        """Those that were asked for, by their depth."""
+        return {}
 
     @property
     def parallax(self) -> Parallax:
