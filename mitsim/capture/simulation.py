@@ -205,7 +205,7 @@ class Simulation(Trays):
         found = self.bench.glint.frames(labels, self.physics.geometry, self.physics.spectrum)
         if found is None or self.places is None:
             return found
-        return replace(found, irradiance=found.irradiance[(slice(None), *np.ix_(self.places, self.places))])
+        return replace(found, irradiance=found.irradiance[:, self.places][:, :, self.places])
 
     def expected(
         self, groups: Sequence[FiledLight], rows: Labels, lighting: Lighting, seed: int, leaking: bool = True

@@ -66,9 +66,9 @@ class FineLight:
         self._seeds = [integer(seed, "pilot", "fine", look) for look in range(LOOKS)]
         self._simulation = simulation = sample.simulation(bench, base)
         self._tracer = _tracer(simulation, _shown(base, sample), base.anchors)
-        self._deposits = [self._tracer.trace(seed, 0, sample.fine) for seed in self._seeds]
+        self._deposits = self._tracer.trace_looks(self._seeds, sample.fine)
         apart, samples = simulation.apart, sample.sharp(simulation)
-        self._sharp = [apart.trace(seed, 0, samples) for seed in self._seeds] if apart else []
+        self._sharp = apart.trace_looks(self._seeds, samples) if apart else []
 
     @property
     def judging(self) -> tuple[float, ...]:
@@ -138,12 +138,12 @@ class FineLight:
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
         tracer = _tracer(self._simulation, _shown(self.base, self.sample), 1, spread=True)
-        seen = [tracer.trace(seed, 0, self.sample.fine) for seed in self._seeds]
+        seen = tracer.trace_looks(self._seeds, self.sample.fine)
         return self._noise_of(tracer, self._formed(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
         """Error of a look of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
-        few = [tracer.trace(seed, 0, self._fewer) for seed in self._seeds]
+        few = tracer.trace_looks(self._seeds, self._fewer)
         return noise(many), noise(self._formed(self._simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
@@ -300,7 +300,7 @@ class AnchoredLight:
         """Light to every anchor, look by look."""
         anchors = self._tray(simulation).bundle.anchors
         tracer = _tracer(simulation, self.pixels, anchors)
-        return [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
+        return tracer.trace_looks(self._seeds, self._samples)
 
     def _formed(self, tray: Tray, looks: list[Deposits]) -> FloatArray:
         """(looks, shots, places, places) frames of light in a ``tray``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -104,7 +105,12 @@ class FollowedLight:
     def _few(self) -> list[Deposits]:
         """Light to a few anchors, look by look."""
         tracers, samples = self._tracers(self._simulation(followed_anchors=_FEW_ANCHORS)), self.sample.followed
-        return [Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers]) for seed in self._seeds]
+        return self._joined([tracer.trace_looks(self._seeds, samples) for tracer in tracers])
+
+    @staticmethod
+    def _joined(traced: Iterable[list[Deposits]]) -> list[Deposits]:
+        """Light of several tracers together, look by look."""
+        return [Deposits.joined(looks) for looks in zip(*traced, strict=True)]
 
     @known
     def _frames(self, anchors: int) -> FloatArray:
@@ -118,8 +124,14 @@ class FollowedLight:
             return self._formed(trays, self._few)
         found = []
         for part in parts:
-            traced = [[tracer.trace(seed, *part) for tracer in tracers] for seed in self._seeds]
-            found.append(self._formed(trays, [Deposits.joined(looks) for looks in traced]))
+            first, some = part
+            traced = [
+                tracer.trace_looks(self._seeds, some)
+                if some == samples
+                else [tracer.trace(seed, first, some) for seed in self._seeds]
+                for tracer in tracers
+            ]
+            found.append(self._formed(trays, self._joined(traced)))
         return np.asarray(sum(found))
 
     def _simulation(self, **numbers: Any) -> Simulation:
@@ -131,5 +143,5 @@ class FollowedLight:
 
     def _formed(self, trays: tuple[Tray, Tray], looks: list[Deposits]) -> FloatArray:
         """(looks, shots, places, places) frames of the projector's light, and lamps', in ``trays``."""
-        samples = self.sample.followed
-        return self.sample.frames(trays[0], looks, samples) + self.sample.lamps(trays[1], looks, samples)
+        frames = self.sample.frames(trays[0], looks, self.sample.followed)
+        return frames + self.sample.lamps(trays[1], looks, self.sample.followed) if self.bench.loaded.lamps else frames

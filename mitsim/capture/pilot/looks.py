@@ -205,7 +205,7 @@ class Sample:
         """(looks, rows, places, places) frames of classes that are lit in ``patterns`` (rows, classes), where lamps are
         the last class; else as for :meth:`frames`."""
         known = {} if known is None else known
-        count, classes = self.lighting.weights.shape
+        classes = self.lighting.weights.shape[1]
         patterns = np.pad(patterns, ((0, 0), (0, classes + 1 - patterns.shape[1])))
         light = tray.key, *map(id, looks)
         keys = [(*light, np.round(row, _DIGITS).tobytes()) for row in patterns]
@@ -300,8 +300,8 @@ def gathered(places: Labels, values: FloatArray, size: int) -> Entries:
     places, values = places[lit], values[lit]
     if size > _SPARSE * len(places):
         found, index = np.unique(places, return_inverse=True)
-        return found, np.bincount(index, values, len(found))
-    light = np.bincount(places, values, size)
+        return found, np.bincount(index, values, len(found)).astype(np.float64)
+    light = np.bincount(places, values, size).astype(np.float64)
     found = np.flatnonzero(light)
     return found, light[found]
 

@@ -180,14 +180,15 @@ class SwitchedEffects:
         return self._form(simulation, direct, followed, sharp)
 
     def _direct(self, simulation: Simulation) -> list[Deposits]:
-        return [simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds]
+        return simulation.direct.trace_looks(self.seeds, self.sample.direct)
 
     def _follow(self, simulation: Simulation, name: str) -> list[Deposits]:
         """Light of the tracer ``name``, look by look."""
         tracer = getattr(simulation, name)
         if tracer is None:
             return [Deposits.none()] * LOOKS
-        return [tracer.trace(integer(seed, name), 0, self.sample.followed) for seed in self.seeds]
+        looks: list[Deposits] = tracer.trace_looks([integer(seed, name) for seed in self.seeds], self.sample.followed)
+        return looks
 
     @staticmethod
     def _by_kind(followed: dict[str, list[Deposits]]) -> dict[str, list[Deposits]]:
@@ -200,7 +201,7 @@ class SwitchedEffects:
         tracer, samples = simulation.apart, self.sample.sharp(simulation)
         if tracer is None:
             return []
-        return [tracer.trace(integer(seed, "sharp"), 0, samples) for seed in self.seeds]
+        return tracer.trace_looks([integer(seed, "sharp") for seed in self.seeds], samples)
 
     def _form(
         self,
