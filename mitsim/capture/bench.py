@@ -228,7 +228,7 @@ class Bench:
         """Projector pixels a side."""
         return self.loaded.pixels.n
 
-    @property
+    @cached_property
     def projector_optics(self) -> ProjectorOptics:
         """The projector as the tracers want it."""
         from mitsim.transport.projector import ProjectorOptics

@@ -8,8 +8,9 @@ threads, because each product is computed by one.
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from types import TracebackType
@@ -45,9 +46,39 @@ def _controller() -> ThreadpoolController:
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """``function`` of each of the ``items``, in order, one thread a processor; it should spend its time in numpy."""
-    with single_threaded_blas(), ThreadPoolExecutor(workers()) as pool:
-        return list(pool.map(function, items))
+    """``function`` of each of the ``items``, in order, one thread a processor; it should spend its time in numpy.
+
+    The threads are kept. One item, and items of an item, are worked on where they are asked for. After an error, or
+    Control-C, items that nobody has begun are left out, and those that somebody has are finished.
+    """
+    todo = list(items)
+    with single_threaded_blas():
+        if len(todo) < 2 or getattr(_inside, "thread", False):
+            return [function(item) for item in todo]
+        begun = [_pool(workers()).submit(function, item) for item in todo]
+        try:
+            return [future.result() for future in begun]
+        finally:
+            for future in begun:
+                future.cancel()
+            wait(begun)
+
+
+_inside = threading.local()
+
+
+def _mark() -> None:
+    """Make known that this thread is one of ours: were it to wait for others, all might wait."""
+    _inside.thread = True
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """So many threads, kept for the next call: starting some takes as long as forming a small frame."""
+    return ThreadPoolExecutor(threads, initializer=_mark)
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on in a forked process
 
 
 class Behind(Generic[Item]):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -50,6 +51,11 @@ class ProjectorOptics:
     aperture: float = 0.0
     focus: float = 400.0
     blur: float = 0.0
+
+    @cached_property
+    def canvas_map(self) -> CanvasMap:
+        """Where the emitter sends its canvas."""
+        return CanvasMap.of(self.emitter)
 
     @property
     def ideal(self) -> bool:
@@ -134,7 +140,7 @@ class ProjectorRays:
     """
 
     def __init__(self, projector: ProjectorOptics) -> None:
-        self.projector, self._map = projector, CanvasMap.of(projector.emitter)
+        self.projector, self._map = projector, projector.canvas_map
 
     def sample(self, pixel: mi.UInt32, jitter: mi.Point2f, rng: mi.PCG32, wavelengths: mi.Color0f) -> mi.Ray3f:
         """A ray through each pixel, and through random points of the lens and of the blurred spot.
@@ -213,7 +219,7 @@ class PinholeRays:
     def __init__(self, projector: ProjectorOptics, wavelengths: Sequence[mi.Color0f | None]) -> None:
         """Of a ``projector``; ``wavelengths`` are sets at which spectra are taken, from :func:`wavelength_sets`."""
         self._projector, n = projector, projector.n
-        self._map = CanvasMap.of(projector.emitter)
+        self._map = projector.canvas_map
         self.origin = self._map.origin
         self.area = self._map.pixel_area(projector.canvas)
         centre = np.stack(np.divmod(np.arange(n * n), n), axis=1) + 0.5
