@@ -209,7 +209,13 @@ class SceneFacts:
         return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes)
 
 
-def decide(accuracy: float, evidence: Evidence, facts: SceneFacts, switches: Mapping[str, bool] | None = None) -> Plan:
+def decide(
+    accuracy: float,
+    evidence: Evidence,
+    facts: SceneFacts,
+    switches: Mapping[str, bool] | None = None,
+    chosen: Choice | None = None,
+) -> Plan:
     """Choose effects, anchors, layers, cells and samples.
 
     Parameters
@@ -222,10 +228,12 @@ def decide(accuracy: float, evidence: Evidence, facts: SceneFacts, switches: Map
         what to say of the devices.
     switches
         effects that the user switches on or off, by name.
+    chosen
+        the choice, where it is known.
     """
     check_accuracy(accuracy)
     switches = switches or {}
-    chosen = cheapest(accuracy, evidence, switches)
+    chosen = chosen or cheapest(accuracy, evidence, switches)
     words = _Words(accuracy, evidence, chosen, facts, switches)
     stages = _stages(evidence, chosen.settings, paces_of(evidence))
     return Plan(

@@ -120,9 +120,9 @@ def _refuse_unfit(bench: Bench) -> None:
 def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
     """The plan at an ``accuracy`` of what a ``look`` found, with the paces of its choice measured."""
     evidence, bench = look.evidence, look.bench
-    chosen = cheapest(accuracy, evidence, switches).settings
-    timed = _timed(evidence, Simulation(bench, chosen), look.lighting.labels, look.seed)
-    return decide(accuracy, timed, SceneFacts.of(bench, switches), switches)
+    chosen = cheapest(accuracy, evidence, switches)
+    timed = _timed(evidence, Simulation(bench, chosen.settings), look.lighting.labels, look.seed)
+    return decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
 
 
 def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:

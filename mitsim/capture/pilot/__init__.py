@@ -188,9 +188,8 @@ class Look:
         elif stage == "effects":
             self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
         elif stage == "followed":
-            self.followed = FollowedLight(
-                bench, self._everything, sample, self._tolerance(_OF_FOLLOWED), seed, self.fine.judging
-            )
+            tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
+            self.followed = FollowedLight(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)
         elif stage == "occluded":
             if base.occluded:
                 self.occluded = OccludedLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)

@@ -49,6 +49,8 @@ class FollowedLight:
         root of the random streams.
     layers
         depths [mm] that judge one layer; none for a flat scene.
+    lit
+        whether other looks found any such light.
     """
 
     def __init__(
@@ -59,15 +61,16 @@ class FollowedLight:
         tolerance: float,
         seed: int,
         layers: tuple[float, ...] = (),
+        lit: bool = True,
     ) -> None:
         self.bench, self.everything, self.sample, self.tolerance = bench, everything, sample, tolerance
-        self._layers = layers
+        self._layers, self._lit = layers, lit
         self._seeds = [integer(seed, "pilot", "followed", look) for look in range(LOOKS)]
 
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried; none where there is no such light."""
-        if not self._tracers(self._simulation()) or not norm(self._frames(1)):
+        if not self._lit or not self._tracers(self._simulation()) or not norm(self._frames(1)):
             return {}
         found = ladder(FOLLOWED_LADDER, self._frames, _FIRST_JUDGE, self.tolerance)
         anchors = {Part("followed_anchors", count): change for count, change in found.items()}
