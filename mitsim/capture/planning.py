@@ -27,8 +27,9 @@ OPENING_S = 1.5
 _LONGER = 2.0
 """Seconds of a second, finer look over those of the first (photograph 1.0, corner 1.1, gift_card 1.3, cookie_bag 2.6 at
 a tenth of the accuracy)."""
-_REHEARSED = 2**16
-"""Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes."""
+_REHEARSED, _MOST_REHEARSED = 2**16, 2**18
+"""Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes; and how
+many tell it without more of them."""
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
@@ -144,7 +145,7 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
         _seconds(stage, own, labels, 1)  # compiles the kernel
         once = _seconds(stage, own, labels, samples)
         seconds = once / samples
-        if GROUPS * stage.predicted * seconds > _LONG:
+        if GROUPS * stage.predicted * seconds > _LONG and samples * stage.tracer.lanes < _MOST_REHEARSED:
             more = _seconds(stage, own, labels, _MORE * samples)
             # What disturbs either of the two may not halve the pace, nor hide that more paths take less for each.
             most = min(seconds, more / (_MORE * samples))
