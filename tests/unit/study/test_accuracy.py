@@ -5,11 +5,13 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.choice import counted
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.planning import make_plan
@@ -118,6 +120,26 @@ def test_the_judges_own_noise_is_taken_off(bench: Bench) -> None:
     for own in (3 * noise, 0.01 * noise):
         apart = answer.frames + rng.normal(0, np.hypot(own, noise) * size, answer.frames.shape)
         assert answer.error(apart) == pytest.approx(max(own, noise / 2), rel=0.05)
+
+
+def test_a_judge_takes_a_plans_own_numbers_where_its_time_does_not_buy_finer_ones(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And states what they leave; all the time that there is goes into samples."""
+    stand, traced = Stand(bench, bench.family("uniform"), SEED, Job(), 3e-2), []
+    plan = stand.plan(3e-2)
+    finest = stand.finest(plan).settings
+    formed = SimpleNamespace(frames=lambda *_: [SimpleNamespace(irradiance=np.ones((2, 2)), variance=0.0)])
+    monkeypatch.setattr(Stand, "trace", lambda _, trial, seed: traced.append((trial.plan, seed)) or formed)
+    _, dear = judge._within(stand, stand.finest(plan), 0.0)
+    for seconds, taken in ((math.inf, finest), (dear, finest), (0.99 * dear, plan.settings), (0.0, plan.settings)):
+        answer = Judge.trace(stand, plan, seconds)
+        own, seed = traced.pop()
+        assert counted(own.settings) == counted(taken) and own.settings.effects == taken.effects
+        assert seed == answer.facts.seed == SEED + 1
+        assert answer.facts.systematic_error == stand.discretisation(taken) > 0
+        assert own.sampling_target < 3e-2 / 9 or seconds < math.inf
+    assert counted(finest) != counted(plan.settings)
 
 
 def test_the_front_is_marked_among_what_was_measured(study: AccuracyFindings) -> None:
