@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
-from mitsim.capture.request import Exposure, Request
+from mitsim.capture.request import HIGHEST_ACCURACY, LONGEST_S, LOWEST_ACCURACY, Exposure, Request
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.manifests import MOST_SHOTS
+from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
 
 
 def test_what_is_asked_by_default() -> None:
@@ -41,11 +43,31 @@ def test_seconds_or_an_accuracy() -> None:
     assert request.changed(patterns="uniform") == Request.of(seconds=10.0, seed=2, patterns="uniform")
     assert Request.of(**request.deciding) == request and "accuracy" not in request.deciding
     assert "seconds" not in Request.of().deciding and Request.of().deciding["accuracy"] == 1e-3
-    for other in ({"accuracy": 1e-3}, {"noise_fraction": 0.1}):
-        with pytest.raises(ArgumentError, match=r"give (seconds or an accuracy, not both|one of both)"):
-            Request.of(seconds=10.0, **other)
-        with pytest.raises(ArgumentError, match="give"):
-            request.changed(**other)
+    for seconds in (1e-6, 10.0, LONGEST_S):
+        for other, named, said in (
+            ({"accuracy": 1e-3}, "seconds", "give seconds or an accuracy, not both"),
+            ({"noise_fraction": 0.1}, "noise_fraction", "give one of both"),
+        ):
+            for ask in (Request.of, Request.of(seconds=seconds).changed):
+                with pytest.raises(ArgumentError, match=f"^{named} .*: .*{said}$") as caught:
+                    ask(seconds=seconds, **other)
+                assert caught.value.argument == named
+
+
+@pytest.mark.parametrize(
+    ("argument", "ends"),
+    [
+        ("seconds", (5e-324, LONGEST_S)),
+        ("accuracy", (LOWEST_ACCURACY, HIGHEST_ACCURACY)),
+        ("noise_fraction", (1e-3, 1.0)),
+        ("exposure", EXPOSURE_S),
+        ("exposure_fraction", EXPOSURE_FRACTION),
+        ("ambient_shots", (1, MOST_SHOTS)),
+    ],
+)
+def test_the_ends_of_a_range_are_within_it(argument: str, ends: tuple[float, float]) -> None:
+    for end in ends:
+        assert getattr(Request.of(**{argument: end}), argument) == end
 
 
 @pytest.mark.parametrize(
@@ -58,6 +80,7 @@ def test_seconds_or_an_accuracy() -> None:
         *(("exposure_fraction", value, "to 1") for value in (0.0, -0.5, 1.01, math.nan)),
         *(("effects", value, "diffraction") for value in ("fog", "+fog", "diffraction", {"fog": True})),
         ("effects", "+ambient,-ambient", "keep one"),
+        *(("ambient_shots", value, f"1 to {MOST_SHOTS} shots") for value in (0, MOST_SHOTS + 1)),
         *(("ambient_frame", value, "use auto, yes or no") for value in ("maybe", "", True)),
     ],
 )
