@@ -5,7 +5,7 @@ variant must not be used after switching.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.configuration import shipped
+from tests.kept_plans import plans_kept
 
 pytest_plugins = ["tests.robustness"]
 
@@ -164,3 +165,26 @@ def shipped_bench(variant: str) -> Callable[..., object]:
         return open_bench(shipped("scenes", name, "scene.xml"), variant, **defines)
 
     return load
+
+
+@pytest.fixture(scope="module")
+def kept_plans(variant: str) -> Iterator[None]:
+    """For modules of which no test is about planning: see :mod:`tests.kept_plans`."""
+    with plans_kept():
+        yield
+
+
+@pytest.fixture(scope="module")
+def draft_figures() -> Iterator[None]:
+    """Figures are written small and without making room for their labels, which takes most of the time of a page."""
+    from matplotlib.figure import Figure
+
+    write = Figure.savefig
+
+    def drafted(figure: Figure, file: object, **options: object) -> None:
+        figure.set_layout_engine("none")
+        write(figure, file, **{**options, "dpi": 20})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", drafted)
+        yield

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.kept_plans import plans_kept
 from tests.system.interrupted import PATTERNS
 
 ACCURACY = "0.005"
@@ -169,6 +170,11 @@ class Laboratory:
         return to
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _quicker(kept_plans: None, draft_figures: None) -> None:
+    """No system test in this process is about planning or how figures look; programs do all by themselves."""
+
+
 @pytest.fixture(scope="session")
 def lab(variant: str, shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
     """The laboratory, built through the command line once."""
@@ -182,8 +188,9 @@ def lab(variant: str, shared_scene: Callable[..., Path], tmp_path_factory: pytes
 
     scene = write_scene("laboratory")
     rig = scene, "--camera", camera, "--projector", projector, "--accuracy", ACCURACY
-    captured = call("capture", *rig, "-o", folder / "run", "--patterns", "dots:4", "--json")
-    calibrated = call("calibrate", *rig, "-o", folder / "calibration", "--json")
+    with plans_kept():
+        captured = call("capture", *rig, "-o", folder / "run", "--patterns", "dots:4", "--json")
+        calibrated = call("calibrate", *rig, "-o", folder / "calibration", "--json")
     assert captured.code == 0, captured.err
     assert calibrated.code == 0, calibrated.err
     return Laboratory(
@@ -220,5 +227,6 @@ def refused(tmp_path: Path, lab: Laboratory) -> Callable[..., str]:
 def whole(lab: Laboratory, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of many frames that nothing disturbed."""
     run: Path = tmp_path_factory.mktemp("whole") / "run"
-    assert call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS).code == 0
+    with plans_kept():
+        assert call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS).code == 0
     return run

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.framefile import read_frame, write_frame
+from mitsim.capture.bench import open_bench
+from mitsim.core.framefile import checksum, read_frame, write_frame
 from tests.system.refusals import Refused, mentions
 
 Edit = Callable[[dict[str, Any]], object]
@@ -59,20 +60,37 @@ def rewrite(path: Path, change: Callable[[np.ndarray], np.ndarray], **rename: st
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_a_calibration_of_another_camera(
-    refused: Refused, call: Callable[..., Any], lab: Any, tmp_path: Path, numbers: dict[str, Any], fragments: list[str]
+    refused: Refused, lab: Any, tmp_path: Path, numbers: dict[str, Any], fragments: list[str]
 ) -> None:
+    """Factors of the laboratory's, or of other shapes, under the identity of another camera."""
     numbers = dict(numbers)
     camera, projector = tmp_path / "camera.toml", tmp_path / "projector.toml"
     text = lab.camera.read_text().replace("binning = 2", f"binning = {numbers.pop('binning', 2)}")
     camera.write_text(text.replace("gain_dn_per_e = 0.125", f"gain_dn_per_e = {numbers.pop('gain', 0.125)}"))
     name = numbers.pop("wavelength", "test projector")
     projector.write_text(lab.projector.read_text().replace("test projector", name))
-    scene = lab.write_scene("other", **numbers)
-    files = "--camera", camera, "--projector", projector, "--accuracy", "0.3"
-    other = call("calibrate", scene, *files, "-o", tmp_path / "other", "--json")
-    assert other.code in (0, 1), other.err
+    bench = open_bench(lab.write_scene("other", **numbers), camera=camera, projector=projector)
+    other = lab.copy("calibration", tmp_path / "other")
+    for side in ("left", "right"):
+        rewrite(other / f"{side}.exr", lambda factor: np.resize(factor, (bench.geometry.pixels, bench.n)))
+
+    def another(manifest: dict[str, Any]) -> None:
+        manifest["camera"] = json.loads(json.dumps(bench.identity()))
+        manifest["checksums"] = {name: checksum(other / name) for name in manifest["checksums"]}
+
+    edit(other, another)
     line = refused("reconstruct", lab.run, "--calibration", "other")
     mentions(line, "calibration other", str(lab.run), *fragments)
+
+
+def test_a_calibration_that_was_made_of_another_camera(
+    refused: Refused, call: Callable[..., Any], lab: Any, tmp_path: Path
+) -> None:
+    """That its manifest states the identity which the test above writes."""
+    scene = lab.write_scene("flat", mask="flatcam", n=8)
+    assert call("calibrate", scene, *lab.electronics, "-o", tmp_path / "other").code in (0, 1)
+    line = refused("reconstruct", lab.run, "--calibration", "other")
+    mentions(line, "calibration other", str(lab.run), "geometry.mask ", "flatcam", "separable")
 
 
 def test_a_run_is_no_calibration_and_vice_versa(refused: Refused, lab: Any, tmp_path: Path) -> None:

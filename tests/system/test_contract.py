@@ -43,7 +43,8 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 
 
 def test_plan(call: Callable[..., Any], lab: Any) -> None:
-    plan = call("plan", *lab.rig, "--json", "--quiet", "--variant", "llvm_ad_mono").payload
+    options = "--patterns", "dots:4", "--json", "--quiet", "--variant", "llvm_ad_mono"
+    plan = call("plan", *lab.rig, *options).payload
     assert {"effects", "accuracy", "predicted_seconds"} <= plan.keys()
     assert plan["accuracy"] == 0.005 and number(plan["predicted_seconds"], 1e-6)
     assert len({effect["name"] for effect in plan["effects"]}) == len(plan["effects"]) >= 5
@@ -142,26 +143,14 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
 
 
 def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two accuracies: that all rows are right is held by unit/study/test_accuracy.py."""
-    monkeypatch.setattr(accuracy, "ACCURACIES", (1e-2, accuracy.QUOTED))
-    scene = lab.write_scene("grey", reflectance=None)
+    """Of no time, which leaves all but one run out; what whole rows hold is held by unit/study/test_accuracy.py."""
+    monkeypatch.setattr(accuracy, "BUDGET_S", 0.0)
+    monkeypatch.setattr(accuracy, "QUOTED", 3e-2)
     options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
-    outcome = call("study", "accuracy", scene, *options)
-    study = outcome.payload
+    study = call("study", "accuracy", lab.scene, *options).payload
     assert {"rows", "speedup_at_equal_error", "left_out", "took", "opening", "solver"} <= study.keys()
-    assert number(study["speedup_at_equal_error"], 1)
-    for row in study["rows"]:
-        assert {"estimator", "setting", "seconds", "error", "mc_error"} <= row.keys()
-        assert row["estimator"] in ("factored", "reference") and isinstance(row["setting"], str)
-        assert number(row["seconds"], 1e-6) and number(row["error"], 1e-9) and number(row["mc_error"], 1e-9)
-        assert 0 < row["least_s"] <= row["seconds"] <= row["most_s"] and row["repeats"] >= 1
-        assert isinstance(row["knob"], str) and isinstance(row["on_front"], bool)
-        assert row["extrapolated"] is bool(row["by"])
-    assert {row["estimator"] for row in study["rows"]} == {"factored", "reference"}
-    keys = {"name", "error_if_off", "error_bound", "seconds", "least_s", "most_s", "within_noise", "repeats", "in_plan"}
-    assert study["effects"] and all(keys == effect.keys() for effect in study["effects"])
-    assert number(study["sensor_noise"], 1e-6, 1)
-    assert {"mc_error", "systematic_error", "seconds", "seed"} <= study["judge"].keys()
+    assert (study["scene"], study["patterns"], study["output"]) == (str(lab.scene), "uniform", str(tmp_path / "study"))
+    assert study["rows"] and study["left_out"] and number(study["took"])
     written = {path.name for path in (tmp_path / "study").iterdir()}
     assert written == {"accuracy.json", "accuracy.png", "effects.png"}
 
@@ -190,25 +179,6 @@ def test_study_solver(call: Callable[..., Any], tmp_path: Path, monkeypatch: pyt
     assert "lambda 1e-04  svd" in text and "runs)" in text
 
 
-def test_study_diffraction(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
-    study = call("study", "diffraction", lab.scene, *options).payload
-    assert {"shadows", "quality", "scene", "patterns", "output"} <= study.keys()
-    assert {row["mask"] for row in study["shadows"]} == {"separable", "flatcam"}
-    assert {row["frames"] for row in study["quality"]} == {"idealised", "rendered"}
-    for row in study["shadows"]:
-        assert row["mask"] in ("separable", "flatcam") and isinstance(row["light"], str)
-        assert number(row["wavelengths"], 0) and number(row["terms"], 1)
-        for key in ("point_source", "scene_pixel", "factor", "separability", "separability_centred"):
-            assert number(row[key], 0, 2), row
-    for row in study["quality"]:
-        assert row["frames"] in ("idealised", "rendered") and isinstance(row["factors"], str)
-        assert number(row["psnr_db"], -50, 100) and number(row["psnr_best_db"], row["psnr_db"], 100)
-        assert number(row["loss_db"], -50, 100) and number(row["residual"]) and row["status"]
-    names = ["diffraction.json", "quality.png", "shadow.png"]
-    assert sorted(path.name for path in (tmp_path / "study").iterdir()) == names
-
-
 def test_doctor(call: Callable[..., Any]) -> None:
     found = call("doctor", "--json", "--quiet", "--variant", "llvm_ad_mono").payload
     assert found["ok"] is True and len(found["checks"]) == 9, found
@@ -219,8 +189,8 @@ def test_doctor(call: Callable[..., Any]) -> None:
 
 
 def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    for verb in (("plan", *lab.rig), ("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4")):
-        outcome = call(*verb, "--effects=-diffraction", "--accuracy", "0.005", "--json")
+    for verb in (("plan",), ("capture", "-o", tmp_path / "run")):
+        outcome = call(*verb, *lab.rig, "--patterns", "dots:4", "--effects=-diffraction", "--json")
         assert outcome.code == 1
         assert outcome.payload["warnings"] and "diffraction (off)" in outcome.payload["warnings"][0]
         lines = outcome.err.splitlines()
@@ -229,7 +199,7 @@ def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], la
 
 
 def test_a_saturated_capture_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "uniform", "--exposure", "100")
+    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4", "--exposure", "1000")
     assert outcome.code == 1 and "full well" in outcome.err
 
 
@@ -376,6 +346,6 @@ def test_a_refusal_on_a_terminal_leaves_one_line(
 
 
 def test_no_bar_where_stderr_is_no_terminal(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "uniform")
+    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4")
     assert outcome.code == 0 and outcome.err == ""
     assert len(outcome.out.splitlines()) == 2 and "\x1b" not in outcome.out

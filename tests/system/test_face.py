@@ -50,8 +50,6 @@ import importlib, sys
 import mitsim as ms
 assert not {"numpy", "scipy", "mitsuba", "drjit", "pydantic"} & set(sys.modules), "the package alone imports nothing"
 assert set(ms._HOMES) == set(ms.__all__) and set(dir(ms)) == {*ms.__all__, "__version__"}
-for name in sys.argv[1:]:
-    importlib.import_module(f"mitsim.{ms._HOMES[name]}")
 tracing = ["Light", "Rendered"]
 for name in sorted(ms.__all__, key=tracing.__contains__):
     assert name in tracing or "mitsuba" not in sys.modules, "only what traces imports the renderer"
@@ -65,8 +63,15 @@ else:
     raise SystemExit("no such name, and no error")
 """
     # The room `reconstruct` and the function of that name: whichever is imported first.
-    for first in ((), ("load_calibration",)):
-        done = subprocess.run([sys.executable, "-c", program, *first], capture_output=True, text=True, check=False)
+    room = """
+import importlib
+import mitsim as ms
+home = importlib.import_module(f"mitsim.{ms._HOMES['load_calibration']}")
+assert ms.load_calibration is home.load_calibration
+assert ms.reconstruct is importlib.import_module(f"mitsim.{ms._HOMES['reconstruct']}").reconstruct
+"""
+    for each in (program, room):
+        done = subprocess.run([sys.executable, "-c", each], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
 
 

@@ -65,7 +65,13 @@ def stopped(call: Callable[..., Any], lab: Any, run: Path, whole: Path, how: sig
     assert_resumed(call, lab, run, whole)
 
 
-@pytest.mark.parametrize(("how", "least"), [(signal.SIGTERM, 100), (signal.SIGKILL, 0)])
+@pytest.mark.parametrize(
+    ("how", "least"),
+    [
+        (signal.SIGINT, 100),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((signal.SIGTERM, 100), (signal.SIGKILL, 0))),
+    ],
+)
 def test_a_stopped_run_loses_no_frame(
     call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path, how: signal.Signals, least: int
 ) -> None:
@@ -82,11 +88,12 @@ def test_no_moment_is_a_bad_one(
     stopped(call, lab, tmp_path / "run", whole, how, least)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "words"),
     [
         (signal.SIGKILL, "out of memory, or killed from outside"),
-        pytest.param(signal.SIGABRT, "a crash in native code", marks=pytest.mark.slow),
+        (signal.SIGABRT, "a crash in native code"),
     ],
 )
 def test_a_worker_that_dies_while_it_renders(
@@ -246,12 +253,16 @@ def test_resume_with_another_texture_is_refused(
 # ---- the machine -----------------------------------------------------------------------------------------------------
 
 
-def test_a_home_that_takes_no_kernels(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    """Dr.Jit's kernel cache lies in the home folder; without it the run compiles anew and gives the same frames."""
+def test_a_home_that_takes_no_kernels(
+    shell: Callable[..., Any], call: Callable[..., Any], lab: Any, tmp_path: Path
+) -> None:
+    """Dr.Jit's kernel cache lies in the home folder; without it the program compiles anew, to the same frame."""
     environment = {**os.environ, "HOME": "/proc/nowhere", "XDG_CACHE_HOME": "/proc/nowhere"}
-    outcome = shell("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4", "--json", env=environment)
-    assert outcome.payload["frames"] == 16
-    assert_equal_runs(tmp_path / "run", lab.run)
+    options = "render", lab.scene, "--spp", 16, "--json", "-o"
+    outcome = shell(*options, tmp_path / "anew.exr", env=environment)
+    assert outcome.payload["mean"] == call(*options, tmp_path / "kept.exr").payload["mean"]
+    ours, theirs = (read_frame(tmp_path / f"{name}.exr")[0] for name in ("anew", "kept"))
+    assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
 
 
 # ---- numbers ---------------------------------------------------------------------------------------------------------

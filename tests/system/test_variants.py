@@ -25,7 +25,7 @@ def channels(path: Path) -> list[np.ndarray]:
     return colours
 
 
-@pytest.mark.parametrize("colour", VARIANTS)
+@pytest.mark.parametrize("colour", [pytest.param(VARIANTS[0], marks=pytest.mark.slow), VARIANTS[1]])
 def test_the_reference_sees_a_grey_scene_alike_in_every_variant(
     call: Callable[..., Any], shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str
 ) -> None:

@@ -29,7 +29,7 @@ from mitsim.reconstruct.solver import prepare
 from mitsim.rig.patterns import parse_patterns
 from mitsim.sensor.moments import frame_moments
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = pytest.mark.usefixtures("kept_plans")
 N, ACCURACY = 16, 3e-3
 LAMPS = """<default name="lamp" value="15"/>
 <shape type="rectangle">

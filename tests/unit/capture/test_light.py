@@ -24,7 +24,7 @@ from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.rig.patterns import Lighting, parse_patterns
 from tests.unit.capture.invented_evidence import EVIDENCE
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16
 
 

@@ -27,7 +27,7 @@ from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.moments import frame_moments
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = pytest.mark.usefixtures("kept_plans")
 N, ACCURACY = 16, 1e-2
 FILES = [f"frame_{index:05d}.exr" for index in range(9)]
 

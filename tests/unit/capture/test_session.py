@@ -29,7 +29,7 @@ from mitsim.rig.camera import centred_edges
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16
 CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16), ("separable", "pair", 13)]
 Done = tuple[Bench, Factors, Estimate, Path]

@@ -21,7 +21,7 @@ from mitsim.capture.planning import make_plan
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.rig.patterns import parse_patterns
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = pytest.mark.usefixtures("kept_plans")
 N, SHEET, HALF_SENSOR, Z = 16, 128.0, 32 * 0.01172, 400.0
 INSIDE = 2.365
 CARD_AT, CARD_HALF = np.array([10.0, -8.0, 345.0]), np.array([21.3, 33.7])
