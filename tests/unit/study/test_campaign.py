@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -18,22 +19,39 @@ from mitsim.study.experiment import Scope, Setup
 from mitsim.study.page import build_page
 from mitsim.study.points import Shard
 
+pytestmark = pytest.mark.usefixtures("draft_figures")
+
 TOY = "tests.unit.study.toy_study"
 ROOT = Path(__file__).parents[3]
 SCOPE = Scope(Setup("nowhere"), (None,))
 ALL = {f"{place}{number}" for place in "abcd" for number in (1, 2, 3)}
 Run = Callable[..., CampaignResult]
+Whole = tuple[CampaignResult, Path]
+
+
+def set_up(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """The toy study can be imported, here and in workers, and tells of its points in a ``folder``."""
+    patch.setenv("TOY_FOLDER", str(folder))
+    patch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    patch.syspath_prepend(str(ROOT))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, draft_figures: None) -> Whole:
+    """All of it in one go, and its folder, which is not to be changed."""
+    folder = tmp_path_factory.mktemp("toy")
+    with pytest.MonkeyPatch.context() as patch:
+        set_up(folder, patch)
+        return run_experiment(TOY, SCOPE, folder / "whole", where=Where(jobs=1)), folder / "whole"
 
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """Runs the toy study into a folder of that name; ``run.begun()`` are the points that were begun since."""
-    monkeypatch.setenv("TOY_FOLDER", str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
-    monkeypatch.syspath_prepend(str(ROOT))
+    set_up(tmp_path, monkeypatch)
 
     def call(name: str = "out", scope: Scope = SCOPE, **where: object) -> CampaignResult:
-        return run_experiment(TOY, scope, tmp_path / name, where=Where(**{"jobs": 2, **where}))  # type: ignore[arg-type]
+        return run_experiment(TOY, scope, tmp_path / name, where=Where(**{"jobs": 1, **where}))  # type: ignore[arg-type]
 
     yield call
     sys.modules.pop(TOY, None)
@@ -55,7 +73,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path) -> None:
-    result = run()
+    result = run(jobs=2)
     assert begun(tmp_path) == sorted(ALL) and result.points == 12 and not result.missing
     assert [claim.verdict for claim in result.claims] == ["confirmed"]
     folder = tmp_path / "out"
@@ -69,21 +87,17 @@ def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path)
     assert "Two squared is four" in page and "data:image/png;base64," in page and "<script" not in page
 
 
-def test_what_is_there_is_not_measured_again(run: Run, tmp_path: Path) -> None:
+def test_what_is_there_is_not_measured_again(run: Run, tmp_path: Path, whole: Whole) -> None:
     """Quick points first, then all; results equal those of one go. (Planted: points named by their place.)"""
-    run("one go")
-    begun(tmp_path)
     run("two", Scope(SCOPE.setup, (None,), quick=True))
     assert begun(tmp_path) == sorted(point for point in ALL if point[1] != "3")
     run("two")
     assert begun(tmp_path) == sorted(point for point in ALL if point[1] == "3")
-    assert contents(tmp_path / "two") == contents(tmp_path / "one go")
+    assert contents(tmp_path / "two") == contents(whole[1])
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path, count: int) -> None:
-    run("whole")
-    begun(tmp_path)
+def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path, whole: Whole, count: int) -> None:
     parts = [tmp_path / f"part{number}" for number in range(count)]
     for number, part in enumerate(parts, start=1):
         found = run(part.name, shard=Shard(number, count))
@@ -91,11 +105,13 @@ def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path,
     assert begun(tmp_path) == sorted(ALL), "each point in one part"
     joined = merge(parts, tmp_path / "joined")
     assert begun(tmp_path) == [] and not joined.missing
-    assert contents(tmp_path / "joined") == contents(tmp_path / "whole")
+    assert contents(tmp_path / "joined") == contents(whole[1])
     assert merge(parts[1:], tmp_path / "half").missing == len(list((parts[0] / "points").iterdir()))
 
 
-def test_all_studies_are_sharded_and_merged_too(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_studies_are_sharded_and_merged_too(
+    run: Run, tmp_path: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On one page. (Planted: parts merged as one study's.)"""
     monkeypatch.setattr(campaign, "PAPER", (TOY,))
     parts = [tmp_path / f"part{number}" for number in (1, 2)]
@@ -106,13 +122,12 @@ def test_all_studies_are_sharded_and_merged_too(run: Run, tmp_path: Path, monkey
     assert not joined.missing and begun(tmp_path) == sorted(ALL)
     assert [claim.verdict for claim in joined.claims] == ["confirmed"] and joined.figures == (f"{TOY}/squares.png",)
     assert "Two squared is four" in (tmp_path / "whole" / "all.html").read_text()
-    run("alone")
-    assert contents(tmp_path / "whole" / TOY) == contents(tmp_path / "alone")
+    assert contents(tmp_path / "whole" / TOY) == contents(whole[1])
 
 
-def test_a_page_of_several_has_each_claim_under_its_command(run: Run, tmp_path: Path) -> None:
+def test_a_page_of_several_has_each_claim_under_its_command(whole: Whole, tmp_path: Path) -> None:
     """(Planted: one table without commands.)"""
-    section = run("one").section
+    section = whole[0].section
     assert section
     page = build_page([section, replace(section, command="mitsim study other")], tmp_path / "page.html", "Two")
     summary = page.read_text().split("<h2")[1]
@@ -121,18 +136,19 @@ def test_a_page_of_several_has_each_claim_under_its_command(run: Run, tmp_path: 
     assert first < claim < second < summary.index("Two squared is four", claim + 1)
 
 
-def test_a_killed_worker_loses_its_point_only(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_worker_loses_its_point_only(
+    run: Run, tmp_path: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And nothing that processes leave in their temporary folders stays. (Planted: their folder the parent's.)"""
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     monkeypatch.setenv("TMPDIR", str(scratch))  # for the processes
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     (tmp_path / "fatal b2").write_text("once")
-    assert not run().missing
+    assert not run(jobs=2).missing
     assert list(scratch.iterdir()) == []
     assert begun(tmp_path) == sorted([*ALL, "b2"])
-    run("whole")
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    assert contents(tmp_path / "out") == contents(whole[1])
 
 
 def test_a_point_that_kills_again_ends_the_study_and_keeps_the_rest(run: Run, tmp_path: Path) -> None:
@@ -155,8 +171,8 @@ def test_what_a_point_refuses_is_one_line_and_the_rest_is_kept(run: Run, tmp_pat
     assert begun(tmp_path) == ["c3", "d1", "d2", "d3"]
 
 
-def test_a_damaged_point_is_named(run: Run, tmp_path: Path) -> None:
-    run()
+def test_a_damaged_point_is_named(run: Run, tmp_path: Path, whole: Whole) -> None:
+    shutil.copytree(whole[1], tmp_path / "out")
     file = sorted((tmp_path / "out" / "points").iterdir())[0]
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(MitsimError, match=f"{file.name}: cannot be read as a point of a study .* remove it"):

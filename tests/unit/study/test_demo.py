@@ -21,6 +21,8 @@ from mitsim.study.compare import label
 from mitsim.study.demo import demo, scene_line
 from mitsim.study.metrics import psnr
 
+pytestmark = pytest.mark.usefixtures("draft_figures")
+
 
 @pytest.mark.parametrize(
     ("text", "line"),

@@ -23,6 +23,8 @@ from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import relative_error
 from mitsim.study.runner import StudyResult
 
+pytestmark = pytest.mark.usefixtures("draft_figures")
+
 N = 16
 PRINT = np.clip(60 + 150 * np.random.default_rng(3).random((32, 32)), 0, 255)
 
@@ -157,5 +159,20 @@ def test_files_and_report(result: StudyResult, study: diffraction.DiffractionFin
     kept = json.loads((folder / "diffraction.json").read_text())
     assert len(kept["shadows"]) == 8
     assert len(kept["quality"]) == 2 * 2 * 7 + 2 * 2 * 2, "idealised: one pair of factors without diffraction"
-    assert kept["seed"] == 1 and {"loss_db", "psnr_db", "residual", "status"} <= kept["quality"][0].keys()
+    assert kept["seed"] == 1 and result.payload().keys() >= {*kept, "output"} - {"kind", "seed", "versions"}
+    keys = {"mask", "light", "wavelengths", "terms", "separability", "separability_centred", "factor", "scene_pixel"}
+    assert all(row.keys() >= keys | {"point_source"} for row in kept["shadows"])
+    keys = {
+        "frames",
+        "mask",
+        "light",
+        "patterns",
+        "factors",
+        "psnr_db",
+        "psnr_best_db",
+        "loss_db",
+        "residual",
+        "status",
+    }
+    assert all(row.keys() >= keys for row in kept["quality"])
     assert study.verdict in " ".join(result.lines())

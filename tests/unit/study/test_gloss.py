@@ -16,6 +16,8 @@ from mitsim.study.exposures import EQUAL_PEAK, LitScene, Unexposed
 from mitsim.study.gloss import CAUSES, INTERREFLECTION, PIXELS, REST, SATURATION, SENSOR, Split, split
 from mitsim.study.ideal import IdealCamera
 
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
 BOARD = 0.99
 """Reflectance that counts as 1."""
 CAMERA = """name = "wide"

@@ -18,6 +18,7 @@ from mitsim.study.demo import _no_image
 from mitsim.study.metrics import Quality
 from mitsim.study.trust import Trust
 
+pytestmark = pytest.mark.usefixtures("draft_figures")
 N = 32
 
 
@@ -135,8 +136,14 @@ class _Outside(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def page() -> str:
+def page(draft_figures: None) -> str:
     return R.render_html(example())
+
+
+@pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of pages whose words alone count, plots are not drawn."""
+    monkeypatch.setattr(R, "_picture", lambda figure: R.data_uri(b"a plot"))
 
 
 def test_nothing_is_loaded_from_elsewhere(page: str) -> None:
@@ -167,6 +174,7 @@ def test_each_image_stands_in_its_place(page: str) -> None:
     assert page.count('class="picture result best"') == 2
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_an_empty_report_has_no_empty_section() -> None:
     page = R.render_html(R.ReportData("t", "v", np.ones((4, 4)), "s"))
     assert re.findall(r"<h2>(.*?)</h2>", page) == ["The scene"]
@@ -195,6 +203,7 @@ def test_trust_is_a_row_a_family_and_one_picture_of_the_main_one(page: str) -> N
     assert section.count("<img ") == 1 and 'alt="Stated uncertainty and actual error, 49 dots"' in section
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_an_image_without_its_uncertainty_has_no_row() -> None:
     family = example().families[3]
     assert family.rendered is not None
@@ -202,6 +211,7 @@ def test_an_image_without_its_uncertainty_has_no_row() -> None:
     assert "How far to trust" not in R.render_html(replace(example(), families=(unknown,)))
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_an_image_too_small_for_ssim_is_shown_without(page: str) -> None:
     family = example().families[0]
     small = replace(family, rendered=R.Recovery(np.ones((4, 4)), Quality(20.0, None)))
@@ -209,6 +219,7 @@ def test_an_image_too_small_for_ssim_is_shown_without(page: str) -> None:
     assert text.count("SSIM") == 1 and page.count("SSIM") == 12, "10 recoveries and 2 tiles"
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_text_cannot_become_markup() -> None:
     one = example().families[:1]
     page = R.render_html(replace(example(), families=one, verdict="<b>&", configuration={"<i>": "</table>"}))
@@ -219,6 +230,7 @@ def test_the_same_data_give_the_same_bytes(page: str) -> None:
     assert R.render_html(example()) == page
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_only_a_solver_with_something_to_say_is_heard(page: str) -> None:
     assert "Solved" not in page
 
@@ -237,6 +249,7 @@ def test_only_a_solver_with_something_to_say_is_heard(page: str) -> None:
     assert "Solved, but 3 of 9" in text and "Rank deficient" in text
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_plan_shows_costs_where_there_are_any_and_no_column_of_zeros(page: str) -> None:
     table = page.split("<h2>The effect plan</h2>")[1].split("</table>")[0]
     assert ">Cost<" in table and "0.80 s" in table and "0.00 s" not in table
@@ -295,6 +308,7 @@ def test_refuses_what_it_cannot_show() -> None:
         R.verdict(R.FamilyResult("a", "A", 1), R.FamilyResult("b", "B", 1))
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = R.ReportData("t", "v", np.ones((4, 4)), "s")
     target = R.build_report(small, tmp_path / "report.html")

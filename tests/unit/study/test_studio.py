@@ -16,6 +16,8 @@ from mitsim.study.ideal import Plane
 from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
 from mitsim.study.studio import Image, Studio
 
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
 
 @pytest.fixture(scope="module")
 def setup(shared_scene: Callable[..., Path], variant: str) -> Setup:

@@ -24,6 +24,8 @@ from mitsim.study.studio import Studio
 from mitsim.study.sweepcam import MovedMask, _consistent, calibrated_places, ideal_places, moved
 from mitsim.study.table import Table
 
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
 PLACES = (-0.6, 0.0, 0.42)
 """Ten features one way, seven the other [mm]."""
 

@@ -32,6 +32,8 @@ from mitsim.study.paper.waterfall import ALONE, EXPERIMENT, IN_ORDER, LEFT_OUT, 
 from mitsim.study.studio import Studio
 from mitsim.study.table import Mean, Table
 
+pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
+
 FAMILY = "dots:4"
 SEEDS = 3
 
