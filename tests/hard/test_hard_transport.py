@@ -52,9 +52,8 @@ def test_sharp_lobes_are_found_from_the_surface(
     assert found < lobe(alpha) + SIGMAS * error
 
 
-@pytest.mark.parametrize(
-    ("alpha", "seen"), [pytest.param(1e-2, True, marks=SLOW), pytest.param(1e-3, False, marks=SLOW), (1e-4, False)]
-)
+@SLOW
+@pytest.mark.parametrize(("alpha", "seen"), [(1e-2, True), (1e-3, False), (1e-4, False)])
 def test_a_lobe_that_would_be_missed_flags_the_plan(
     measured: Recorder, small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, alpha: float, seen: bool
 ) -> None:

@@ -201,11 +201,10 @@ def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None
 @pytest.mark.parametrize(
     ("name", "rho"),
     [
-        ("path", 0.5),
         ("factored", 0.9),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("path", 0.9), ("factored", 0.3), ("factored", 0.6))
+            for case in (("path", 0.5), ("path", 0.9), ("factored", 0.3), ("factored", 0.6))
         ),
     ],
 )

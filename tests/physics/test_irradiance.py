@@ -195,7 +195,7 @@ def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
 PIXELS = [(0, 0), (0, 15), (3, 11)]
 
 
-@pytest.mark.parametrize("pixel", PIXELS)
+@pytest.mark.parametrize("pixel", [PIXELS[0], *(pytest.param(pixel, marks=pytest.mark.slow) for pixel in PIXELS[1:])])
 def test_a_projector_pixel_lands_where_it_should(small_scene: Callable[..., Path], pixel: tuple[int, int]) -> None:
     canvas = np.zeros((16, 32))
     canvas[pixel[0], 16 + pixel[1]] = 255

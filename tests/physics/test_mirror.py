@@ -194,6 +194,7 @@ def test_dots_by_a_mirror(variant: str) -> None:
         assert relative(frame, REFLECTANCE * light[0] * np.outer(left, right)) < 1e-3
 
 
+@pytest.mark.slow
 def test_dots_by_a_mirror_that_casts_a_keystone(variant: str) -> None:
     """Projector pixels lie askew on the sensor pixels. Coarse sensor pixels, each the mean of 64 x 64 parts."""
     pixels, pitch, fine = 48, 0.125, 64
@@ -356,6 +357,7 @@ def mirror_part(light) -> np.ndarray:
     return whole - next(iter(traced)).irradiance
 
 
+@pytest.mark.slow
 def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) -> None:
     """Ray optics. What is left of the frame without the analytic glint is what the reference sees: the board alone."""
     bench = shipped_bench("mirror")
@@ -405,6 +407,7 @@ def test_the_shipped_mirror_in_wave_optics(shipped_bench, variant: str) -> None:
 # ---- a projector of finite aperture
 
 
+@pytest.mark.slow
 def test_a_perfect_mirror_with_an_aperture_in_the_reference(variant: str) -> None:
     """Camera paths find a lens by chance: its light is the beams', whose point source is that lens, made small.
 

@@ -40,7 +40,6 @@ SCENES = {
     "a mirror wall behind": slab(220, 5, 20) + MIRROR_WALL,
     "a lamp before": slab(300, 5, 20) + LAMP,
 }  # fmt: skip
-QUICK = ("two, both slanted",)
 
 
 @pytest.fixture(scope="module")
@@ -103,14 +102,13 @@ def test_a_pane_before_the_camera_counts_light_once(scene: Callable[..., Bench])
     assert abs(found - expected) < SIGMAS * error + 1e-3 * expected
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_all_light_is_that_of_paths_that_meet_the_lens(scene: Callable[..., Bench], name: str) -> None:
     bench = scene(SCENES[name])
     light = [all_light(bench, seed, 64, LENS, WALL) for seed in range(SEEDS)]
     found, error = mean([float(parts.sum()) for parts in light])
-    expected, spread = reference_with_lens(bench, 128 if name in QUICK else 512)
+    expected, spread = reference_with_lens(bench, 512)
     gate = SIGMAS * np.hypot(error, spread)
     assert gate < 0.04 * expected
     assert abs(found - expected) < gate, f"{found / expected - 1:+.2%}, gate {gate / expected:.2%}"

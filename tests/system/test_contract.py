@@ -203,6 +203,7 @@ def test_a_saturated_capture_is_flagged(call: Callable[..., Any], lab: Any, tmp_
     assert outcome.code == 1 and "full well" in outcome.err
 
 
+@pytest.mark.slow
 def test_an_under_determined_image_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     # 12 sensor rows cannot tell 16 scene rows apart under one pattern.
     scene = lab.write_scene("few", pixels=12)

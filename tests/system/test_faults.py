@@ -129,6 +129,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", disk], check=True)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_during_a_run(call: Callable[..., Any], lab: Any, whole: Path, small_disk: Path) -> None:
     run = small_disk / "run"
     process = running(20, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS, "--json")
@@ -165,6 +166,7 @@ def test_a_read_only_disk_is_refused_before_work(refused: Callable[..., str], la
 # ---- the folder ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_runs_on_one_folder(call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path) -> None:
     """The second is refused while the first writes, whatever its options; the first does not notice."""
     run = tmp_path / "run"

@@ -171,19 +171,6 @@ def test_a_second_reconstruction_replaces_the_first_when_it_is_asked_to(
     assert written() == 1e9
 
 
-def test_the_same_seed_gives_the_same_frames_and_another_gives_others(
-    call: Callable[..., Any], lab: Any, tmp_path: Path
-) -> None:
-    def frame(name: str, seed: int) -> np.ndarray:
-        options = "--patterns", "dots:2", "--seed", seed
-        assert call("capture", *lab.rig, "-o", tmp_path / name, *options).code == 0
-        return read_frame(tmp_path / name / "frame_00003.exr")[0]["DN"].astype(float)
-
-    first, again, other = frame("a", 5), frame("b", 5), frame("c", 6)
-    assert np.array_equal(first, again)
-    assert np.mean(first != other) > 0.5
-
-
 def test_noise_is_drawn_afresh_for_every_frame_and_seed(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     """Frames less what their electrons promise: unit variance in units of the sensor's noise, and no correlation.
 
@@ -214,6 +201,7 @@ def test_a_flatcam_from_end_to_end(call: Callable[..., Any], lab: Any, tmp_path:
     assert found["psnr"] > 30
 
 
+@pytest.mark.slow
 def test_both_estimators_render_the_same_frame(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     """Under uniform light both estimators see the same irradiance, but for diffraction, which the reference lacks.
 

@@ -56,7 +56,7 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
         ("sweep", ("--over", "seed=x"), "give whole numbers"),
         ("sweep", ("--over", "albedo=1:2:3", "--measure", "speed"), "--measure 'speed': use psnr"),
         ("patterns", ("a.xml", "b.xml"), "give one scene"),
-        ("patterns", ("no_such_scene", "--jobs", 1), "no_such_scene"),
+        pytest.param("patterns", ("no_such_scene", "--jobs", 1), "no_such_scene", marks=pytest.mark.slow),
         ("merge", (), "give the folders of the parts"),
     ],
 )

@@ -25,7 +25,8 @@ def channels(path: Path) -> list[np.ndarray]:
     return colours
 
 
-@pytest.mark.parametrize("colour", [pytest.param(VARIANTS[0], marks=pytest.mark.slow), VARIANTS[1]])
+@pytest.mark.slow
+@pytest.mark.parametrize("colour", VARIANTS)
 def test_the_reference_sees_a_grey_scene_alike_in_every_variant(
     call: Callable[..., Any], shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str
 ) -> None:
@@ -42,9 +43,8 @@ def test_the_reference_sees_a_grey_scene_alike_in_every_variant(
         assert abs(frame.mean() - mono["mean"]) < 5 * error / np.sqrt(frame.size)
 
 
-@pytest.mark.parametrize(
-    ("colour", "gate"), [(VARIANTS[0], 1e-6), pytest.param(VARIANTS[1], 2 * float(ACCURACY), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("colour", "gate"), [(VARIANTS[0], 1e-6), (VARIANTS[1], 2 * float(ACCURACY))])
 def test_capture_in_every_variant(
     shell: Callable[..., Any], lab: Any, tmp_path: Path, colour: str, gate: float
 ) -> None:

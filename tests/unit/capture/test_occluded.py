@@ -115,7 +115,7 @@ def test_the_plan_gives_them_anchors_and_the_others_few(bench: Bench) -> None:
     assert loose.row("occluded-anchors").state == "off" and loose.settings.with_own_anchors == ()
 
 
-@pytest.mark.parametrize("shows", ["none", "nothing else"])
+@pytest.mark.parametrize("shows", ["none", pytest.param("nothing else", marks=pytest.mark.slow)])
 def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
     bench: Bench, shows: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

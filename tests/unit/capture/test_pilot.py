@@ -252,6 +252,7 @@ def test_the_pilot_is_reproducible(bench: Bench, evidence: Evidence) -> None:
     assert np.array_equal(again.changes.products, evidence.changes.products)
 
 
+@pytest.mark.slow
 def test_the_pilot_of_a_flat_scene_is_reproducible(small_scene: Callable[..., Path]) -> None:
     flat = open_bench(small_scene())
     one, again, other = (measured(flat, seed) for seed in (3, 3, 4))

@@ -31,7 +31,8 @@ from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16
-CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16), ("separable", "pair", 13)]
+CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16)]
+CASES += [pytest.param("separable", "pair", 13, marks=pytest.mark.slow)]
 Done = tuple[Bench, Factors, Estimate, Path]
 """The bench, its factors, the estimate that they were made of, and their folder."""
 
@@ -222,7 +223,7 @@ def assert_equal(ours: Factors, theirs: Factors) -> None:
 
 
 @pytest.mark.usefixtures("geometric_sessions")
-@pytest.mark.parametrize("mode", ["pair", "uniform"])
+@pytest.mark.parametrize("mode", ["pair", pytest.param("uniform", marks=pytest.mark.slow)])
 def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
     shared_scene: Callable[..., Path],
     tmp_path: Path,

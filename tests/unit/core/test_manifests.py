@@ -120,6 +120,7 @@ def test_patterns_that_no_reader_takes_are_refused_before_work() -> None:
         Patterns.of(PatternFamily("uniform", row, row), ["a.exr"])
 
 
+@pytest.mark.slow
 def test_the_largest_manifest_that_is_written_is_read(tmp_path: Path) -> None:
     """65536 shots of 4096 x 256 patterns."""
     family = parse_patterns("dots:256", MOST_PIXELS)

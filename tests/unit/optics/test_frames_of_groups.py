@@ -17,7 +17,7 @@ from tests.unit.optics.small_camera import (
 SEEDS = 300
 
 
-@pytest.mark.parametrize("groups", [2, 4])
+@pytest.mark.parametrize("groups", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_the_predicted_variance_is_the_actual_one(groups: int) -> None:
     """Squared error / predicted variance over 300 seeds is 1 within five of its own standard deviations.
 

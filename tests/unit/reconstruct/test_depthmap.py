@@ -65,7 +65,11 @@ def psnr(image: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("patterns", "baseline"),
-    [("dots:4x10", BESIDE), ("dots:4x8", BESIDE), ("dots:8", BASELINE), ("dots:5x8", BASELINE)],
+    [
+        ("dots:4x8", BESIDE),
+        ("dots:8", BASELINE),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("dots:4x10", BESIDE), ("dots:5x8", BASELINE))),
+    ],
 )
 def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> None:
     """Both depths are found, and the image is within 2.5 dB of that at the true depths, 15 above that at one depth.
@@ -82,7 +86,10 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> 
     assert found.told.mean() > 0.9
 
 
-@pytest.mark.parametrize(("depth", "patterns"), [(400.0, "dots:4x8"), (380.0, "dots:4x8"), (360.0, "dots:4")])
+@pytest.mark.parametrize(
+    ("depth", "patterns"),
+    [pytest.param(400.0, "dots:4x8", marks=pytest.mark.slow), (380.0, "dots:4x8"), (360.0, "dots:4")],
+)
 def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
     """And the image that its own depth gives, less 1.5 dB: twice as many unknowns. At 360 mm light lies half a period
     of 4 beside. (Planted: depths looked for about the calibrated one alone.)"""
@@ -97,7 +104,12 @@ def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("near", "far", "patterns"), [(330.0, 500.0, "dots:4x5"), (370.0, 430.0, "dots:4"), (345.0, 470.0, "dots:4x8")]
+    ("near", "far", "patterns"),
+    [
+        (330.0, 500.0, "dots:4x5"),
+        (370.0, 430.0, "dots:4"),
+        pytest.param(345.0, 470.0, "dots:4x8", marks=pytest.mark.slow),
+    ],
 )
 def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: float, far: float, patterns: str) -> None:
     """Parallax of 8.2 pixels under dots 5 apart, of 3 under 4 and of 6.2 under 8. (Planted: nothing spared; no

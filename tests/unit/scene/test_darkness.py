@@ -85,7 +85,14 @@ CARD = """<shape type="rectangle"><transform name="to_world"><scale value="90"/>
     <bsdf type="mask"><float name="opacity" value="0"/><bsdf type="diffuse"/></bsdf></shape>"""
 
 
-@pytest.mark.parametrize("before", [CARD, PANE.format(z=200, bsdf="dielectric"), PANE.format(z=200, bsdf="null")])
+@pytest.mark.parametrize(
+    "before",
+    [
+        CARD,
+        PANE.format(z=200, bsdf="dielectric"),
+        pytest.param(PANE.format(z=200, bsdf="null"), marks=pytest.mark.slow),
+    ],
+)
 def test_causes_are_looked_for_behind_what_lets_light_pass(small_scene: Write, before: str) -> None:
     """(Seen failing: the material of what stands before was blamed.)"""
     words = sentence(small_scene(extra=before), FLIP)

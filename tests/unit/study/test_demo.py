@@ -47,6 +47,7 @@ def test_every_shipped_scene_says_what_it_is(path: Path) -> None:
     assert line.startswith(f"{path.parent.name}: ") and len(line) > 40
 
 
+@pytest.mark.slow
 def test_the_scene_is_traced_once_and_a_speckled_projector_shows_in_every_family(
     shared_scene: Callable[..., Path], variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -77,6 +77,7 @@ def test_brighter_paint_is_all_brightness(lit: Callable[..., LitScene]) -> None:
     np.testing.assert_allclose(sum(found.parts.values()), found.solution.image - dull.truth, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_full_well_is_told_apart(lit: Callable[..., LitScene]) -> None:
     """Four times the exposure that fills 0.8 of the full well: what electrons beyond it took from the image, worked out
     with a well of a hard edge (Poisson's law smears it by 1e-3). None of that is left in the rest, where longer

@@ -18,6 +18,7 @@ from tests.conftest import write_png
 from tests.physics.test_sharp_lobes import on_ball
 
 N, SEEDS, SEVEN = 16, 8, 7.0
+LONGER = pytest.mark.slow
 
 
 def metal(alpha: float) -> str:
@@ -93,7 +94,7 @@ def both(bench: Bench, pixels: np.ndarray, samples: int) -> tuple[np.ndarray, np
     return totals(AimedTracer(*parts, pixels), samples), totals(DirectTracer(*parts, pixels=pixels), 4 * samples)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=LONGER if name == "plate" else ()) for name in SCENES])
 def test_aimed_rays_find_the_same_light(lit: Callable[[str], tuple[Bench, np.ndarray]], name: str) -> None:
     aimed, even = both(*lit(SCENES[name]), 1024)
     error = np.hypot(aimed.std(axis=0, ddof=1), even.std(axis=0, ddof=1)) / np.sqrt(SEEDS)
@@ -102,7 +103,9 @@ def test_aimed_rays_find_the_same_light(lit: Callable[[str], tuple[Bench, np.nda
     assert (np.abs(aimed.mean(axis=0) - even.mean(axis=0)) < SEVEN * error + 1e-6 * scale).all()
 
 
-@pytest.mark.parametrize(("before", "part"), [(HOLE, 0.25), (PANE, 0.96**4 * (790 / 786) ** 2)])
+@pytest.mark.parametrize(
+    ("before", "part"), [(HOLE, 0.25), pytest.param(PANE, 0.96**4 * (790 / 786) ** 2, marks=LONGER)]
+)
 def test_lobes_are_found_behind_what_lets_light_pass(
     lit: Callable[[str], tuple[Bench, np.ndarray]], before: str, part: float
 ) -> None:
@@ -123,6 +126,7 @@ def test_lobes_are_found_behind_what_lets_light_pass(
     assert AimedTracer(*parts, pixels)._aims.known.any()
 
 
+@LONGER
 def test_a_highlight_that_few_rays_meet_is_looked_at_again(lit: Callable[..., tuple[Bench, np.ndarray]]) -> None:
     """A ball sends one ray of 1400 of its pixel to the sensor, 12 of 2^22 of all: by these alone, 30 % are unsure.
 

@@ -71,7 +71,9 @@ def circle_below(distance: np.ndarray, radius: float) -> np.ndarray:
     return 0.5 + (np.arcsin(s) + s * np.sqrt(1 - s**2)) / np.pi
 
 
-@pytest.mark.parametrize(("z", "focus"), [(800.0, 400.0), (400.0, 400.0), (200.0, 400.0)])
+@pytest.mark.parametrize(
+    ("z", "focus"), [(800.0, 400.0), pytest.param(400.0, 400.0, marks=pytest.mark.slow), (200.0, 400.0)]
+)
 def test_an_edge_spreads_by_the_blur_circle(z: float, focus: float) -> None:
     """The window's left edge, texel 16 of 32, is on the projector's axis. A point of the picture is a disk of radius
     a |z - focus| / focus there, so the edge is the disk's part on one side."""

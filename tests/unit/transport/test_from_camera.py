@@ -48,7 +48,7 @@ def tracer(bench: Bench, **followed: object) -> FromCameraTracer:
     return FromCameraTracer(loaded.scene, loaded.camera, bench.projector_optics, grid(bench), Paths(**followed))
 
 
-@pytest.mark.parametrize("interreflection", [False, True])
+@pytest.mark.parametrize("interreflection", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_an_even_sky(outdoors: Bench, interreflection: bool) -> None:
     """The sheet of albedo 0.5 shows half of the sky's radiance, and where the sheet ends is the sky itself.
 

@@ -263,6 +263,7 @@ print(tests["flux"](tests["scene_with"](sheet=tests["plane"](0, 400, half))))
 """
 
 
+@pytest.mark.slow
 def test_rgb_and_spectral_see_the_same_grey(variant: str) -> None:
     """Children, because a process must not use objects of one variant under another."""
     expected = 0.5 * flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))

@@ -87,8 +87,9 @@ def test_a_sharp_lobe_over_a_mirror_is_left_out(
     assert error < 0.05 * expected and found == pytest.approx(expected, rel=0.2)
     broad = shared_scene(f"broad{way}", extra=MIRROR + gloss(place, 0.1), sheet_z=-500, fov=30)
     assert left_out(open_bench(broad, for_render=True), PILOTS)[0] < 0.06 * expected
-    plan = make_plan(bench, Lighting.uniform(16), 1e-1, 1, {"interreflection": False, "diffraction": False})
-    assert plan.warnings and plan.systematic_error > 0.1, plan.warnings
+    if place == LIT:
+        plan = make_plan(bench, Lighting.uniform(16), 1e-1, 1, {"interreflection": False, "diffraction": False})
+        assert plan.warnings and plan.systematic_error > 0.1, plan.warnings
 
 
 @pytest.mark.parametrize("alpha", [1e-2, 1e-1])
@@ -161,9 +162,10 @@ def test_a_ball_is_seldom_met_however_broad_its_lobe(
 def test_windows_leave_nothing_out(shared_scene: Callable[..., Path]) -> None:
     """But what is reflected inside of them on both ways, R^2 = 1.6e-3 each."""
     bench = open_bench(shared_scene("window", extra=slab(220, 6, 20), sheet_z=WALL))
-    assert left_out(bench)[0] < 1e-5 * 0.02
+    assert left_out_of(bench, 0).unseen(np.inf, NONE)[0] < 1e-5 * 0.02
 
 
+@pytest.mark.slow
 def test_a_plan_is_flagged_that_leaves_light_out(shared_scene: Callable[..., Path]) -> None:
     """A glass ball before the wall: most of what is lit behind it is seen through it. The flag names its line."""
     ball = BALL.replace('value="5"', 'value="60"')

@@ -65,8 +65,14 @@ def summed(light: Deposits, samples: int, pixels: int) -> np.ndarray:
     return np.array([np.bincount(light.pixel % pixels, light.value * each / samples, pixels) for each in weights])
 
 
-@pytest.mark.parametrize("spread", [False, True])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "spread"),
+    [
+        pytest.param(name, spread, marks=() if spread is (index % 2 == 0) else pytest.mark.slow)
+        for index, name in enumerate(SCENES)
+        for spread in (False, True)
+    ],
+)
 def test_shared_light_is_the_light_of_paths_of_their_own(
     shared_scene: Callable[..., Path], name: str, spread: bool
 ) -> None:
@@ -215,6 +221,7 @@ print(hashlib.sha256(ledger.filed()[0].toarray().tobytes()).hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_the_number_of_threads_changes_no_bit(shared_scene: Callable[..., Path]) -> None:
     scene = shared_scene("threads", extra=SCENES["shiny wall"])
     printed = {

@@ -106,7 +106,9 @@ def scene(shared_scene: Callable[..., Path], variant: str) -> Callable[..., Benc
     return lambda extra: open_bench(shared_scene(f"pane{next(count)}", extra=extra, sheet_z=WALL))
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "one pane" else ()) for name in SCENES]
+)
 def test_the_way_is_snells(scene: Callable[..., Bench], name: str) -> None:
     """To a sensor's corner and to a projector 60 mm aside, from nine places of the wall."""
     extra, planes = SCENES[name]

@@ -28,8 +28,8 @@ def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], sha
     again = plain.repeating(repeats.tolist())
     lanes = repeats.sum() * 16 if shared else by_pixel(repeats.tolist(), N).sum()
     assert again.lanes == lanes
-    looks = [[side.trace(seed, 0, 512) for seed in range(SEEDS)] for side in (plain, again)]
-    found = np.array([[summed(look, 512, N) for look in side] for side in looks])
+    looks = [[side.trace(seed, 0, 256) for seed in range(SEEDS)] for side in (plain, again)]
+    found = np.array([[summed(look, 256, N) for look in side] for side in looks])
     means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
     bound = SIGMAS * np.hypot(*errors)
     assert (np.abs(means[0] - means[1]) <= bound).all() and bound[0].sum() < 0.2 * means[0, 0].sum()
