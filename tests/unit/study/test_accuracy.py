@@ -227,7 +227,8 @@ def test_the_judge_of_the_reference_has_what_the_registry_says(
     """A thick mask is in the reference, the projector's lens and blur are not, nor can traced light be rid of them.
 
     The error of the reference against the right judge is its own noise alone. Against a thin mask's shadow it is 2.5
-    times that at 2048 samples (1.9 at 1024), against light that came through the lens 1.27 times at 64 (both bugs planted).
+    times that at 2048 samples (1.9 at 1024), against light that came through the lens 1.27 times at 64 (both bugs
+    planted).
     """
     print_ = np.random.default_rng(4).integers(40, 256, (16, 16))
     scene = shared_scene(f"judge_{lacking[:4].strip()}", n=16, reflectance=print_)
