@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +18,24 @@ from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Exposure
 from mitsim.capture.run import digital_scale
-from mitsim.capture.session import SIDES, LitSession, Session
+from mitsim.capture.session import SIDES, LitSession, Response, Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.versions import DECIDING, versions
-from mitsim.reconstruct.calibration import Estimate, StripeSums, factors_of_sums, stripe_sums
+from mitsim.optics.frames import Frame
+from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
+NOISY, NOISE_FREE = "noisy", "noise_free"
+"""Kinds of responses that factors are estimated from."""
 _SAVED_EVERY = 8
-"""Responses between two checkpoints: the 16 shots that are exposed at once, or 32 of a noise-free check."""
+"""Responses between two checkpoints: half of those that are looked at at once, or twice as many at 2048 pixels."""
+_STRIPES = "stripes"
+"""The part of a checkpoint that holds the sums over finished responses."""
 
 
 def calibrate(
@@ -68,9 +76,7 @@ def calibrate(
         plan = session.plan(accuracy, job)
         checkpoint.begin()
         lit = session.lit(_light(session, plan, checkpoint, job), job)
-        noisy, saturated = estimate(lit, job, checkpoint=checkpoint)
-        with job.clock.stage("noise-free check"):
-            clean, _ = estimate(lit, job, noise_free=True, checkpoint=checkpoint)
+        (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
         warnings = lit.light.warnings + (() if noisy.ok else (str(noisy.status),))
         if saturated:
             warnings += (
@@ -123,28 +129,59 @@ def estimate(
     checkpoint
         where finished stripes are kept, and those of an interrupted session found.
     """
+    (found,), saturated = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
+    return found, saturated
+
+
+@single_threaded_blas()
+def estimates(
+    lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
+) -> tuple[list[Estimate], int]:
+    """Factors from each kind of responses to a session, whose frames are formed once, and its saturated shots.
+
+    Parameters
+    ----------
+    lit, job, checkpoint
+        as for :func:`estimate`.
+    kinds
+        of ``NOISY`` and ``NOISE_FREE``, one or both.
+    """
     session, checkpoint = lit.session, checkpoint or Checkpoint()
-    count, name = session.signs.shape[1], "noise_free" if noise_free else "noisy"
-    found = _stripes(checkpoint.load(name), session.centre, count)
-    first = [sums.done for sums in found[0]] if found else [0, 0]
-    streams = [
-        lit.noise_free(side, start) if noise_free else lit.noisy(side, job, start)
-        for side, start in zip(SIDES, first, strict=True)
-    ]
-    if found:
-        both, saturated = found
-    else:
-        uniform = [next(stream) for stream in streams]
-        both = stripe_sums(uniform[0].rate, uniform[1].rate, count, session.centre)
-        saturated = sum(response.saturated for response in uniform)
-    for sums, stream in zip(both, streams, strict=True):
-        while sums.done < count:
-            response = next(stream)
-            sums.add(response.rate)
-            saturated += response.saturated
-            if sums.done % _SAVED_EVERY == 0 or sums.done == count:
-                checkpoint.save(name, _stripe_arrays(both, saturated))
-    return factors_of_sums(*both, session.signs, None if noise_free else lit.response_noise), saturated
+    count = session.signs.shape[1]
+    stripes = _restored(checkpoint.load(_STRIPES), kinds, session)
+    if stripes is None:
+        with job.clock.stage("sensor"):
+            first = [list(_responses(lit, kinds, side, *next(lit.patterns(side)))) for side in SIDES]
+        both = [stripe_sums(left.rate, right.rate, count, session.centre) for left, right in zip(*first, strict=True)]
+        stripes = _Stripes(dict(zip(kinds, both, strict=True)), sum(each.saturated for side in first for each in side))
+        del first
+    for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
+        for looked in lit.each(side, partial(_looked, lit, kinds, sums), job, sums[0].done):
+            for own, (seen, saturated) in zip(sums, looked, strict=True):
+                own.put(seen)
+                stripes.saturated += saturated
+            if sums[0].done % _SAVED_EVERY == 0 or sums[0].done == count:
+                checkpoint.save(_STRIPES, stripes.arrays())
+    with job.clock.stage("estimate"):
+        found = [
+            factors_of_sums(*stripes.sums[kind], session.signs, lit.response_noise if kind == NOISY else None)
+            for kind in kinds
+        ]
+    return found, stripes.saturated
+
+
+def _responses(lit: LitSession, kinds: Sequence[str], side: str, number: int, frame: Frame) -> Iterator[Response]:
+    """Each of the ``kinds`` of responses to a pattern, as :meth:`LitSession.patterns` has it."""
+    for kind in kinds:
+        yield lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
+
+
+def _looked(
+    lit: LitSession, kinds: Sequence[str], sums: Sequence[StripeSums], shown: tuple[int, Frame]
+) -> list[tuple[Seen, int]]:
+    """What the responses to a pattern add to the ``sums`` of each kind, and their saturated shots."""
+    responses = _responses(lit, kinds, sums[0].side, *shown)
+    return [(own.seen(each.rate, shown[0]), each.saturated) for own, each in zip(sums, responses, strict=True)]
 
 
 def _factor_error(noisy: Estimate, clean: Estimate) -> float:
@@ -196,26 +233,37 @@ def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> Li
     return light
 
 
-def _stripe_arrays(both: tuple[StripeSums, StripeSums], saturated: int) -> dict[str, npt.ArrayLike]:
-    arrays: dict[str, npt.ArrayLike] = {"saturated": saturated}
-    for sums in both:
-        arrays[f"{sums.side}_common"], arrays[f"{sums.side}_vectors"] = sums.common, sums.vectors[:, : sums.done]
-        arrays[f"{sums.side}_sums"] = [sums.misfit, sums.energy]
-    return arrays
+@dataclass
+class _Stripes:
+    """Sums over finished stripes by kind, horizontal and vertical ones, and ``saturated`` shots so far."""
+
+    sums: dict[str, tuple[StripeSums, StripeSums]]
+    saturated: int
+
+    def arrays(self) -> dict[str, npt.ArrayLike]:
+        """What a checkpoint holds of them."""
+        arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
+        for kind, both in self.sums.items():
+            for sums in both:
+                name = f"{kind}_{sums.side}"
+                arrays[f"{name}_common"], arrays[f"{name}_vectors"] = sums.common, sums.vectors[:, : sums.done]
+                arrays[f"{name}_sums"] = [sums.misfit, sums.energy]
+        return arrays
 
 
-def _stripes(
-    arrays: Mapping[str, FloatArray] | None, centre: bool, count: int
-) -> tuple[tuple[StripeSums, StripeSums], int] | None:
-    """Sums over the finished stripes and saturated shots so far, as :func:`_stripe_arrays` put them down."""
+def _restored(arrays: Mapping[str, FloatArray] | None, kinds: Sequence[str], session: Session) -> _Stripes | None:
+    """What :meth:`_Stripes.arrays` put down of these ``kinds``."""
     if arrays is None:
         return None
 
-    def restored(side: str) -> StripeSums:
-        finished = arrays[f"{side}_vectors"]
-        vectors = np.empty((len(finished), count))
+    def restored(kind: str, side: str) -> StripeSums:
+        finished = arrays[f"{kind}_{side}_vectors"]
+        vectors = np.empty((len(finished), session.signs.shape[1]))
         vectors[:, : finished.shape[1]] = finished
-        misfit, energy = map(float, arrays[f"{side}_sums"])
-        return StripeSums(side, centre, arrays[f"{side}_common"], vectors, misfit, energy, finished.shape[1])
+        misfit, energy = map(float, arrays[f"{kind}_{side}_sums"])
+        common = arrays[f"{kind}_{side}_common"]
+        return StripeSums(side, session.centre, common, vectors, misfit, energy, finished.shape[1])
 
-    return (restored(SIDES[0]), restored(SIDES[1])), int(arrays["saturated"])
+    return _Stripes(
+        {kind: (restored(kind, SIDES[0]), restored(kind, SIDES[1])) for kind in kinds}, int(arrays["saturated"])
+    )

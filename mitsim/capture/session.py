@@ -7,10 +7,11 @@ noise. When n is no Hadamard order the next one is used and its first n rows: ro
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,11 +26,16 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
-from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.optics.frames import Frame
 from mitsim.rig.patterns import Lighting, hadamard_matrix
 from mitsim.rig.recipe import SessionRecipe
+from mitsim.sensor.chain import Digital
 
+Result = TypeVar("Result")
 SIDES = ("horizontal", "vertical")
+_NUMBERS_AT_ONCE = 2**15
+"""Numbers of frames that become a response at a time: so few stay in the cache. Whole frames of a sensor of 2048 pixels
+took ten times as long."""
 _LINES = 4
 """Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
 
@@ -68,19 +74,11 @@ class Session:
         """Whether a +-1 pattern is the difference of two shots, and not taken from one and a uniform shot."""
         return self.recipe.signed_capture == "pair"
 
-    @cached_property
-    def weights(self) -> FloatArray:
-        """(shots, n) power of each stripe in the shots of one side."""
-        n, count = self.signs.shape
-        positive = (1.0 + self.signs.T) / 2
-        if self.pairs:
-            return np.stack([positive, 1 - positive], axis=1).reshape(2 * count, n)
-        return np.concatenate([np.ones((1, n)), positive])
-
     @property
     def shots(self) -> int:
         """Frames of the whole session."""
-        return 2 * len(self.weights)
+        count = int(self.signs.shape[1])
+        return 2 * (2 * count if self.pairs else count + 1)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
         """What to simulate for responses of this relative ``accuracy``.
@@ -153,84 +151,136 @@ class LitSession:
         one shot and a uniform one, 2 Y(positive) - Y(uniform), it is three times the light and 5/2 of the read noise.
         """
         sensor, time = self.session.bench.sensor, self.exposure_s
-        light = float(self._second.electrons(self.white).mean()) + 2 * sensor.superpixel_dark_current_e_per_s
+        light = float(self._white_rate.mean()) + 2 * sensor.superpixel_dark_current_e_per_s
         read = sensor.superpixel_read_noise_e**2
         if self.session.pairs:
             return float(np.sqrt(light / time + 2 * read / time**2))
         return float(np.sqrt(3 * light / time + 5 * read / time**2))
 
-    def noisy(self, side: str, job: Job, first: int = 0) -> Iterator[Response]:
-        """Responses to +-1 stripes from noisy frames, one at a time.
+    def patterns(self, side: str, first: int = 0) -> Iterator[tuple[int, Frame]]:
+        """Number of every +-1 pattern of a ``side`` from ``first`` on, and the expected frame of its +1 pixels.
+
+        Number 0 is the uniform one. No frames are formed before one of another number is asked for.
+        """
+        if first == 0:
+            yield 0, self.white
+        n = self.session.bench.n
+        row, column = np.divmod(np.arange(n * n), n)
+        lighting = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
+        # All are formed, needed or not: how many are mixed at once shows in their last bits.
+        numbered = enumerate(self.light.frames(lighting, self.session.seed))
+        yield from islice(numbered, max(first, 1), None)
+
+    def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
+        """What a function makes of the patterns of a side, in order, some at a time in a thread each.
 
         Parameters
         ----------
-        side
-            ``horizontal`` or ``vertical`` stripes.
+        side, first
+            as for :meth:`patterns`.
+        use
+            of a number and frame of :meth:`patterns`.
         job
             takes the time and is told how far it is.
-        first
-            number of the first response; earlier ones are not exposed.
         """
-        exposed = self._exposed(side, job, first)
-        if self.session.pairs:
-            for positive in exposed:
-                negative = next(exposed)
-                yield Response(positive.rate - negative.rate, positive.saturated + negative.saturated)
-            return
-        uniform = next(exposed)
-        counted = uniform.saturated if first == 0 else 0
-        for positive in exposed:
-            yield Response(2 * positive.rate - uniform.rate, positive.saturated + counted)
-            counted = 0
-
-    def noise_free(self, side: str, first: int = 0) -> Iterator[Response]:
-        """Expected responses to the +-1 stripes of a ``side`` from number ``first`` on: 2 Y((1 + P)/2) - Y(1)."""
-        rates = (self._second.electrons(frame) for frame in self._expected(side, (1.0 + self.session.signs.T) / 2))
-        uniform = next(rates)
-        if first == 0:
-            yield Response(uniform)
-        for positive in islice(rates, max(first - 1, 0), None):
-            yield Response(2 * positive - uniform)
-
-    @property
-    def _second(self) -> Exposer:
-        """An exposure of one second, whose electrons are rates."""
-        return Exposer(self.session.bench.rig, 1.0, self.session.seed)
-
-    def _expected(self, side: str, weights: FloatArray) -> ExpectedFrames:
-        n = self.session.bench.n
-        row, column = np.divmod(np.arange(n * n), n)
-        lighting = Lighting(row if side == "horizontal" else column, weights)
-        return self.light.frames(lighting, self.session.seed)
-
-    def _exposed(self, side: str, job: Job, first: int) -> Iterator[Response]:
-        """Electrons a second that a user computes from each noisy frame that responses from ``first`` on need."""
-        session = self.session
-        exposer = Exposer(session.bench.rig, self.exposure_s, session.seed, self.speckle)
-        # Frames that are not needed are formed all the same: how many are mixed at once shows in their last bits.
-        needed = range(2 * first if session.pairs else first + 1, len(session.weights))
-        numbered = (
-            item
-            for item in enumerate(self._expected(side, session.weights))
-            if item[0] in needed or (item[0] == 0 and not session.pairs)
-        )
-
-        def expose(item: tuple[int, Frame]) -> Response:
-            index, frame = item
-            lit = exposer.lit(frame, "calibration", side, index)
-            digital = exposer.digital(lit, "calibration", side, index)
-            return Response(exposer.rate(digital), int(exposer.saturated(digital, lit)))
-
-        chunks = in_chunks(numbered)
+        chunks = in_chunks(self.patterns(side, first))
         while True:
             with job.clock.stage("optics"):
                 chunk = next(chunks, None)
             if chunk is None:
                 return
             with job.clock.stage("sensor"):
-                exposed = in_threads(expose, chunk)
-            job.progress(f"{side} stripes", (chunk[-1][0] + 1) / len(session.weights))
-            yield from exposed
+                used = in_threads(use, chunk)
+            job.progress(f"{side} stripes", (chunk[-1][0] + 1) / self.session.signs.shape[1])
+            yield from used
+
+    def noisy(self, side: str, number: int, frame: Frame) -> Response:
+        """Response to a +-1 pattern as a user of noisy frames has it.
+
+        Parameters
+        ----------
+        side
+            ``horizontal`` or ``vertical`` stripes.
+        number, frame
+            as :meth:`patterns` has them.
+        """
+        if not self.session.pairs:
+            shot, uniform = self._exposed(frame.irradiance, side, number + 1), self._uniform[side]
+            return Response(
+                self._rates(lambda rows: 2 * self._exposer.rate(shot.digital[rows]) - uniform.rate[rows], shot),
+                shot.saturated + (uniform.saturated if number == 0 else 0),
+            )
+        negative = self._both - frame.irradiance
+        shots = (
+            self._exposed(frame.irradiance, side, 2 * number),
+            # Rounding leaves pixels that see the +1 stripes alone a little below zero.
+            self._exposed(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
+        )
+
+        def difference(rows: slice) -> FloatArray:
+            positive, negative = (self._exposer.rate(shot.digital[rows]) for shot in shots)
+            return positive - negative
+
+        return Response(self._rates(difference, shots[0]), sum(shot.saturated for shot in shots))
+
+    def noise_free(self, frame: Frame) -> FloatArray:
+        """(pixels, pixels) the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
+        rate = self._second.electrons(frame)
+        rate *= 2
+        rate -= self._white_rate
+        return rate
+
+    @property
+    def _second(self) -> Exposer:
+        """An exposure of one second, whose electrons are rates."""
+        return Exposer(self.session.bench.rig, 1.0, self.session.seed)
+
+    @property
+    def _exposer(self) -> Exposer:
+        return Exposer(self.session.bench.rig, self.exposure_s, self.session.seed, self.speckle)
+
+    @cached_property
+    def _white_rate(self) -> FloatArray:
+        return self._second.electrons(self.white)
+
+    @cached_property
+    def _both(self) -> FloatArray:
+        """(pixels, pixels) light of a pair's two shots together [W m^-2]: all of it, and what black pixels leak."""
+        n = self.session.bench.n
+        off = Lighting(np.zeros(n * n, dtype=np.int64), np.zeros((1, 1)))
+        (dark,) = self.light.frames(off, self.session.seed)
+        return np.asarray(self.white.irradiance + dark.irradiance)
+
+    @cached_property
+    def _uniform(self) -> Mapping[str, Response]:
+        """Noisy uniform frames, from which each side's responses are taken where they are no pairs."""
+        shots = {side: self._exposed(self.white.irradiance, side, 0) for side in SIDES}
+        return {side: Response(self._exposer.rate(shot.digital), shot.saturated) for side, shot in shots.items()}
+
+    def _exposed(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
+        """The noisy frame of shot number ``index`` of a ``side``, of expected ``irradiance`` (pixels, pixels)."""
+        names = "calibration", side, index
+        lit = self._exposer.lit(Frame(irradiance, 0.0, 0.0, 0.0), *names)
+        digital = self._exposer.digital(lit, *names)
+        return _Shot(digital, int(self._exposer.saturated(digital, lit)))
+
+    @staticmethod
+    def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
+        """(pixels, pixels) rates of all rows by those ``of`` some, a few at a time: their arrays stay in the cache."""
+        rates: FloatArray = np.empty(shot.digital.shape)
+        step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
+        for start in range(0, len(rates), step):
+            rows = slice(start, start + step)
+            rates[rows] = of(rows)
+        return rates
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """A noisy frame (pixels, pixels), and whether it has ``saturated`` pixels: 1 or 0."""
+
+    digital: Digital
+    saturated: int
 
 
 def _lines(n: int) -> Lighting:

@@ -31,6 +31,11 @@ NOISE_MODEL = 0.2
 
 LARGEST_ERROR = 0.1
 """Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
+_NUMBERS_AT_ONCE = 2**15
+"""Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
+_TURNS, _TURNED = 30, 1e-13
+"""Steps of the power iteration that splits a uniform response, and the change at which it has converged: where it has,
+each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +80,23 @@ class Estimate:
         return self.status.ok
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What one response adds to :class:`StripeSums`.
+
+    Attributes
+    ----------
+    vector
+        (m,) u_i, or w_i: least squares in Y_i = u_i common^T.
+    misfit, energy
+        ||Y_i - u_i common^T||^2 and ||Y_i||^2.
+    """
+
+    vector: FloatArray
+    misfit: float
+    energy: float
+
+
 @dataclass
 class StripeSums:
     """Running sums over the responses of one side; saved after any response and continued, they come to the same bits.
@@ -105,18 +127,36 @@ class StripeSums:
 
     def add(self, response: npt.ArrayLike) -> None:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
+        self.put(self.seen(response, self.done))
+
+    def seen(self, response: npt.ArrayLike, number: int) -> Seen:
+        """What the ``response`` (rows, columns) of this ``number`` adds; MitsimError as :meth:`add`.
+
+        Changes nothing, so that responses are looked at in several threads.
+        """
         shape = len(self.vectors), len(self.common)
         shape = shape if self.side == "horizontal" else shape[::-1]
-        self.add_checked(_response(response, f"{self.side} response {self.done}", shape, self.centre))
+        return self.seen_checked(_response(response, f"{self.side} response {number}", shape, self.centre))
 
-    def add_checked(self, response: FloatArray) -> None:
-        """The same for a ``response`` that is checked and centred: least squares for u_i in Y_i = u_i common^T."""
-        values = response if self.side == "horizontal" else response.T
-        vector = values @ (self.common / np.dot(self.common, self.common))
-        self.vectors[:, self.done] = vector
-        explained = np.outer(vector, self.common)
-        self.misfit += sum_of_squares(np.subtract(values, explained, out=explained))
-        self.energy += sum_of_squares(values)
+    def seen_checked(self, response: FloatArray) -> Seen:
+        """The same of a ``response`` that is checked and centred."""
+        across = self.side == "horizontal"
+        vector = (response if across else response.T) @ (self.common / np.dot(self.common, self.common))
+        rows, columns = (vector, self.common) if across else (self.common, vector)
+        misfit = energy = 0.0
+        step = max(1, _NUMBERS_AT_ONCE // response.shape[1])
+        for start in range(0, len(response), step):
+            block = response[start : start + step]
+            explained = np.multiply.outer(rows[start : start + step], columns)
+            misfit += sum_of_squares(np.subtract(block, explained, out=explained))
+            energy += sum_of_squares(block)
+        return Seen(vector, misfit, energy)
+
+    def put(self, seen: Seen) -> None:
+        """Count in what was ``seen`` of the next response."""
+        self.vectors[:, self.done] = seen.vector
+        self.misfit += seen.misfit
+        self.energy += seen.energy
         self.done += 1
 
 
@@ -146,8 +186,8 @@ def stripe_sums(
     a, v = _rank_one_split(mean)
     left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
     right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
-    left.add_checked(first)
-    right.add_checked(second)
+    left.put(left.seen_checked(first))
+    right.put(right.seen_checked(second))
     return left, right
 
 
@@ -222,11 +262,12 @@ def factors_of_sums(
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
     allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
-    condition = max(squared_condition(phi[0]), squared_condition(phi[1]))
+    singular = _singular(phi[0]), _singular(phi[1])
+    condition = max(map(_squared_condition, singular))
     predicted, rank = [], []
-    for factor, common in ((phi[0], v), (phi[1], a)):
+    for factor, common, values in zip(phi, (v, a), singular, strict=True):
         predicted.append(predicted_error(factor, noise, float(np.linalg.norm(common)), count))
-        rank.append(_rank(factor, predicted[-1]))
+        rank.append(_rank(factor, values, predicted[-1]))
     n = phi[0].shape[1], phi[1].shape[1]
     figures = (
         f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
@@ -296,43 +337,83 @@ def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, i
     return Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
 
 
-def _rank(phi: FloatArray, error: float) -> int:
-    """Singular values of a factor (m, n) beyond rounding and what its noise, ``error`` of ||phi||, makes of zero.
+def _rank(phi: FloatArray, singular: _Singular, error: float) -> int:
+    """Singular values of a factor beyond rounding and what its noise makes of zero.
 
     Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
     norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
+
+    Parameters
+    ----------
+    phi, singular
+        (m, n), and its singular values.
+    error
+        noise, as a part of ||phi||.
     """
     if not phi.any():
         return 0
-    singular, rounding = _singular(phi)
     deviation = error * np.linalg.norm(phi) / np.sqrt(phi.size)
     rows = phi.shape[0]
     noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
-    return int(np.count_nonzero(singular > max(float(noise), rounding)))
+    return int(np.count_nonzero(singular.values > max(float(noise), singular.rounding)))
 
 
-def _singular(phi: FloatArray) -> tuple[FloatArray, float]:
-    """Singular values, and what of them is rounding, as numpy.linalg.matrix_rank takes it."""
-    singular = np.asarray(np.linalg.svd(phi, compute_uv=False))
-    return singular, float(singular[0] * max(phi.shape) * np.finfo(np.float64).eps)
+@dataclass(frozen=True, eq=False)
+class _Singular:
+    """Singular ``values`` of a factor, what of them is ``rounding``, and whether the factor is ``wide``: of fewer rows
+    than columns."""
+
+    values: FloatArray
+    rounding: float
+    wide: bool
+
+
+def _singular(phi: FloatArray) -> _Singular:
+    """Singular values of ``phi`` (m, n), with the rounding that numpy.linalg.matrix_rank states."""
+    values = np.asarray(np.linalg.svd(phi, compute_uv=False))
+    return _Singular(values, float(values[0] * max(phi.shape) * np.finfo(np.float64).eps), phi.shape[0] < phi.shape[1])
 
 
 def squared_condition(phi: FloatArray) -> float:
     """cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
-    singular, cut = _singular(phi)
-    if phi.shape[0] < phi.shape[1] or singular[-1] <= cut:
-        return float("inf")
-    return float((singular[0] / singular[-1]) ** 2)
+    return _squared_condition(_singular(phi))
+
+
+def _squared_condition(singular: _Singular) -> float:
+    values = singular.values
+    return float("inf") if singular.wide or values[-1] <= singular.rounding else float((values[0] / values[-1]) ** 2)
 
 
 def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     """a, v of equal norm with mean = a v^T in the least-squares sense, a with positive sum."""
-    left, singular, right = np.linalg.svd(mean, full_matrices=False)
-    if singular[0] == 0:
+    right = _largest_right_vector(mean)
+    left = mean @ right
+    size = float(np.linalg.norm(left))
+    if size == 0:
         raise MitsimError("the uniform response is zero everywhere; check exposure and black level")
-    root = np.sqrt(singular[0])
-    sign = 1.0 if left[:, 0].sum() >= 0 else -1.0
-    return sign * root * left[:, 0], sign * root * right[0]
+    root = np.sqrt(size) if left.sum() >= 0 else -np.sqrt(size)
+    return left * (root / size), right * root
+
+
+def _largest_right_vector(matrix: FloatArray) -> FloatArray:
+    """(n,) right singular vector of the largest singular value of a ``matrix`` (m, n), of either sign.
+
+    By power iteration: a uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048. Where
+    the next singular value is so near that the iteration has not converged in time, by that SVD.
+    """
+    # No direction of the data: what starts across the first singular vector would not find it.
+    vector = _unit(np.random.default_rng(0).standard_normal(len(matrix)) @ matrix)
+    for _ in range(_TURNS):
+        before, vector = vector, _unit(_unit(matrix @ vector) @ matrix)
+        if np.linalg.norm(vector - before) <= _TURNED:
+            return vector
+    return np.asarray(np.linalg.svd(matrix, full_matrices=False)[2][0])
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    """``vector`` over its norm; zeros as they are."""
+    norm = float(np.linalg.norm(vector))
+    return vector / norm if norm else vector
 
 
 def _next(responses: Iterator[npt.ArrayLike], side: str, index: int, count: int) -> npt.ArrayLike:

@@ -5,17 +5,18 @@ The camera is a toy of random factors, whose frames under any light are known in
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mitsim.capture.calibrate import estimate
+from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.capture.checkpoint import Checkpoint
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.session import SIDES, LitSession, Response, Session
+from mitsim.capture.session import SIDES, LitSession, Session, _Shot
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.optics.frames import Frame
@@ -24,6 +25,7 @@ from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import load_recipe
 from mitsim.rig.rig import Rig
 from mitsim.rig.sensor import SensorModel
+from mitsim.sensor.chain import Digital
 
 SENSOR = SensorModel(
     name="bare",
@@ -98,11 +100,9 @@ def test_noisy_frames_give_the_camera_within_the_error_that_is_predicted(mode: s
     error to 5 %. Five deviations each. Noise is light plus dark current (half of it) plus read noise.
     """
     lit = lit_session(7, mode)
-    stream, clean = (
-        [response.rate for response in responses]
-        for responses in (lit.noisy("vertical", Job()), lit.noise_free("vertical"))
+    off = np.array(
+        [lit.noisy("vertical", *shown).rate - lit.noise_free(shown[1]) for shown in lit.patterns("vertical")]
     )
-    off = np.array(stream) - np.array(clean)
     assert off.std() == pytest.approx(lit.response_noise, rel=0.05)
     found, _ = estimate(lit, Job())
     assert found.noise == pytest.approx(lit.response_noise, rel=0.05)
@@ -121,37 +121,68 @@ def test_a_flatcam_s_responses_are_centred() -> None:
 
 def test_progress_of_each_side_rises_to_the_whole() -> None:
     told: list[tuple[str, float]] = []
-    estimate(lit_session(13), Job(progress=lambda stage, part: told.append((stage, part))))
-    for side in SIDES:  # 16 of 32 shots at once
-        assert [part for stage, part in told if stage == f"{side} stripes"] == [0.5, 1.0]
+    estimate(lit_session(29), Job(progress=lambda stage, part: told.append((stage, part))))
+    for side in SIDES:  # 16 patterns at once, of 32 less the first, which is the uniform one
+        assert [part for stage, part in told if stage == f"{side} stripes"] == [17 / 32, 1.0]
 
 
 # ---- shots -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("mode", "shots"), [("pair", 2 * 16), ("uniform", 2 * 9)])
-def test_every_signed_pattern_is_shown_by_shots_of_light_that_is_there(mode: str, shots: int) -> None:
-    """Power is 0 or 1, pairs add up to the uniform light, and differences are the columns of H."""
-    session = lit_session(7, mode).session
-    assert session.shots == shots and session.signs.shape == (7, 8)
-    assert set(np.unique(session.weights)) == {0.0, 1.0}
-    if mode == "pair":
-        positive, negative = session.weights[::2], session.weights[1::2]
-        assert np.array_equal(positive + negative, np.ones((8, 7)))
-    else:
-        positive, negative = session.weights[1:], session.weights[0] - session.weights[1:]
-    assert np.array_equal((positive - negative).T, session.signs)
+@pytest.fixture
+def shots(monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, int], FloatArray]:
+    """Expected electrons of every shot that is exposed, by side and number."""
+    found: dict[tuple[str, int], FloatArray] = {}
+    digital = Exposer.digital
+
+    def counted(self: Exposer, electrons: FloatArray, *names: str | int) -> Digital:
+        assert names[0] == "calibration" and names[1:] not in found, "exposed before"
+        found[names[1:]] = electrons.copy()  # type: ignore[index]
+        return digital(self, electrons, *names)
+
+    monkeypatch.setattr(Exposer, "digital", counted)
+    return found
+
+
+@pytest.mark.parametrize(("mode", "count"), [("pair", 16), ("uniform", 9)])
+def test_every_signed_pattern_is_shown_by_shots_of_light_that_is_there(
+    shots: dict[tuple[str, int], FloatArray], mode: str, count: int
+) -> None:
+    """The +1 pixels of a pattern, then its -1 pixels; or the uniform one, then the +1 pixels of each; 7 pixels by the
+    first 7 rows of 8 x 8. (Planted: -1 pixels twice.)"""
+    lit = lit_session(7, mode)
+    session, toy = lit.session, lit.light
+    estimate(lit, Job())
+    assert session.shots == 2 * count == len(shots) and session.signs.shape == (7, 8)
+    for side, (across, along) in zip(SIDES, ((toy.left, toy.right), (toy.right, toy.left)), strict=True):
+        for number, sign in enumerate(session.signs.T):
+            lit_pixels = {2 * number: (1 + sign) / 2, 2 * number + 1: (1 - sign) / 2}
+            if mode == "uniform":
+                lit_pixels = {0: np.ones(7), number + 1: (1 + sign) / 2}
+            for index, pixels in lit_pixels.items():
+                expected = EXPOSURE_S * np.outer(across @ pixels, along.sum(axis=1))
+                seen = shots[side, index] if side == SIDES[0] else shots[side, index].T
+                np.testing.assert_allclose(seen, expected, rtol=1e-12, atol=1e-12 * expected.max() + 1e-9)
 
 
 @pytest.mark.parametrize("mode", ["pair", "uniform"])
-def test_no_two_shots_of_a_session_share_noise(mode: str) -> None:
-    """Not of the two sides, not the two shots of a pair: shot noise of the same light, frame by frame."""
+def test_no_two_shots_of_a_session_share_noise(monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+    """Not of the two sides, not the two shots of a pair: shot noise of the same light, frame by frame.
+    (Planted: the -1 frame named as the +1 frame.)"""
+    noise: list[FloatArray] = []
+    digital = Exposer.digital
+
+    def kept(self: Exposer, electrons: FloatArray, *names: str | int) -> Digital:
+        frame = digital(self, electrons, *names)
+        noise.append((frame - electrons).ravel())
+        return frame
+
+    monkeypatch.setattr(Exposer, "digital", kept)
     lit = lit_session(4, mode)
-    rates = [response.rate for side in SIDES for response in lit._exposed(side, Job(), 0)]
-    clean = [lit._second.electrons(frame) for side in SIDES for frame in lit._expected(side, lit.session.weights)]
-    noise = np.array([(rate - mean).ravel() for rate, mean in zip(rates, clean, strict=True)])
+    estimate(lit, Job())
+    assert len(noise) == lit.session.shots
     # Of 648 numbers each: correlations of independent noise are below 5 / sqrt(648) = 0.2.
-    correlations = np.corrcoef(noise) - np.eye(len(noise))
+    correlations = np.corrcoef(np.array(noise)) - np.eye(len(noise))
     assert np.abs(correlations).max() < 0.2
 
 
@@ -176,22 +207,34 @@ class Kept(Checkpoint):
         return self.parts.get(name)
 
 
-@pytest.mark.parametrize("noise_free", [False, True])
+@pytest.mark.parametrize("kinds", [(NOISY,), (NOISE_FREE,), (NOISY, NOISE_FREE)])
 @pytest.mark.parametrize("mode", ["pair", "uniform"])
-def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, noise_free: bool) -> None:
+def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, ...]) -> None:
     """16 responses a side are kept after 8 and after 16: interrupted after each of the four parts, and finished."""
     lit = lit_session(13, mode)
-    whole, _ = estimate(lit, Job(), noise_free)
+    whole, _ = estimates(lit, Job(), kinds)
     kept = Kept()
     for life in range(4):
         kept.left = 1
         with pytest.raises(KeyboardInterrupt):
-            estimate(lit, Job(), noise_free, kept)
-        done = [kept.parts["noise_free" if noise_free else "noisy"][f"{side}_vectors"].shape[1] for side in SIDES]
-        assert done == [[8, 1], [16, 1], [16, 8], [16, 16]][life]
-    again, _ = estimate(lit, Job(), noise_free, kept)
-    for name in ("left", "right", "noise", "separability_residual", "unexplained", "predicted_error", "status"):
-        assert np.array_equal(getattr(again, name), getattr(whole, name)), name
+            estimates(lit, Job(), kinds, kept)
+        for kind in kinds:
+            done = [kept.parts["stripes"][f"{kind}_{side}_vectors"].shape[1] for side in SIDES]
+            assert done == [[8, 1], [16, 1], [16, 8], [16, 16]][life]
+    again, _ = estimates(lit, Job(), kinds, kept)
+    for ours, theirs in zip(again, whole, strict=True):
+        for name in ("left", "right", "noise", "separability_residual", "unexplained", "predicted_error", "status"):
+            assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+
+
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_factors_of_both_kinds_at_once_are_those_of_each_alone(mode: str) -> None:
+    """(Planted: noise-free sums given the noisy response.)"""
+    lit = lit_session(7, mode)
+    for found, noise_free in zip(estimates(lit, Job(), (NOISY, NOISE_FREE))[0], (False, True), strict=True):
+        alone, _ = estimate(lit, Job(), noise_free)
+        assert np.array_equal(found.left, alone.left) and np.array_equal(found.right, alone.right)
+        assert found.separability_residual == alone.separability_residual
 
 
 def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,49 +263,60 @@ def test_the_error_of_factors_is_that_of_both_whatever_their_common_sign() -> No
 # ---- differences -----------------------------------------------------------------------------------------------------
 
 
-class Played(LitSession):
-    """A session whose noisy frames are given, the uniform one first where it has one."""
-
-    def _exposed(self, side: str, job: Job, first: int) -> Iterator[Response]:
-        yield from (Response(rate, index) for index, rate in enumerate(RATES, start=1))
-
-
 RATES = [np.array([[value, 7.0]]) for value in (100.0, 60.0, 30.0, 90.0)]
 
 
-def played(pairs: bool) -> LitSession:
-    return Played(SimpleNamespace(pairs=pairs), None, None, 1.0, 0.0)  # type: ignore[arg-type]
+def played(pairs: bool, monkeypatch: pytest.MonkeyPatch) -> LitSession:
+    """A session whose noisy frames are given, the uniform one first where it has one; digital numbers are rates."""
+    lit = LitSession(SimpleNamespace(pairs=pairs), None, Frame(np.ones((1, 2)), 0, 0, 0), 1.0, 0.0)  # type: ignore[arg-type]
+    monkeypatch.setattr(LitSession, "_both", np.ones((1, 2)))
+    monkeypatch.setattr(LitSession, "_exposer", SimpleNamespace(rate=lambda digital: digital))
+    monkeypatch.setattr(LitSession, "_exposed", lambda self, light, side, index: _Shot(RATES[index], index + 1))
+    return lit
 
 
-def test_a_calibration_pair_is_the_plain_difference_of_its_two_frames() -> None:
+SHOWN = Frame(np.ones((1, 2)), 0.0, 0.0, 0.0)
+
+
+def test_a_calibration_pair_is_the_plain_difference_of_its_two_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """(Planted: the -1 frame weighted 0.999.) So what both frames share is gone, to the last bit."""
-    responses = list(played(pairs=True).noisy("horizontal", Job()))
+    lit = played(True, monkeypatch)
+    responses = [lit.noisy("horizontal", number, SHOWN) for number in (0, 1)]
     assert [response.rate.tolist() for response in responses] == [[[40.0, 0.0]], [[-60.0, 0.0]]]
     assert [response.saturated for response in responses] == [1 + 2, 3 + 4]
 
 
-def test_a_calibration_with_a_uniform_shot_takes_it_from_twice_the_other() -> None:
+def test_a_calibration_with_a_uniform_shot_takes_it_from_twice_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
     """2 Y((1 + P)/2) - Y(1) = Y(P): what a +1 and a -1 pixel share is gone. The uniform shot counts once."""
-    responses = list(played(pairs=False).noisy("horizontal", Job()))
+    lit = played(False, monkeypatch)
+    responses = [lit.noisy("horizontal", number, SHOWN) for number in (0, 1, 2)]
     assert [response.rate.tolist() for response in responses] == [[[20.0, 7.0]], [[-40.0, 7.0]], [[80.0, 7.0]]]
     assert [response.saturated for response in responses] == [1 + 2, 3, 4]
-    resumed = list(played(pairs=False).noisy("horizontal", Job(), first=1))
-    assert [response.saturated for response in resumed] == [2, 3, 4], "it was counted before"
 
 
 def test_a_noise_free_response_is_that_of_the_signed_pattern() -> None:
-    """Expected frames hold no noise to hide in: light of the +1 pixels less that of the -1 pixels, exactly."""
-    signs = np.array([[1, 1], [1, -1]])
-    pixels = np.array([[3.0, 5.0], [2.0, 11.0]])  # light that each of two stripes casts on two sensor pixels
+    """Expected frames hold no noise to hide in: light of the +1 pixels less that of the -1 pixels, to rounding."""
+    lit = lit_session(2)
+    lights = {"horizontal": (lit.light.left, lit.light.right), "vertical": (lit.light.right, lit.light.left)}
+    for side, (across, along) in lights.items():
+        for sign, (_, frame) in zip(lit.session.signs.T, lit.patterns(side), strict=True):
+            found = lit.noise_free(frame) if side == "horizontal" else lit.noise_free(frame).T
+            np.testing.assert_allclose(found, np.outer(across @ sign, along.sum(axis=1)), rtol=1e-12, atol=1e-9)
 
-    class Expected(LitSession):
-        @property
-        def _second(self) -> Exposer:
-            return SimpleNamespace(electrons=lambda light: light)  # type: ignore[return-value]
 
-        def _expected(self, side: str, weights: FloatArray) -> FloatArray:
-            return weights @ pixels
+def test_light_that_black_pixels_leak_is_in_both_shots_of_a_pair(shots: dict[tuple[str, int], FloatArray]) -> None:
+    """A shot shows w + l (1 - w) of each pixel: formed for the +1 pixels alone, the -1 frame has what both leak.
+    (Planted: no leak in the sum of both.)"""
+    lit, leak = lit_session(4), 0.05
 
-    lit = Expected(SimpleNamespace(signs=signs), None, None, 1.0, 0.0)  # type: ignore[arg-type]
-    assert np.array_equal([response.rate for response in lit.noise_free("vertical")], signs.T @ pixels)
-    assert np.array_equal([response.rate for response in lit.noise_free("vertical", 1)], [[1.0, -6.0]])
+    class Leaking(ToyLight):
+        def frames(self, lighting: Lighting, seed: int) -> list[Frame]:
+            return super().frames(replace(lighting, weights=leak + (1 - leak) * lighting.weights), seed)
+
+    estimate(replace(lit, light=Leaking(4)), Job())
+    (whole,) = Leaking(4).frames(Lighting.uniform(4), 0)
+    unit = float(shots["horizontal", 0].sum() / whole.irradiance.sum())
+    for number, sign in enumerate(lit.session.signs.T):
+        shown = Lighting(np.repeat(np.arange(4), 4), (1 - sign[None]) / 2)
+        (negative,) = Leaking(4).frames(shown, 0)
+        np.testing.assert_allclose(shots["horizontal", 2 * number + 1], unit * negative.irradiance, rtol=1e-9)

@@ -6,7 +6,13 @@ from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import estimate_factors, predicted_error, squared_condition
+from mitsim.reconstruct.calibration import (
+    StripeSums,
+    _rank_one_split,
+    estimate_factors,
+    predicted_error,
+    squared_condition,
+)
 from mitsim.reconstruct.solver import prepare
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
@@ -207,3 +213,38 @@ def test_bad_input_is_refused_in_one_line(change, words):
     with pytest.raises(MitsimError, match=words) as caught:
         estimate_factors(**({"horizontal": horizontal, "vertical": vertical, "H": H} | change))
     assert "\n" not in str(caught.value)
+
+
+# ---- large sensors ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("next_one", [0.0, 0.02, 0.5, 0.99, 1.0])
+@pytest.mark.parametrize("shape", [(90, 70), (1, 5), (40, 60)])
+def test_a_uniform_response_is_split_as_its_svd_would_be(shape, next_one):
+    """Nearly of rank one, where power iteration converges, or not, where the SVD itself is taken; ``next_one`` is the
+    second singular value over the first. (Planted: one step of the iteration; its start taken for the vector.)"""
+    rng = np.random.default_rng(7)
+    size = min(shape)
+    left, right = (np.linalg.qr(rng.standard_normal((length, size)))[0] for length in shape)
+    values = np.append(3.0, 3.0 * next_one * np.linspace(1, 0.5, size - 1) if size > 1 else [])
+    mean = (left * values) @ right.T
+    a, v = _rank_one_split(mean)
+    assert np.linalg.norm(a) == pytest.approx(np.linalg.norm(v), rel=1e-12) and a.sum() > 0
+    if next_one < 1 or size == 1:
+        np.testing.assert_allclose(np.outer(a, v), 3.0 * np.outer(left[:, 0], right[:, 0]), atol=1e-11)
+    assert np.linalg.norm(mean @ v) == pytest.approx(3.0 * np.linalg.norm(v), rel=1e-12)
+
+
+@pytest.mark.parametrize("side", ["horizontal", "vertical"])
+def test_a_response_of_several_parts_is_summed_as_a_whole(side):
+    """70 000 numbers, of which 32768 are held at a time. (Planted: the last part left out.)"""
+    rng = np.random.default_rng(3)
+    response = rng.standard_normal((350, 200))
+    common = rng.random(200 if side == "horizontal" else 350)
+    values = response if side == "horizontal" else response.T
+    sums = StripeSums(side, False, common, np.empty((len(values), 2)))
+    sums.add(response)
+    vector = np.linalg.lstsq(common[:, None], values.T, rcond=None)[0][0]
+    np.testing.assert_allclose(sums.vectors[:, 0], vector, rtol=1e-10, atol=1e-12)
+    assert sums.misfit == pytest.approx(np.square(values - np.outer(vector, common)).sum(), rel=1e-12)
+    assert sums.energy == pytest.approx(np.square(values).sum(), rel=1e-12) and sums.done == 1
