@@ -151,7 +151,7 @@ def estimates(
     stripes = _restored(checkpoint.load(_STRIPES), kinds, session)
     if stripes is None:
         with job.clock.stage("sensor"):
-            first = [list(_responses(lit, kinds, side, *next(lit.patterns(side)))) for side in SIDES]
+            first = [list(_responses(lit, kinds, side, 0, lit.white)) for side in SIDES]
         both = [stripe_sums(left.rate, right.rate, count, session.centre) for left, right in zip(*first, strict=True)]
         stripes = _Stripes(dict(zip(kinds, both, strict=True)), sum(each.saturated for side in first for each in side))
         del first
@@ -171,7 +171,7 @@ def estimates(
 
 
 def _responses(lit: LitSession, kinds: Sequence[str], side: str, number: int, frame: Frame) -> Iterator[Response]:
-    """Each of the ``kinds`` of responses to a pattern, as :meth:`LitSession.patterns` has it."""
+    """Each of the ``kinds`` of responses to a pattern, as :meth:`LitSession.each` has it."""
     for kind in kinds:
         yield lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
 

@@ -157,42 +157,55 @@ class LitSession:
             return float(np.sqrt(light / time + 2 * read / time**2))
         return float(np.sqrt(3 * light / time + 5 * read / time**2))
 
-    def patterns(self, side: str, first: int = 0) -> Iterator[tuple[int, Frame]]:
-        """Number of every +-1 pattern of a ``side`` from ``first`` on, and the expected frame of its +1 pixels.
-
-        Number 0 is the uniform one. No frames are formed before one of another number is asked for.
-        """
-        if first == 0:
-            yield 0, self.white
-        n = self.session.bench.n
-        row, column = np.divmod(np.arange(n * n), n)
-        lighting = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
-        # All are formed, needed or not: how many are mixed at once shows in their last bits.
-        numbered = enumerate(self.light.frames(lighting, self.session.seed))
-        yield from islice(numbered, max(first, 1), None)
-
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
-        """What a function makes of the patterns of a side, in order, some at a time in a thread each.
+        """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.
 
         Parameters
         ----------
-        side, first
-            as for :meth:`patterns`.
+        side
+            ``horizontal`` or ``vertical`` stripes.
         use
-            of a number and frame of :meth:`patterns`.
+            of a pattern's number and the expected frame of its +1 pixels. Number 0 is the uniform pattern.
         job
             takes the time and is told how far it is.
+        first
+            number of the first pattern.
         """
-        chunks = in_chunks(self.patterns(side, first))
+
+        def used(item: tuple[int, Frame]) -> Result:
+            number, frame = item
+            return use((number, self._leaking(frame) if number else frame))
+
+        chunks = in_chunks(self._formed(side, first))
         while True:
             with job.clock.stage("optics"):
                 chunk = next(chunks, None)
             if chunk is None:
                 return
             with job.clock.stage("sensor"):
-                used = in_threads(use, chunk)
+                results = in_threads(used, chunk)
             job.progress(f"{side} stripes", (chunk[-1][0] + 1) / self.session.signs.shape[1])
-            yield from used
+            yield from results
+
+    def _formed(self, side: str, first: int) -> Iterator[tuple[int, Frame]]:
+        """Numbers and frames from ``first`` on, without what black pixels leak; none is formed for number 0."""
+        if first == 0:
+            yield 0, self.white
+        n = self.session.bench.n
+        row, column = np.divmod(np.arange(n * n), n)
+        lighting = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
+        # All are formed, needed or not: how many are mixed at once shows in their last bits.
+        numbered = enumerate(self.light.frames(lighting, self.session.seed, leaking=False))
+        yield from islice(numbered, max(first, 1), None)
+
+    def _leaking(self, frame: Frame) -> Frame:
+        """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""
+        black = self.light.simulation.physics.black_level
+        if not black:
+            return frame
+        light = (1 - black) * frame.irradiance
+        light += black * self.white.irradiance
+        return replace(frame, irradiance=light)
 
     def noisy(self, side: str, number: int, frame: Frame) -> Response:
         """Response to a +-1 pattern as a user of noisy frames has it.
@@ -202,7 +215,7 @@ class LitSession:
         side
             ``horizontal`` or ``vertical`` stripes.
         number, frame
-            as :meth:`patterns` has them.
+            of the pattern, as :meth:`each` has them.
         """
         if not self.session.pairs:
             shot, uniform = self._exposed(frame.irradiance, side, number + 1), self._uniform[side]

@@ -50,14 +50,16 @@ RIG = Rig(
 class ToyLight:
     """Light of a camera Y = L X R^T, in electrons a second; ``left`` and ``right`` have different shapes and norms."""
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, leak: float = 0.0) -> None:
         rng = np.random.default_rng(n)
         self.left, self.right = 30 * rng.random((PIXELS, n)), 20 * rng.random((PIXELS + 3, n))
+        self.simulation = SimpleNamespace(physics=SimpleNamespace(black_level=leak))
         self.unit = float(Exposer(RIG, 1.0, 0).electrons(Frame(np.ones(1), 0.0, 0.0, 0.0))[0])
 
-    def frames(self, lighting: Lighting, _: int) -> list[Frame]:
-        n = self.left.shape[1]
-        pictures = [weights[lighting.labels].reshape(n, n) for weights in lighting.weights]
+    def frames(self, lighting: Lighting, _: int, leaking: bool = True) -> list[Frame]:
+        n, leak = self.left.shape[1], self.simulation.physics.black_level if leaking else 0.0
+        emitted = leak + (1 - leak) * lighting.weights
+        pictures = [weights[lighting.labels].reshape(n, n) for weights in emitted]
         return [Frame(self.left @ picture @ self.right.T / self.unit, 0.0, 0.0, 0.0) for picture in pictures]
 
 
@@ -101,7 +103,7 @@ def test_noisy_frames_give_the_camera_within_the_error_that_is_predicted(mode: s
     """
     lit = lit_session(7, mode)
     off = np.array(
-        [lit.noisy("vertical", *shown).rate - lit.noise_free(shown[1]) for shown in lit.patterns("vertical")]
+        list(lit.each("vertical", lambda it: lit.noisy("vertical", *it).rate - lit.noise_free(it[1]), Job()))
     )
     assert off.std() == pytest.approx(lit.response_noise, rel=0.05)
     found, _ = estimate(lit, Job())
@@ -299,24 +301,21 @@ def test_a_noise_free_response_is_that_of_the_signed_pattern() -> None:
     lit = lit_session(2)
     lights = {"horizontal": (lit.light.left, lit.light.right), "vertical": (lit.light.right, lit.light.left)}
     for side, (across, along) in lights.items():
-        for sign, (_, frame) in zip(lit.session.signs.T, lit.patterns(side), strict=True):
-            found = lit.noise_free(frame) if side == "horizontal" else lit.noise_free(frame).T
+        for sign, rate in zip(
+            lit.session.signs.T, lit.each(side, lambda it: lit.noise_free(it[1]), Job()), strict=True
+        ):
+            found = rate if side == "horizontal" else rate.T
             np.testing.assert_allclose(found, np.outer(across @ sign, along.sum(axis=1)), rtol=1e-12, atol=1e-9)
 
 
 def test_light_that_black_pixels_leak_is_in_both_shots_of_a_pair(shots: dict[tuple[str, int], FloatArray]) -> None:
-    """A shot shows w + l (1 - w) of each pixel: formed for the +1 pixels alone, the -1 frame has what both leak.
-    (Planted: no leak in the sum of both.)"""
-    lit, leak = lit_session(4), 0.05
-
-    class Leaking(ToyLight):
-        def frames(self, lighting: Lighting, seed: int) -> list[Frame]:
-            return super().frames(replace(lighting, weights=leak + (1 - leak) * lighting.weights), seed)
-
-    estimate(replace(lit, light=Leaking(4)), Job())
-    (whole,) = Leaking(4).frames(Lighting.uniform(4), 0)
+    """A shot shows w + l (1 - w) of each pixel, by light that was formed for the +1 pixels alone. (Planted: no leak in
+    the sum of both, or in the +1 frame.)"""
+    lit, leaking = lit_session(4), ToyLight(4, leak=0.05)
+    estimate(replace(lit, light=leaking), Job())
+    (whole,) = leaking.frames(Lighting.uniform(4), 0)
     unit = float(shots["horizontal", 0].sum() / whole.irradiance.sum())
     for number, sign in enumerate(lit.session.signs.T):
-        shown = Lighting(np.repeat(np.arange(4), 4), (1 - sign[None]) / 2)
-        (negative,) = Leaking(4).frames(shown, 0)
-        np.testing.assert_allclose(shots["horizontal", 2 * number + 1], unit * negative.irradiance, rtol=1e-9)
+        shown = Lighting(np.repeat(np.arange(4), 4), np.array([(1 + sign) / 2, (1 - sign) / 2]))
+        for index, frame in enumerate(leaking.frames(shown, 0), start=2 * number):
+            np.testing.assert_allclose(shots["horizontal", index], unit * frame.irradiance, rtol=1e-9)
