@@ -93,6 +93,9 @@ def calibrate(
             "condition": noisy.condition,
             "exposure_s": lit.exposure_s,
             "seconds": job.clock.seconds(),
+            "predicted": plan.predicted,
+            "predicted_seconds": plan.predicted_seconds,
+            "predicted_memory_bytes": plan.cost and plan.cost.memory_bytes,
             "warnings": warnings,
         }
         manifest = CalibrationManifest(

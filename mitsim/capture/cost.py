@@ -74,19 +74,27 @@ def frames_cost(
     pixels = rows**2
     files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
     truth = float(_BYTES_PER_PIXEL * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES)
-    filed, paths = (
-        float(entries(bench.n**2, classes, Numbers.of(settings), settings)),
-        min(LANES_AT_ONCE, _paths(bench.n**2, settings)),
-    )
     return Cost(
         seconds=seconds,
-        memory_bytes=_LANES_BYTES
-        + _FOLLOWED_BYTES * bool(settings.effects & names(lambda effect: effect.followed))
-        + frames_bytes(classes, shots, rows)
-        + GROUPS * filed * _ENTRY_BYTES
-        + paths * _DEPOSIT_BYTES,
+        memory_bytes=light_bytes(bench, classes, settings) + frames_bytes(classes, shots, rows),
         disk_bytes=max(files + truth - on_disk, 0.0),
     )
+
+
+def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
+    """Memory of tracing light, and of filing it.
+
+    Parameters
+    ----------
+    bench, settings
+        what is simulated.
+    classes
+        of projector pixels, that light is filed by.
+    """
+    filed = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
+    paths = min(LANES_AT_ONCE, _paths(bench.n**2, settings))
+    followed = bool(settings.effects & names(lambda effect: effect.followed))
+    return _LANES_BYTES + _FOLLOWED_BYTES * followed + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES
 
 
 def _paths(pixels: int, settings: Settings) -> float:

@@ -16,12 +16,13 @@ from typing import TypeVar
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.cost import frame_seconds, frames_bytes, frames_cost
+from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import Exposer, in_chunks
 from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Exposure
+from mitsim.capture.session_cost import session_cost, session_seconds
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -81,20 +82,22 @@ class Session:
         return 2 * (2 * count if self.pairs else count + 1)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
-        """What to simulate for responses of this relative ``accuracy``.
+        """What to simulate for responses of this relative ``accuracy``, and what the session takes.
 
-        MitsimError when the session would take more memory or time than the ``job`` allows.
+        MitsimError when that is more memory or time than the ``job`` allows: before the look at the board, or after it.
         """
-        n = self.bench.n
+        n, count, starting = self.bench.n, self.signs.shape[1], job.clock.seconds()["total"]
+        first = Settings(self.bench.geometry.scene_distance)
+        seconds = session_seconds(self.board, count, self.shots, first)
+        session_cost(self.board, count, first, sum(seconds.values())).check("calibration", job.limits)
         with job.clock.stage("plan"):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
-        by_pixel = Lighting(np.arange(n * n), np.broadcast_to(1.0, (self.shots, n * n)))
-        exposing, pixels = frame_seconds(self.bench, self.shots)["sensor"], self.bench.geometry.pixels
-        cost = frames_cost(self.bench, plan.settings, by_pixel, plan.predicted_seconds + exposing)
-        # Light is filed by pixel, but frames are formed of lines, and those of both sides are held.
-        lines = 2 * frames_bytes(n, self.shots // 2, pixels) - frames_bytes(n * n, self.shots, pixels)
-        replace(cost, memory_bytes=cost.memory_bytes + lines).check("calibration", job.limits)
-        return plan
+        seconds = session_seconds(self.board, count, self.shots, plan.settings)
+        # There is no truth to be traced, and other frames are formed than those that the plan looks at.
+        plan = plan.taking(start=starting, truth=0.0, **seconds)
+        cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds)
+        cost.check("calibration", job.limits)
+        return replace(plan, cost=cost)
 
     def trace(self, plan: Plan, job: Job) -> Light:
         """The board's light, by projector pixel, sampled as the ``plan`` says; ``job`` is told how far it is."""

@@ -263,6 +263,7 @@ def calibrate(
     quiet: Quiet = False,
 ) -> int:
     """Render a Hadamard session on a white board and estimate the camera's factors."""
+    from mitsim.core.resources import memory_from_here, peak_memory
     from mitsim.rig.recipe import load_recipe
 
     session = load_recipe(recipe)
@@ -270,8 +271,10 @@ def calibrate(
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
+        held = memory_from_here()
         factors = bench.calibrate(seed, accuracy, session, output, resume, job)
-    payload = {**factors.manifest.result, "output": str(output)}
+    taken = max(peak_memory() - held, 0.0)
+    payload = {**factors.manifest.result, "memory_bytes": taken, "output": str(output)}
     # JSON has no numbers beyond the finite ones.
     residual, clean, error, condition = (
         math.inf if payload[name] is None else payload[name]
@@ -281,6 +284,7 @@ def calibrate(
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
         f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
         f"{condition:.2e}",
+        f"memory {taken / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
     ]
     return finish(as_json, payload, lines, factors.warnings)
 

@@ -74,6 +74,7 @@ def test_capture(lab: Any) -> None:
 def test_calibrate(lab: Any) -> None:
     found = lab.calibrated.payload
     keys = {"n", "frames", "separability_residual", "phi_error", "condition", "seconds", "output"}
+    keys |= {"predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes"}
     assert keys <= found.keys()
     assert (found["n"], found["output"]) == (16, str(lab.calibration))
     assert found["frames"] == 2 * 2 * 16, "n horizontal and n vertical patterns, two captures each"

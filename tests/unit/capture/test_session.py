@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,14 +15,18 @@ import pytest
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.calibrate import calibrate
 from mitsim.capture.checkpoint import Checkpoint
+from mitsim.capture.cost import frame_seconds
 from mitsim.capture.effects import EFFECTS
+from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.capture.session import SIDES, Session
+from mitsim.capture.session_cost import session_cost
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
 from mitsim.core.job import Job
+from mitsim.optics.frames import mixes
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Estimate
 from mitsim.reconstruct.factors import Factors
@@ -140,6 +145,30 @@ def test_the_folder(session: Callable[..., Done]) -> None:
         assert manifest["checksums"][f"{name}.exr"] == checksum(folder / f"{name}.exr")
 
 
+def test_what_a_session_takes_is_predicted(session: Callable[..., Done]) -> None:
+    """By stage, and in bytes; there is no truth to be traced, and frames of both sides count. (Planted: of one.)"""
+    bench, factors, _, _ = session("separable", "pair", 16)
+    result = factors.manifest.result
+    assert result["predicted_seconds"] == pytest.approx(sum(result["predicted"].values()))
+    assert result["predicted"].keys() >= {"start", "plan", "transport", "optics", "sensor"}
+    assert result["predicted"]["truth"] == 0
+    exposing = frame_seconds(bench, 2 * 2 * 16)["sensor"]
+    assert result["predicted"]["sensor"] == exposing > 0
+    assert 0 < result["predicted"]["optics"] < 10
+    assert 3e8 < result["predicted_memory_bytes"] < 2e9
+
+
+@pytest.mark.parametrize(("pixels", "mixed"), [(1024, True), (2048, False)])
+def test_memory_of_large_sensors_stays_below_four_gib(pixels: int, mixed: bool) -> None:
+    """By prediction, with 128 and 512 stripes a side, whether frames of single lines are held or not.
+    (Planted: all shots of a side held.)"""
+    assert mixes(128, 128, pixels) == mixed
+    large = SimpleNamespace(n=128, geometry=SimpleNamespace(pixels=pixels))
+    for n in (128, 512):
+        large.n = n
+        assert 5e8 < session_cost(large, n, Settings(400.0), 1.0).memory_bytes < 3.6 * 2**30
+
+
 def test_flatcam_is_centred(session: Callable[..., Done]) -> None:
     _, _, calibration, folder = session("flatcam", "pair", 16)
     assert json.loads((folder / "manifest.json").read_text())["centre"] is True
@@ -172,6 +201,8 @@ def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[
 
 # ---- interrupted and resumed -----------------------------------------------------------------------------------------
 
+SECONDS = {"seconds", "predicted", "predicted_seconds"}
+"""Of a result, what differs from session to session: time, taken and predicted with what was taken before."""
 PARTS = ["light.part.npz", "stripes.part.npz"]
 
 
@@ -218,7 +249,7 @@ def assert_equal(ours: Factors, theirs: Factors) -> None:
         assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
     for name in ("predicted_error", "unexplained", "noise", "status"):
         assert getattr(ours.estimate, name) == getattr(theirs.estimate, name), name
-    for name in ours.manifest.result.keys() - {"seconds"}:
+    for name in ours.manifest.result.keys() - SECONDS:
         assert ours.manifest.result[name] == theirs.manifest.result[name], name
 
 
@@ -327,7 +358,8 @@ def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path]
     manifests = []
     for name in ("streamed", "saved"):
         manifest = json.loads((tmp_path / name / "manifest.json").read_text())
-        del manifest["result"]["seconds"]
+        for key in SECONDS:
+            del manifest["result"][key]
         manifests.append(manifest)
     assert manifests[0] == manifests[1]
     with pytest.raises(MitsimError, match="holds files already"):
