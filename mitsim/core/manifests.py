@@ -106,8 +106,12 @@ class Digital(_Part):
 
     def rate(self, dn: npt.NDArray[Any]) -> FloatArray:
         """Photoelectrons a second of digital numbers ``dn``."""
-        electrons = (dn.astype(np.float64) - self.black_level_dn) / self.gain_dn_per_e
-        return np.asarray(electrons / self.exposure_s - self.dark_current_e_per_s)
+        rate = dn.astype(np.float64)
+        rate -= self.black_level_dn
+        rate /= self.gain_dn_per_e
+        rate /= self.exposure_s
+        rate -= self.dark_current_e_per_s
+        return rate
 
     def variance(self, light: FloatArray | float, shots: int = 1) -> FloatArray:
         """Noise variance [(electrons / s)^2] of a sum or difference of shots, after EMVA 1288: shot noise of light and

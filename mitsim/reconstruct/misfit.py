@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -137,7 +138,8 @@ class Residuals:
         self._prepared, self._weights, self._noise, self.evidence = prepared, weights, noise, evidence
         sizes = prepared.left.sensor_size, prepared.right.sensor_size
         edges = [np.linspace(0, size, min(_TILES, size) + 1).astype(np.intp) for size in sizes]
-        self._starts = [edge[:-1] for edge in edges]
+        self._strips = [slice(*ends) for ends in pairwise(edges[0])]
+        self._starts = edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         self.residual, self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(4))
 
@@ -147,8 +149,8 @@ class Residuals:
         frame = centred(measurement.frame) if prepared.centre else measurement.frame
         left, right = prepared.left.slabs[measurement.row], prepared.right.slabs[measurement.column]
         residual = frame - (left.matrix @ self._weights[left.columns][:, right.columns]) @ right.matrix.T
-        self.residual += self._sums(np.square(residual))
-        self.energy += self._sums(np.square(frame))
+        self.residual += self._squares(residual)
+        self.energy += self._squares(frame)
         self.power += self._sums(measurement.power)
         # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
         light = self._sums(measurement.light) / self.pixels
@@ -164,8 +166,13 @@ class Residuals:
         return np.asarray(self.variance * spare + rendering + factor_energy * self.pixels / self.pixels.sum())
 
     def _sums(self, values: FloatArray) -> FloatArray:
-        rows = np.add.reduceat(values, self._starts[0], axis=0)
-        return np.asarray(np.add.reduceat(rows, self._starts[1], axis=1))
+        # Not reduceat along the rows: it takes five times as long.
+        rows = np.stack([values[strip].sum(axis=0) for strip in self._strips])
+        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
+
+    def _squares(self, values: FloatArray) -> FloatArray:
+        rows = np.stack([np.einsum("ij,ij->j", values[strip], values[strip]) for strip in self._strips])
+        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
 
 def judge(
