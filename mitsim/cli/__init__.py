@@ -318,10 +318,12 @@ def reconstruct(
     # Refused before the solver is imported, which takes half a second.
     read_manifest(run, RunManifest)
     read_manifest(calibration, CalibrationManifest)
+    from mitsim.core.resources import memory_from_here, peak_memory
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
+    held = memory_from_here()
     result = reconstruct_folder(run, calibration, output or run / "reconstruction", strength, method, overwrite, depth)
-    payload = result.summary()
+    payload = {**result.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
     lines = [payload["status"]]
     if result.quality is not None:
         lines.append(str(result.quality))

@@ -17,6 +17,7 @@ from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.causes import Evidence
+from mitsim.reconstruct.cost import BYTES_A_NUMBER, is_kept, predicted, slab_numbers
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
@@ -31,10 +32,6 @@ from mitsim.reconstruct.tv import TVSolution, solve_tv
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
 METHODS = ("tikhonov", "tv")
-_BYTES_A_NUMBER = 32.0
-"""Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
-_KEPT_NUMBERS = 1 << 24
-"""Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
 
 
 @single_threaded_blas()
@@ -71,6 +68,11 @@ def reconstruct(
     """
     asked = inputs(shots, factors, lam, method, focus)
     factors.check_fit(shots)
+    # Depths that are looked for, and total variation, take as long as the data ask for.
+    cost = predicted(shots, factors) if method == "tikhonov" and focus not in ("auto", "map") else None
+    _check_factorising(shots, factors)
+    if cost:
+        Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
     depth = _depth(shots, factors, lam, focus)
     found = time.perf_counter()
@@ -115,6 +117,7 @@ def reconstruct(
         },
         inputs=asked,
         focus=depth,
+        predicted=cost,
     )
 
 
@@ -191,19 +194,23 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     """The model of ``shots`` and ``factors`` factorised, and every frame added. MitsimError when that takes more memory
     than is free, or a frame cannot be read."""
     left, right = shots.patterns
-    sides = (factors.left, left), (factors.right, right)
-    numbers = sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides)
-    Cost(memory_bytes=_BYTES_A_NUMBER * float(numbers)).check(f"{shots.name}: factorising its patterns", Limits())
+    _check_factorising(shots, factors)
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
     noise = FrameNoise(shots.manifest, _ambient_noise(shots))
     frames, kept = prepared.accumulator(), list[Measurement]()
-    few = left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= _KEPT_NUMBERS
+    few = is_kept(shots, factors)
     for measurement in shots.measured((len(factors.left), len(factors.right))):
         frames.add(measurement.frame, measurement.row, measurement.column)
         noise.add(measurement)
         if few:
             kept.append(measurement)
     return Accumulated(Model(prepared, factors.sides, shots.patterns), frames, noise, tuple(kept))
+
+
+def _check_factorising(shots: Capture, factors: Factors) -> None:
+    """MitsimError where factorising the model of ``shots`` and ``factors`` takes more memory than is free."""
+    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors))
+    cost.check(f"{shots.name}: factorising its patterns", Limits())
 
 
 def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:

@@ -15,6 +15,7 @@ from mitsim.core.framefile import write_frame
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.pictures import card, png, scaled, span
+from mitsim.reconstruct.cost import Predicted
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depthmap import DepthMap
 from mitsim.reconstruct.misfit import Misfit
@@ -59,6 +60,8 @@ class Reconstruction:
         fingerprints of shots and factors, ``lam`` as it was asked for, and the method; the focus, where one was.
     focus
         the depth whose factors were used, or a depth for each pixel; None: the calibrated one.
+    predicted
+        seconds by stage and memory, before it was begun; None where nobody could tell.
     """
 
     image: FloatArray
@@ -75,6 +78,7 @@ class Reconstruction:
     seconds: dict[str, float]
     inputs: dict[str, str | float]
     focus: Depth | DepthMap | None = None
+    predicted: Predicted | None = None
 
     @property
     def ok(self) -> bool:
@@ -118,6 +122,9 @@ class Reconstruction:
             **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
             "status": str(self.status),
             "seconds": {**self.seconds, "total": sum(self.seconds.values())},
+            "predicted": self.predicted and self.predicted.seconds,
+            "predicted_seconds": self.predicted and sum(self.predicted.seconds.values()),
+            "predicted_memory_bytes": self.predicted and self.predicted.memory_bytes,
         }
 
     def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:

@@ -90,6 +90,7 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     assert found.keys() == keys | {
         *("truth_error", "rank_sides", "condition_whole", "condition_sides"),
         *("misfit", "uncertainty", "uncertainty_budget", "focus_mm", "focus_error_mm", "depths"),
+        *("predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes"),
     }
     assert found["focus_mm"] is None and found["focus_error_mm"] is None
     assert number(found["uncertainty"], 1e-6, 0.1) and all(map(number, found["uncertainty_budget"].values()))

@@ -17,6 +17,7 @@ from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHea
 from mitsim.core.recorders import RunMemory, frame_name
 from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, load_run
+from mitsim.reconstruct.cost import Predicted, predicted
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from mitsim.reconstruct.status import Status, Verdict
@@ -93,6 +94,37 @@ def test_the_time_of_both_parts_is_stated(shots: Capture, factors: Factors) -> N
     result = reconstruct(shots, factors)
     assert min(result.seconds.values()) > 0 and sum(result.seconds.values()) <= time.perf_counter() - begin
     assert result.summary()["seconds"]["total"] == pytest.approx(sum(result.seconds.values()))
+
+
+def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture, factors: Factors) -> None:
+    """By the stages that it states; every shot is read, and held against the model. (Planted: half of the shots.)"""
+    image = reconstruct(shots, factors)
+    assert image.predicted == predicted(shots, factors) and image.predicted is not None
+    assert image.predicted.seconds.keys() == image.seconds.keys()
+    summary = image.summary()
+    assert summary["predicted_seconds"] == sum(summary["predicted"].values()) > 0
+    assert 1e8 < summary["predicted_memory_bytes"] < 2e8
+    assert reconstruct(shots, factors, method="tv").summary()["predicted_memory_bytes"] is None
+
+
+def test_large_sensors_are_predicted_to_be_read_twice() -> None:
+    """16 times the pixels take 16 times as long, and once more for frames that are not kept; memory grows with a frame,
+    not with their number. (Planted: one look at frames that are not kept.)"""
+
+    def told(pixels: int, dots: int) -> Predicted:
+        family = parse_patterns(f"dots:{dots}", 128)
+        captures = [None] * dots**2
+        shots = SimpleNamespace(
+            patterns=(family.left, family.right), manifest=SimpleNamespace(patterns=SimpleNamespace(captures=captures))
+        )
+        side = np.zeros((pixels, 128))
+        return predicted(shots, SimpleNamespace(left=side, right=side))  # type: ignore[arg-type]
+
+    small, large, many = told(512, 7), told(2048, 7), told(2048, 32)
+    assert 10 < large.seconds["accumulate"] / small.seconds["accumulate"] <= 16
+    assert large.seconds["misfit"] > 30 * small.seconds["misfit"]
+    assert large.seconds["misfit"] > large.seconds["accumulate"] / 2
+    assert many.memory_bytes < 1.2 * large.memory_bytes < 2**30
 
 
 def test_dots_may_have_a_period_for_each_axis(tmp_path: Path) -> None:
