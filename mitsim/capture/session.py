@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -27,7 +26,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
-from mitsim.optics.frames import Frame
+from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.rig.patterns import Lighting, hadamard_matrix
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
@@ -194,12 +193,19 @@ class LitSession:
         """Numbers and frames from ``first`` on, without what black pixels leak; none is formed for number 0."""
         if first == 0:
             yield 0, self.white
-        n = self.session.bench.n
+        n, count = self.session.signs.shape
         row, column = np.divmod(np.arange(n * n), n)
         lighting = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
-        # All are formed, needed or not: how many are mixed at once shows in their last bits.
-        numbered = enumerate(self.light.frames(lighting, self.session.seed, leaking=False))
-        yield from islice(numbered, max(first, 1), None)
+        # Lots that hang on the sensor alone: what is formed together shows in the last bits. Not all patterns at once,
+        # unless their lines are mixed: which pixels each of 512 lights would be 2 GiB.
+        pixels = self.session.bench.geometry.pixels
+        step = count if mixes(n, count, pixels) else at_once(pixels)
+        for start in range(0, count, step):
+            numbers = np.arange(start, min(start + step, count))
+            if numbers[-1] >= max(first, 1):
+                frames = self.light.frames(lighting.shots(numbers), self.session.seed, leaking=False)
+                numbered = zip(numbers.tolist(), frames, strict=True)
+                yield from (item for item in numbered if item[0] >= max(first, 1))
 
     def _leaking(self, frame: Frame) -> Frame:
         """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""

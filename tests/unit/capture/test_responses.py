@@ -65,7 +65,7 @@ class ToyLight:
 
 def lit_session(n: int = 7, mode: str = "pair", mask: str = "separable") -> LitSession:
     recipe = load_recipe().model_copy(update={"signed_capture": mode})
-    bench = SimpleNamespace(n=n, rig=RIG, sensor=SENSOR, geometry=SimpleNamespace(mask=mask))
+    bench = SimpleNamespace(n=n, rig=RIG, sensor=SENSOR, geometry=SimpleNamespace(mask=mask, pixels=PIXELS))
     light = ToyLight(n)
     white = light.frames(Lighting.uniform(n), 0)[0]
     return LitSession(Session(bench, recipe, seed=4), light, white, EXPOSURE_S, 0.0)  # type: ignore[arg-type]
@@ -227,6 +227,29 @@ def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, 
     for ours, theirs in zip(again, whole, strict=True):
         for name in ("left", "right", "noise", "separability_residual", "unexplained", "predicted_error", "status"):
             assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+
+
+@pytest.mark.parametrize("first", [0, 1, 5, 9, 12])
+def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
+    """16 patterns in lots of 4 that begin at the same numbers wherever a session goes on; lots before are not formed.
+    (Planted: lots from the first number on, one pattern left out between lots.)"""
+    monkeypatch.setattr("mitsim.capture.session.mixes", lambda *_: False)
+    monkeypatch.setattr("mitsim.capture.session.at_once", lambda _: 4)
+    lit, formed = lit_session(13), []
+    whole = {number: frame.irradiance for number, frame in lit._formed("vertical", 0)}
+    frames = ToyLight.frames
+
+    def counted(self: ToyLight, lighting: Lighting, seed: int, leaking: bool = True) -> list[Frame]:
+        formed.append(lighting.weights)
+        return frames(self, lighting, seed, leaking)
+
+    monkeypatch.setattr(ToyLight, "frames", counted)
+    found = dict(lit._formed("vertical", first))
+    assert list(found) == list(range(first, 16)) and all(
+        np.array_equal(frame.irradiance, whole[number]) for number, frame in found.items()
+    )
+    lots = [(1 + lit.session.signs.T[start : start + 4]) / 2 for start in range(4 * (first // 4), 16, 4)]
+    assert all(np.array_equal(*pair) for pair in zip(formed, lots, strict=True))
 
 
 @pytest.mark.parametrize("mode", ["pair", "uniform"])
