@@ -22,11 +22,12 @@ from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Exposure
 from mitsim.capture.session_cost import session_cost, session_seconds
+from mitsim.capture.stripes import stripe_frames
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
-from mitsim.optics.frames import Frame, at_once, mixes
+from mitsim.optics.frames import Frame
 from mitsim.rig.patterns import Lighting, hadamard_matrix
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
@@ -193,19 +194,11 @@ class LitSession:
         """Numbers and frames from ``first`` on, without what black pixels leak; none is formed for number 0."""
         if first == 0:
             yield 0, self.white
-        n, count = self.session.signs.shape
+        n = self.session.bench.n
         row, column = np.divmod(np.arange(n * n), n)
-        lighting = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
-        # Lots that hang on the sensor alone: what is formed together shows in the last bits. Not all patterns at once,
-        # unless their lines are mixed: which pixels each of 512 lights would be 2 GiB.
+        stripes = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
         pixels = self.session.bench.geometry.pixels
-        step = count if mixes(n, count, pixels) else at_once(pixels)
-        for start in range(0, count, step):
-            numbers = np.arange(start, min(start + step, count))
-            if numbers[-1] >= max(first, 1):
-                frames = self.light.frames(lighting.shots(numbers), self.session.seed, leaking=False)
-                numbered = zip(numbers.tolist(), frames, strict=True)
-                yield from (item for item in numbered if item[0] >= max(first, 1))
+        yield from stripe_frames(self.light, stripes, self.session.seed, pixels, max(first, 1))
 
     def _leaking(self, frame: Frame) -> Frame:
         """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""

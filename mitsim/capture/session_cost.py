@@ -13,8 +13,9 @@ from mitsim.capture.evidence import Forming, Settings
 from mitsim.capture.exposer import frames_at_once
 from mitsim.capture.prices import FIXED, Numbers, forming_seconds
 from mitsim.capture.simulation import Simulation
+from mitsim.capture.stripes import lines_held
 from mitsim.core.resources import Cost
-from mitsim.optics.frames import frames_in_memory, mixes
+from mitsim.optics.frames import at_once
 
 _PACES = replace(FIXED, product=1.1e-11)
 """A multiplication of products as large as those of stripes: half of what it takes in small ones (2048 pixels a side,
@@ -41,7 +42,7 @@ def session_seconds(board: Bench, count: int, shots: int, settings: Settings) ->
     """
     n, pixels = board.n, board.geometry.pixels
     cells = max(Simulation(board, settings).fine.bundle.cells)
-    mixed = mixes(n, count, pixels)
+    mixed = lines_held(n, count, pixels)
     forming = Forming(
         pixels=pixels,
         cells=cells,
@@ -68,6 +69,8 @@ def session_cost(board: Bench, count: int, settings: Settings, seconds: float) -
         that it takes.
     """
     n, pixels = board.n, board.geometry.pixels
-    frames = frames_in_memory(n, count, pixels) + _HELD + _AT_WORK * frames_at_once(pixels**2)
+    frames = (
+        (n if lines_held(n, count, pixels) else 0) + 3 * at_once(pixels) + _HELD + _AT_WORK * frames_at_once(pixels**2)
+    )
     held = 8.0 * (frames * pixels**2 + _SUMS * count * pixels)
     return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + held)

@@ -233,8 +233,9 @@ def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, 
 def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
     """16 patterns in lots of 4 that begin at the same numbers wherever a session goes on; lots before are not formed.
     (Planted: lots from the first number on, one pattern left out between lots.)"""
-    monkeypatch.setattr("mitsim.capture.session.mixes", lambda *_: False)
-    monkeypatch.setattr("mitsim.capture.session.at_once", lambda _: 4)
+    monkeypatch.setattr("mitsim.capture.stripes.mixes", lambda *_: False)
+    monkeypatch.setattr("mitsim.capture.stripes.lines_held", lambda *_: False)
+    monkeypatch.setattr("mitsim.capture.stripes.at_once", lambda _: 4)
     lit, formed = lit_session(13), []
     whole = {number: frame.irradiance for number, frame in lit._formed("vertical", 0)}
     frames = ToyLight.frames

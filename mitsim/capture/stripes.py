@@ -1,0 +1,85 @@
+"""Light by projector pixel and a side's stripes in; the expected frame of every stripe pattern out.
+
+Where frames of single lines can be held, those of patterns are mixed from them: by :class:`ExpectedFrames` up to 256
+lines, and here beyond. Otherwise they are formed in lots: which pixels each of 512 patterns lights would be 2 GiB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mitsim.capture.light import Light
+from mitsim.core.arrays import FloatArray
+from mitsim.core.parallel import in_threads
+from mitsim.optics.frames import Frame, at_once, mixes
+from mitsim.rig.patterns import Lighting
+
+_LINES_BYTES = 7 * 2**28
+"""Frames of lines that are held at most, as of classes that are mixed."""
+_COLUMNS = 2**14
+"""Pixels of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+
+
+def lines_held(lines: int, patterns: int, pixels: int) -> bool:
+    """Whether frames of so many ``lines`` are held to be mixed into ``patterns``; ``pixels``: a side of the sensor."""
+    return mixes(lines, patterns, pixels) or (patterns >= lines and 8 * lines * pixels**2 <= _LINES_BYTES)
+
+
+def stripe_frames(light: Light, stripes: Lighting, seed: int, pixels: int, first: int) -> Iterator[tuple[int, Frame]]:
+    """Numbers and frames of patterns, without what black pixels leak.
+
+    The same bits whatever is the first. Frames come without a Monte Carlo error.
+
+    Parameters
+    ----------
+    light, seed
+        by projector pixel, and the seed of its probes.
+    stripes
+        line of each projector pixel, and the power 0 or 1 of each line in every pattern.
+    pixels
+        a side of the sensor.
+    first
+        number of the first pattern.
+    """
+    count, n = stripes.weights.shape
+    lines = None
+    if lines_held(n, count, pixels) and not mixes(n, count, pixels):
+        lines = _lines(light, Lighting(stripes.labels, np.eye(n)), seed, pixels)
+    # Lots that hang on the sensor alone: what is formed together shows in the last bits.
+    step = count if mixes(n, count, pixels) else at_once(pixels)
+    for start in range(0, count, step):
+        numbers = np.arange(start, min(start + step, count))
+        if numbers[-1] < first:
+            continue
+        if lines is None:
+            frames: Iterator[Frame] = iter(light.frames(stripes.shots(numbers), seed, leaking=False))
+        else:
+            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in _mixed(stripes.weights[numbers], lines))
+        yield from (item for item in zip(numbers.tolist(), frames, strict=True) if item[0] >= first)
+
+
+def _lines(light: Light, lines: Lighting, seed: int, pixels: int) -> FloatArray | None:
+    """(lines, pixels^2) frames of single lines; None where one lost light below zero, which patterns would lack."""
+    frames = np.empty((len(lines.weights), pixels**2))
+    for start in range(0, len(frames), step := at_once(pixels)):
+        numbers = np.arange(start, min(start + step, len(frames)))
+        for number, frame in zip(numbers, light.frames(lines.shots(numbers), seed, leaking=False), strict=True):
+            if frame.removed:
+                return None
+            frames[number] = frame.irradiance.ravel()
+    return frames
+
+
+def _mixed(weights: FloatArray, lines: FloatArray) -> FloatArray:
+    """(patterns, pixels, pixels) sums of ``lines`` (lines, pixels^2) by ``weights`` (patterns, lines)."""
+    mixed = np.empty((len(weights), lines.shape[1]))
+
+    def part(start: int) -> None:
+        inside = slice(start, start + _COLUMNS)
+        mixed[:, inside] = weights @ lines[:, inside]
+
+    in_threads(part, range(0, lines.shape[1], _COLUMNS))
+    side = round(lines.shape[1] ** 0.5)
+    return mixed.reshape(-1, side, side)
