@@ -23,7 +23,15 @@ _COLUMNS = 2**14
 
 
 def lines_held(lines: int, patterns: int, pixels: int) -> bool:
-    """Whether frames of so many ``lines`` are held to be mixed into ``patterns``; ``pixels``: a side of the sensor."""
+    """Whether frames of lines are held to be mixed into those of patterns.
+
+    Parameters
+    ----------
+    lines, patterns
+        how many there are of a side.
+    pixels
+        a side of the sensor.
+    """
     return mixes(lines, patterns, pixels) or (patterns >= lines and 8 * lines * pixels**2 <= _LINES_BYTES)
 
 
