@@ -56,10 +56,10 @@ _FRAMES_AS_MANY = 20.0
 """Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
 _OF_EFFECTS = 3
 """Changes that each effect's look takes as long as: it forms all light with and without, and coarse cells besides."""
-_OVER_PRICES, _LESS_S = 6.5, 1.0
+_OVER_PRICES, _LESS_S = 4.2, 0.6
 """Seconds of a look over the price of its samples, and less what flat scenes have less: kernels, searches for lobes and
-edges, chains of changes (processor seconds: photograph 1.4, gift_card 5, corner 7, cookie_bag 14; six tenths of them by
-the clock on two cores)."""
+edges, chains of changes (processor seconds in a new process: photograph 1.0, gift_card 2, corner 3, cookie_bag 7.5; six
+tenths of them by the clock on two cores)."""
 _LOBE_RAYS = 2**22
 """Rays that look for sharp lobes, some 0.5 s: a lobe of 1e-4 of the hemisphere is met 400 times, a metal ball of 20 mm
 at 370 twelve times on a sensor of 6.4 mm; a quarter of them overlooked it in one plan of twenty."""

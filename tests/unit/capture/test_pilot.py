@@ -15,12 +15,14 @@ from mitsim.capture import effects, pilot
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Evidence, Settings
-from mitsim.capture.pilot import direct, followed
+from mitsim.capture.pilot import direct, followed, looks
+from mitsim.capture.pilot.switched import SwitchedEffects
 from mitsim.capture.simulation import AT_ANCHORS, Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.rig.patterns import parse_patterns
+from mitsim.transport.histogram import Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
@@ -245,6 +247,25 @@ def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
 
 
 @pytest.mark.slow
+def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the sample's pixels, from the same paths, with lamps and black pixels that leak. (Planted: lamps' light lost,
+    the least light of a shot counted once, the columns of other pixels.)"""
+    monkeypatch.setattr(looks, "_PLACES", 5)
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = looks.Sample.of(lighting, bench.geometry.pixels, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    found = SwitchedEffects(bench, everything, sample, 5)
+    made = Simulation(bench, everything)
+    filed = [
+        made.file_direct(direct, lighting.labels, sample.direct)
+        + made.file_followed(Deposits.joined(list(followed)), lighting.labels, sample.followed)
+        for direct, *followed in zip(found.direct, *found.followed.values(), strict=True)
+    ]
+    assert made.physics.lamps and made.physics.black_level and len(sample.places) == 5 < bench.geometry.pixels
+    expected = made.expected(filed, sample.rows, sample.lighting, 0).by_group(np.array(sample.places))
+    np.testing.assert_allclose(found.frames, expected[:, :, list(sample.places)], rtol=1e-9)
+
+
 def test_the_pilot_is_reproducible(bench: Bench, evidence: Evidence) -> None:
     again = measured(bench, seed=3)
     for name in ("depth", "layers", "effects", "ladders"):

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.parallel import Behind
+from mitsim.core.parallel import Behind, in_threads
 
 
 def test_two_lots_are_held_and_no_more() -> None:
@@ -56,3 +56,24 @@ def test_an_interruption_leaves_begun_items_finished_and_others_undone() -> None
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert sorted(begun) == sorted(finished) and len(finished) < 500
+
+
+def test_items_of_items_do_not_wait_for_each_other() -> None:
+    """The threads are kept, and few: were items of items given to them, all might wait. (Planted: so they are.)"""
+    assert in_threads(lambda row: in_threads(lambda item: row * item, range(3)), range(64))[63] == [0, 63, 126]
+
+
+def test_an_error_of_an_item_leaves_none_at_work() -> None:
+    """(Planted: the error is raised while others go on.)"""
+    begun, finished = [], []
+
+    def work(item: int) -> None:
+        begun.append(item)
+        if item == 0:
+            raise MitsimError("item 0")
+        time.sleep(0.02)
+        finished.append(item)
+
+    with pytest.raises(MitsimError, match="item 0"):
+        in_threads(work, range(500))
+    assert sorted(begun) == [0, *sorted(finished)] and len(begun) < 500

@@ -1,0 +1,47 @@
+"""Independent looks that one kernel follows together are those that single ones find, bit for bit."""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture import effects
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.evidence import Settings
+from mitsim.capture.simulation import Simulation
+from mitsim.transport.histogram import Deposits
+from mitsim.transport.paths import Tracer
+
+pytestmark = pytest.mark.usefixtures("variant")
+SEEDS = (7, 2**32 - 1, 11, 12, 13)
+GLOSSY = """<emitter type="constant"><spectrum name="radiance" value="0.02"/></emitter>
+    <shape type="sphere"><point name="center" x="-25" y="10" z="330"/> <float name="radius" value="30"/>
+        <bsdf type="roughconductor"><float name="alpha" value="0.3"/></bsdf></shape>"""
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    return open_bench(shared_scene("looks", extra=GLOSSY), variant)
+
+
+def alike(one: Deposits, other: Deposits) -> bool:
+    names = [field.name for field in fields(one) if field.name != "lane"]
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+@pytest.mark.parametrize("launch", [2**22, 3 * 256])
+@pytest.mark.parametrize("name", ["direct", "anchored", "indirect", "from_camera"])
+def test_looks_together_are_looks_one_by_one(
+    bench: Bench, name: str, launch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four in a launch and one more, or launches that hold too few. (Planted: the sample's number of the first look
+    for all of them, the lanes of the look before.)"""
+    settings = Settings(depth=bench.geometry.scene_distance, effects=frozenset(effects.present(bench)))
+    tracer = getattr(Simulation(bench, replace(settings, anchors=2)), name)
+    monkeypatch.setattr(Tracer, "lanes_per_launch", launch)
+    together = tracer.trace_looks(SEEDS, 3)
+    assert len(together) == len(SEEDS) and not alike(together[0], together[1])
+    for seed, found in zip(SEEDS, together, strict=True):
+        assert found.value.size and alike(found, tracer.trace(seed, 0, 3))
