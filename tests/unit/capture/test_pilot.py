@@ -249,7 +249,7 @@ def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
 @pytest.mark.slow
 def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the sample's pixels, from the same paths, with lamps and black pixels that leak. (Planted: lamps' light lost,
-    the least light of a shot counted once, the columns of other pixels.)"""
+    the least light of a shot left out.)"""
     monkeypatch.setattr(looks, "_PLACES", 5)
     lighting = parse_patterns("dots:4", N).lighting
     sample = looks.Sample.of(lighting, bench.geometry.pixels, bench.loaded.mirrors)
