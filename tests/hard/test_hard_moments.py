@@ -137,6 +137,7 @@ def test_moments_of_some_electrons_are_exact_too(model: SensorModel, mean: float
     assert variance == pytest.approx(exact[1], rel=1e-3, abs=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(models, st.floats(4.01, 5).map(lambda x: 10**x))
 def test_moments_of_many_electrons_are_right_to_a_quarter_of_a_code(model: SensorModel, mean: float) -> None:

@@ -92,9 +92,8 @@ def furnace(write: Callable[..., Path], albedo: float) -> IndirectTracer:
     return IndirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, False, True)
 
 
-@pytest.mark.parametrize(
-    ("albedo", "samples"), [pytest.param(0.9, 64, marks=SLOW), pytest.param(0.99, 32, marks=SLOW), (0.999, 8)]
-)
+@SLOW
+@pytest.mark.parametrize(("albedo", "samples"), [(0.9, 64), (0.99, 32), (0.999, 8)])
 def test_a_closed_room_that_absorbs_little(
     measured: Recorder, small_scene: Callable[..., Path], albedo: float, samples: int
 ) -> None:

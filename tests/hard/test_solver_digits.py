@@ -218,6 +218,7 @@ def distance_table() -> list[tuple[float, float, list[float]]]:
     return rows
 
 
+@pytest.mark.slow
 def test_masks_from_2_mm_to_20_um(measured: Recorder) -> None:
     """Uniform light, 48 pixels, n = 12: cond(Phi) grows to 1e15, the error stays below the gate at every lambda."""
     rows = distance_table()

@@ -198,15 +198,9 @@ def test_corner(small_scene: Callable[..., Path], name: str, rho: float) -> None
     check(found.more, found.more_error, more, JUDGE_ERROR, 0.015, "more reflections")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "rho"),
-    [
-        ("factored", 0.9),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("path", 0.5), ("path", 0.9), ("factored", 0.3), ("factored", 0.6))
-        ),
-    ],
+    ("name", "rho"), [("path", 0.5), ("path", 0.9), ("factored", 0.3), ("factored", 0.6), ("factored", 0.9)]
 )
 def test_furnace(small_scene: Callable[..., Path], name: str, rho: float) -> None:
     scene = write_scene(small_scene, "furnace", SPHERE.format(rho=rho))

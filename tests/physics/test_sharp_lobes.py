@@ -346,6 +346,7 @@ def test_a_sharp_lobe_behind_panes(traced: Callable[..., Light], monkeypatch: py
     assert error < SIGMAS * predicted(light) < 0.15
 
 
+@pytest.mark.slow
 def test_matt_scenes_pay_nothing(small_scene: Callable[..., Path], variant: str) -> None:
     bench = open_bench(small_scene("matt", n=N, pitch=0.1, **glossy(0.3)), variant, for_render=True)
     assert make_plan(bench, Lighting.uniform(N), 1e-2, 0, ALONE).settings.sharp is None

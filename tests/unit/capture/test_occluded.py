@@ -130,6 +130,7 @@ def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
     assert evidence.occluded == () and {1, 2, 3} <= set(evidence.ladders["anchors"])
 
 
+@pytest.mark.slow
 def test_pixels_that_are_traced_apart_are_no_occluded_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """(Planted: the look goes by a simulation without them.)"""
     found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0)

@@ -98,7 +98,8 @@ def test_a_full_well_is_told_apart(lit: Callable[..., LitScene]) -> None:
     assert rms(long)[REST] < 1.5 * rms(short)[REST] + 0.02 and not long.parts[PIXELS].any()
 
 
-@pytest.mark.parametrize("alpha", [0.3, pytest.param(0.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("alpha", [0.3, 0.1])
 def test_a_highlight_has_the_brightness_of_its_lobe(lit: Callable[..., LitScene], alpha: float) -> None:
     """Where the surface mirrors the projector into the camera, at x = 30 mm here, GGX without Fresnel is f = 1 / (4 pi
     alpha^2) but for cosines and shadowing of 4.3 degrees, 1 %; half vectors turn by a 400th of a millimetre, so the
