@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -61,6 +62,18 @@ def test_no_finer_than_the_evidence_is_good_for(bought: list[Affordable], candid
     assert affordable(candidates, math.inf, FIRST_LOOK).accuracy == FIRST_LOOK
     kept, priced = (affordable(candidates, math.inf, 0.0, kept=kept) for kept in (True, False))
     assert priced.accuracy == 1e-5 < kept.accuracy, "the ladders end before it, so only its price is known"
+
+
+@pytest.mark.parametrize("seconds", [0.05, 0.2])
+def test_where_nothing_is_kept_time_alone_counts(seconds: float) -> None:
+    """The loosest is taken; that it is not kept is for the plan to say. (Planted: told as too few seconds.)"""
+
+    class Hopeless:
+        def seconds(self, accuracy: float) -> tuple[float, bool]:
+            return 0.1, False
+
+    found: Any = Hopeless()
+    assert affordable(found, seconds, 1e-4) == Affordable(HIGHEST_ACCURACY, 0.1, seconds > 0.1)
 
 
 def test_too_little_time_is_told(bought: list[Affordable]) -> None:

@@ -17,8 +17,8 @@ from mitsim.capture.evidence import GROUPS
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import trace_light
 from mitsim.capture.planning import make_plan
-from mitsim.capture.request import Exposure
-from mitsim.core.errors import MitsimError
+from mitsim.capture.request import Exposure, Request
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import checksum, read_frame
 from mitsim.core.job import Job
 from mitsim.core.resources import Limits
@@ -26,6 +26,7 @@ from mitsim.core.runs import Capture
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.recipe import load_recipe
 from mitsim.sensor.moments import frame_moments
+from tests.unit.capture.invented_evidence import plan as invented_plan
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N, ACCURACY = 16, 1e-2
@@ -217,6 +218,48 @@ def test_too_few_seconds_flag_the_loosest_plan(bench: Bench) -> None:
     for other, said in (({"seconds": 20.0}, "0.01; plan anew"), ({"accuracy": 1e-3}, "not both")):
         with pytest.raises(MitsimError, match=said):
             bench.capture(plan, **other)
+
+
+@pytest.mark.parametrize(
+    ("asked", "maker", "handed"),
+    [
+        ({"seconds": 3.0}, "plan_within", (3.0, 5, {"blur": False})),
+        ({"accuracy": 2e-2}, "make_plan", (2e-2, 5, {"blur": False})),
+        ({}, "make_plan", (1e-3, 5, {"blur": False})),
+    ],
+)
+def test_a_plan_is_made_of_what_is_asked(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, asked: dict[str, object], maker: str, handed: tuple[object, ...]
+) -> None:
+    """By the one way or the other. (Planted: no seed, or no effects, for a plan within seconds.)"""
+
+    def planned(seen: Bench, lighting: object, *rest: object) -> None:
+        raise MitsimError(repr((seen is bench, *rest)))
+
+    monkeypatch.setattr(run, maker, planned)
+    for begin in (bench.plan, bench.light, bench.capture):
+        with pytest.raises(MitsimError) as caught:
+            begin("dots:3", seed=5, effects="-blur", **asked)
+        assert str(caught.value) == repr((True, *handed))
+
+
+def test_what_a_plan_was_made_for_is_not_changed() -> None:
+    """What would need another plan is refused by name; what the plan does not hang on may change. (Planted: each of the
+    four left out.)"""
+    made = replace(invented_plan(), request=Request.of(patterns="dots:3", accuracy=2e-2, effects="-blur", seed=3))
+    timed = replace(made, request=Request.of(seconds=3.0))
+    for own, changes in (
+        (made, {"patterns": "dots:2"}),
+        (made, {"accuracy": 1e-2}),
+        (made, {"effects": {}}),
+        (timed, {"seconds": 4.0}),
+    ):
+        (name,) = changes
+        with pytest.raises(ArgumentError, match="plan anew") as caught:
+            run.request_of(own, changes)
+        assert caught.value.argument == name
+    assert run.request_of(made, {"exposure": 0.01, "accuracy": 2e-2}) == made.request.changed(exposure=0.01)
+    assert run.request_of(timed, {"exposure": 0.01}) == Request.of(seconds=3.0, exposure=0.01)
 
 
 def test_frames_of_another_run_are_not_kept(bench: Bench, captured: Capture, tmp_path: Path) -> None:
