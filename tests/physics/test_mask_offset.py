@@ -103,6 +103,7 @@ def test_samplers_of_a_moved_mask_are_a_centred_ones_asked_elsewhere(spectrum: S
             assert np.abs(found - own(s, width, tangent)).max() > 0.1 * found.max()
 
 
+@pytest.mark.slow
 def test_the_reference_moves_its_mask_alike(small_scene: Callable[..., Path], variant: str) -> None:
     """Slope of the reference's frame on the factored one less its mean, 8 seeds of 128 samples a pixel: 1 to five
     standard errors of their mean; it is 0 +- 0.1 for a mask elsewhere. (Planted: the sign, rows for columns.)"""

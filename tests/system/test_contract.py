@@ -144,6 +144,7 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
     assert [path.name for path in tmp_path.iterdir()] == ["frame.exr"]
 
 
+@pytest.mark.slow
 def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of no time, which leaves all but one run out; what whole rows hold is held by unit/study/test_accuracy.py."""
     monkeypatch.setattr(accuracy, "BUDGET_S", 0.0)

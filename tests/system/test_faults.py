@@ -234,6 +234,7 @@ def test_resume_with_another_version_is_refused(
         assert "resume" in line and "another configuration (versions differ)" in line
 
 
+@pytest.mark.slow
 def test_resume_with_another_variant_is_refused(shell: Callable[..., Any], lab: Any, interrupted: Path) -> None:
     options = "--patterns", PATTERNS, "--resume", "--variant", "llvm_ad_rgb"
     assert "(variant differ)" in shell("capture", *lab.rig, "-o", interrupted, *options).refusal

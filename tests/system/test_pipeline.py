@@ -171,6 +171,7 @@ def test_a_second_reconstruction_replaces_the_first_when_it_is_asked_to(
     assert written() == 1e9
 
 
+@pytest.mark.slow
 def test_noise_is_drawn_afresh_for_every_frame_and_seed(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     """Frames less what their electrons promise: unit variance in units of the sensor's noise, and no correlation.
 

@@ -50,7 +50,7 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
         ("patterns", ("--over", "z=1:2:3"), "has its own points and measures"),
         ("distance", ("--patterns", "dots:3"), "has its own points and measures"),
         ("sweep", (), "nothing is varied; give --over"),
-        ("sweep", ("--over", "z=1:2", "--jobs", 1), "has no <default name='z'>"),
+        pytest.param("sweep", ("--over", "z=1:2", "--jobs", 1), "has no <default name='z'>", marks=pytest.mark.slow),
         ("sweep", ("--over", "z=a:b:c"), "is not FIRST:LAST:COUNT"),
         ("sweep", ("--over", "exposure=long"), "use equal peak, equal frame, equal total"),
         ("sweep", ("--over", "seed=x"), "give whole numbers"),

@@ -109,6 +109,7 @@ def test_studios_share_their_calibrations(studio: Studio, setup: Setup, tmp_path
     assert len([path for path in (tmp_path / "calibrations").iterdir() if path.is_dir()]) == 2
 
 
+@pytest.mark.slow
 def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[..., Path], variant: str) -> None:
     """Its truth is the picture, averaged over pixels; the scene's own files are as they were."""
     path = shared_scene("printed", reflectance=np.full((48, 48), 100))

@@ -150,6 +150,7 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
     assert np.mean(squares) == pytest.approx(gain / 12 / step_s**2, rel=0.15)
 
 
+@pytest.mark.slow
 def test_steps_add_up_to_the_whole(studio: Studio, setup: Setup) -> None:
     """In order, of a real scene; what it does not call for changes nothing at all."""
     scope = Scope(setup, (None,), seeds=(3,), quick=True)

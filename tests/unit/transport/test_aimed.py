@@ -94,7 +94,9 @@ def both(bench: Bench, pixels: np.ndarray, samples: int) -> tuple[np.ndarray, np
     return totals(AimedTracer(*parts, pixels), samples), totals(DirectTracer(*parts, pixels=pixels), 4 * samples)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=LONGER if name == "plate" else ()) for name in SCENES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=LONGER if name in ("plate", "blend") else ()) for name in SCENES]
+)
 def test_aimed_rays_find_the_same_light(lit: Callable[[str], tuple[Bench, np.ndarray]], name: str) -> None:
     aimed, even = both(*lit(SCENES[name]), 1024)
     error = np.hypot(aimed.std(axis=0, ddof=1), even.std(axis=0, ddof=1)) / np.sqrt(SEEDS)

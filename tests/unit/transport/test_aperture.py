@@ -88,6 +88,7 @@ def test_an_edge_spreads_by_the_blur_circle(z: float, focus: float) -> None:
     assert blur == 0 or (np.abs(lit - 0.5) < 0.49).any()
 
 
+@pytest.mark.slow
 def test_defocus_keeps_the_flux() -> None:
     """One projector pixel of 7.5 mm on a board twice as far as the focus: blurred, but as much light as in focus."""
     canvas = np.zeros((N, 2 * N))

@@ -64,6 +64,7 @@ def test_flux_over_lobes_is_that_of_quadrature(bench: Callable[..., Bench], alph
     assert abs(found - expected) < gate, f"{found / expected - 1:+.2%}, gate {gate / expected:.2%}"
 
 
+@pytest.mark.slow
 def test_flux_behind_a_hole_is_dimmed_once_each_way(bench: Callable[..., Bench]) -> None:
     found, error = flux(bench(1e-3, 0.5), True, 2**14, LIT)
     gate, expected = SEVEN * error + 1e-3 * found, 0.25 * over_the_sensor(1e-3)
