@@ -20,6 +20,9 @@ from mitsim.optics.frames import at_once
 _PACES = replace(FIXED, product=1.1e-11)
 """A multiplication of products as large as those of stripes: half of what it takes in small ones (2048 pixels a side,
 two processors)."""
+_MIXED_S, _FORMED_S = 3e-8, 1e-8
+"""A pixel of a frame that is mixed or formed beside its multiplications: memory that is read and taken anew (sensors of
+512 and 1024 pixels mixed, of 2048 formed; processor seconds, halved for two processors)."""
 _HELD, _AT_WORK = 5.0, 5.0
 """Frames in double precision: those that a session holds (the uniform one, its rate, a pair's both shots together, two
 noisy uniform ones), and what each response takes that is worked on (light of two shots, their numbers, rates)."""
@@ -54,8 +57,8 @@ def session_seconds(board: Bench, count: int, shots: int, settings: Settings) ->
     )
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
     seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _PACES))
-    mixing = 2 * count * n * pixels**2 * _PACES.product if mixed else 0.0
-    return {"optics": seconds + mixing, "sensor": frame_seconds(board, shots)["sensor"]}
+    each = n * _PACES.product + _MIXED_S if mixed else _FORMED_S
+    return {"optics": seconds + 2 * count * pixels**2 * each, "sensor": frame_seconds(board, shots)["sensor"]}
 
 
 def session_cost(board: Bench, count: int, settings: Settings, seconds: float) -> Cost:
