@@ -118,17 +118,14 @@ def _counted(words: list[str], inside: Path, limit: float) -> dict[str, Any]:
 
 
 def table(results: Mapping[str, Any], verb: str) -> str:
-    """What was measured of a command, as markdown: predicted / taken.
-
-    Captures of cases of several commands are left out: others show the same.
-    """
+    """What was measured of a command, as markdown: predicted / taken."""
     stages = STAGES[verb]
     sizes = "processor [s]", "memory [GiB]", "process [GiB]"
     heads = ("case", *(f"{stage} [s]" for stage in stages), "total [s]", *sizes)
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for name, case in CASES.items():
+    for name in CASES:
         row = results["cases"].get(name, {}).get(verb)
-        if row is None or (verb == "capture" and case.verbs != ("capture",)):
+        if row is None or not _counts(name, verb):
             continue
         name = name.removeprefix("image, ")
         if row.get("killed"):
@@ -141,6 +138,12 @@ def table(results: Mapping[str, Any], verb: str) -> str:
         memory = "{:.2f} / {:.2f} | {:.2f}".format(*held)
         lines.append(f"| {' | '.join((name, *pairs, total, format(row['processor_seconds'], '.1f'), memory))} |")
     return "\n".join(lines)
+
+
+def _counts(name: str, verb: str) -> bool:
+    """Whether a case is in the table of a command: captures of cases of several commands are shown by others."""
+    verbs = CASES[name].verbs
+    return verb in verbs and (verb != "capture" or len(verbs) == 1)
 
 
 def main() -> None:
@@ -161,7 +164,8 @@ def main() -> None:
         taken = ", ".join(f"{verb} {row['seconds']:.1f} s" for verb, row in results["cases"][name].items())
         print(f"{name}: {taken}", file=sys.stderr, flush=True)
     print(f"{results['machine']}; predicted / taken")
-    for verb in STAGES:
+    counted = [verb for verb in STAGES if any(_counts(name, verb) for name in results["cases"])]
+    for verb in counted:
         print(f"\n{verb}\n\n{table(results, verb)}")
 
 
