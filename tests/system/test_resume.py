@@ -144,8 +144,8 @@ def factors(call: Callable[..., Any], wide: tuple[object, ...], tmp_path_factory
     [
         pytest.param(signal.SIGKILL, "manifest.json", marks=pytest.mark.slow),
         pytest.param(signal.SIGKILL, "light.part.npz", marks=pytest.mark.slow),
-        (signal.SIGINT, "noisy.part.npz"),
-        pytest.param(signal.SIGTERM, "noise_free.part.npz", marks=pytest.mark.slow),
+        (signal.SIGINT, "stripes.part.npz"),
+        pytest.param(signal.SIGTERM, "stripes.part.npz", marks=pytest.mark.slow),
     ],
 )
 def test_a_calibration_that_is_stopped_loses_no_finished_part(
