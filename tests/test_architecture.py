@@ -207,9 +207,16 @@ def sums_lanes(module: str, source: str) -> list[str]:
     """Sums that Dr.Jit would add up over lanes, in the lanes' own 32 bits."""
     if module in OF_A_LANE:
         return []
-    calls = (node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
-    found = (call for call in calls if isinstance(call, ast.Attribute) and call.attr in SUMS)
+    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    narrow = (call.func for call in calls if not in_double_precision(call))
+    found = (call for call in narrow if isinstance(call, ast.Attribute) and call.attr in SUMS)
     return [call.attr for call in found if isinstance(call.value, ast.Name) and call.value.id in ("dr", "drjit")]
+
+
+def in_double_precision(call: ast.Call) -> bool:
+    """Whether what is added up has been turned into 64 bits in the call itself."""
+    first = call.args[0] if call.args else None
+    return isinstance(first, ast.Call) and isinstance(first.func, ast.Attribute) and first.func.attr == "Float64"
 
 
 def test_no_module_but_core_knows_a_backend() -> None:
@@ -221,6 +228,7 @@ def test_no_module_but_core_knows_a_backend() -> None:
 
 
 def test_lanes_are_not_added_up_in_32_bits() -> None:
-    """Light leaves the device as it is, or in whole numbers of 64 bits; the host adds up in double precision."""
+    """Light is added up on the device in whole numbers or floats of 64 bits, or on the host in double precision."""
     assert not [name for name, path in modules() if sums_lanes(name, path.read_text(encoding="utf-8"))]
     assert sums_lanes("mitsim.transport.flux", "total = dr.sum(light)") == ["sum"]
+    assert not sums_lanes("mitsim.transport.flux", "total = dr.block_sum(mi.Float64(light), 4)")

@@ -1,7 +1,8 @@
 """What a perfect image would show: from a bench and how well frames know its light to apparent reflectance and error.
 
 Apparent reflectance is each projector pixel's flux of direct light toward the sensor over that of the calibration
-board. Both fluxes have random streams of their own, so an error of the frames is never one of the truth as well.
+board. Both fluxes have random streams of their own, so an error of the frames is never one of the truth as well; but
+where the frames' light is noisy tells where the truth is to be sampled.
 """
 
 from __future__ import annotations
@@ -13,20 +14,27 @@ from scipy.ndimage import uniform_filter
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import Physics, names
-from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
-from mitsim.capture.prices import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_PART, TRUTH_SAMPLES
+from mitsim.capture.evidence import Settings
+from mitsim.capture.prices import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_GROUPS, TRUTH_PART, TRUTH_SAMPLES
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.rig.recipe import load_recipe
-from mitsim.transport.flux import FluxTracer
+from mitsim.transport.flux import FluxTracer, IntArray
 
 _FINEST = 1e-4
 """Standard error below which the truth is not refined: 80 dB, where no image of a sensor with a full well comes."""
 _BOARD_PART = 0.5
 """Of the truth's error, what the board may bring: a quarter of its square, for a surface that converges quickly."""
-_GAIN = 0.75
-"""Part of its variance that a pixel loses when its samples are doubled: 0.5 of random points, 0.87 of stratified ones
+_RATE = 2.0
+"""Power of its samples that a pixel's variance falls with: 1 of random points, 2 of stratified ones about an edge, 3
 over smooth light. Too high a guess costs another round, too low a one some rays."""
+_ANYWHERE = 0.01
+"""Part of the mean variance that is expected of any pixel, as those that foretell it may have missed what it shows."""
+_AIM = 0.98
+"""Part of the error to aim at: half of those just at it would take another round."""
+_DOUBLINGS, _AT_ONCE = 8, 4
+"""Doublings of a pixel's samples that are weighed, and those made in one round, as the first rounds know little.
+Numbers of samples are powers of 2, at which points are even."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +84,9 @@ def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatAr
     board = _Flux(bench.with_board(load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
     unit = board.mean
     target = max(TRUTH_PART * _rms(_over(flux_error, unit)), _FINEST)
-    board.refine(unit, _BOARD_PART * target)
+    board.refine(unit, _BOARD_PART * target, np.ones_like(unit))
     scene = _Flux(bench, effects, seed, "scene", TRUTH_SAMPLES)
-    scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target)
+    scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target, np.square(_over(flux_error, unit)))
     reflectance = _over(scene.mean, board.mean)
     error = np.hypot(_over(scene.standard_error, board.mean), reflectance * _over(board.standard_error, board.mean))
     shape = (bench.n, bench.n)
@@ -91,10 +99,15 @@ class _Flux:
     def __init__(self, bench: Bench, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
         physics, loaded, pixels = Physics.simulated(bench, effects), bench.loaded, bench.n**2
         self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry, loaded.glossy)
-        self._seeds = [integer(seed, "truth", name, group) for group in range(GROUPS)]
-        self._sums, self._samples = np.zeros((GROUPS, pixels)), np.zeros(pixels)
-        self._shape, self.rays = (bench.n, bench.n), 0
-        self._sample(np.arange(pixels), 0, samples)
+        self._seed = integer(seed, "truth", name)
+        self._sums, self._samples = np.zeros((TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)
+        self._shape, self._first = (bench.n, bench.n), samples
+        self._sample(np.full(pixels, samples))
+
+    @property
+    def rays(self) -> int:
+        """All that were traced."""
+        return int(TRUTH_GROUPS * self._samples.sum())
 
     @property
     def mean(self) -> FloatArray:
@@ -104,34 +117,67 @@ class _Flux:
     @property
     def standard_error(self) -> FloatArray:
         """(n^2,) of the mean, from the spread of the groups [W m^-2]."""
-        return np.asarray(self._sums.std(axis=0, ddof=1) / self._samples / np.sqrt(GROUPS))
+        return np.asarray(self._sums.std(axis=0, ddof=1) / self._samples / np.sqrt(TRUTH_GROUPS))
 
-    def refine(self, unit: FloatArray, target: float) -> None:
-        """Double the samples of the pixels where that brings most, until the standard error in units ``unit`` (n^2,),
-        rms over the image, meets the ``target``, or too many rays would be needed."""
-        while True:
-            variance = np.square(_over(self.standard_error, unit))
-            excess = variance.sum() - target**2 * len(variance)
-            if excess <= 0:
-                return
-            # An edge goes on in the next pixel, where all samples so far may have missed it.
-            likely = variance + uniform_filter(variance.reshape(self._shape), 3, mode="nearest").ravel()
-            by_gain = np.argsort(-likely / self._samples, kind="stable")
-            enough = int(np.searchsorted(_GAIN * np.cumsum(variance[by_gain]), excess)) + 1
-            pixels = np.sort(by_gain[:enough])
-            most = max(MOST_RAYS, MOST_SAMPLES * len(variance))
-            if self.rays + GROUPS * self._samples[pixels].sum() > most:
-                return
-            for done in np.unique(self._samples[pixels]).astype(int):
-                self._sample(pixels[self._samples[pixels] == done], done, done)
+    def refine(self, unit: FloatArray, target: float, likely: FloatArray) -> None:
+        """Trace more where that brings most, until the standard error meets a target, or too many rays would be needed.
 
-    def _sample(self, pixels: np.ndarray[tuple[int], np.dtype[np.int64]], first: int, samples: int) -> None:
-        tracer, at_once = self._tracer.at(pixels), max(1, LANES_AT_ONCE // len(pixels))
-        for sums, seed in zip(self._sums, self._seeds, strict=True):
-            for start in range(first, first + samples, at_once):
-                sums[pixels] += tracer.sums(seed, start, min(at_once, first + samples - start))
-        self._samples[pixels] += samples
-        self.rays += GROUPS * samples * len(pixels)
+        Parameters
+        ----------
+        unit
+            (n^2,) of the error [W m^-2].
+        target
+            its rms over the image, in these units.
+        likely
+            (n^2,) variances at equal samples, in any unit, by what others know. The pixels' own spread does not tell:
+            a pixel whose samples happen to agree would get no more of them, and be further off than it says.
+        """
+        # An edge goes on in the next pixel, where all samples so far may have missed it.
+        likely = likely + uniform_filter(likely.reshape(self._shape), 3, mode="nearest").ravel()
+        likely += _ANYWHERE * likely.mean() or 1.0
+        most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
+        while (error := _rms(_over(self.standard_error, unit))) > target:
+            wanted = _allotted(likely, self._samples, self._first, (_AIM * target / error) ** 2, most)
+            if (wanted == self._samples).all():
+                return
+            self._sample(wanted)
+
+    def _sample(self, wanted: IntArray) -> None:
+        """Trace until every pixel has so many samples as are ``wanted`` (n^2,): no less than it has."""
+        pixels = np.flatnonzero(wanted > self._samples)
+        done, more = self._samples[pixels], (wanted - self._samples)[pixels]
+        block = int(np.gcd.reduce(more))
+        blocks = more // block
+        place = np.repeat(np.arange(len(pixels)), blocks)
+        within = np.arange(len(place)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+        light = self._tracer.sums(self._seed, TRUTH_GROUPS, pixels[place], done[place] + block * within, block)
+        for sums, part in zip(self._sums, light, strict=True):
+            sums += np.bincount(pixels[place], part, len(sums))
+        self._samples = wanted
+
+
+def _allotted(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
+    """(n^2,) samples that leave a part of the variance, doubled where a sample takes off most of it.
+
+    Parameters
+    ----------
+    likely
+        (n^2,) variances of the pixels at ``first`` samples, in any unit.
+    samples, first
+        (n^2,) that they have, powers of 2 times what they began with.
+    part
+        of today's variance that may be left.
+    most
+        samples in all.
+    """
+    doublings = np.arange(_DOUBLINGS)
+    left = (likely * (samples / first) ** -_RATE)[:, None] * 2.0 ** (-_RATE * doublings)
+    gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
+    best = np.argsort(-(gain / cost), axis=None, kind="stable")
+    enough = int(np.searchsorted(np.cumsum(gain.ravel()[best]), (1 - part) * left[:, 0].sum())) + 1
+    affordable = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
+    made = np.bincount(best[: min(enough, affordable)] // _DOUBLINGS, minlength=len(likely))
+    return np.asarray(samples << np.minimum(made, _AT_ONCE))
 
 
 def _over(flux: FloatArray, unit: FloatArray) -> FloatArray:

@@ -2,12 +2,11 @@
 
 With A the sensor's area, a connection to an even point of it finds the irradiance I there; over glossy surfaces a turn
 that is sampled as the surface scatters, and lands on the sensor with density q [1/mm^2], finds I / (A q). By the
-balance heuristic (Veach 1997, 9.2) either counts I / (1 + A q): unbiased, and bounded however sharp the lobe.
+balance heuristic (Veach 1997, 9.2) either counts I / (1 + A q): unbiased, and bounded however sharp the lobe. Places in
+the pixel, points of the sensor and turns are as even as each other, and independent.
 """
 
 from __future__ import annotations
-
-from copy import copy
 
 import drjit as dr
 import mitsuba as mi
@@ -16,18 +15,26 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import check_finite
 from mitsim.transport.landing import landing
-from mitsim.transport.paths import launches
-from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.receiver import Reception
+from mitsim.transport.paths import LANES_PER_LAUNCH
+from mitsim.transport.projector import ProjectorOptics, ProjectorRays
+from mitsim.transport.receiver import Receiver, SensorPoints, sampled_wavelengths
+from mitsim.transport.sampling import panchromatic, shuffled, stratified, streams
 
 IntArray = npt.NDArray[np.int64]
 
 
-class FluxTracer(DirectTracer):
-    """Direct light at the sensor as a whole, of each projector pixel."""
+class FluxTracer:
+    """Direct light at the sensor as a whole, of each projector pixel.
+
+    Attributes
+    ----------
+    lanes_per_launch
+        rays of one kernel, unless those of one block are more.
+    """
+
+    lanes_per_launch = LANES_PER_LAUNCH
 
     def __init__(
         self,
@@ -48,73 +55,108 @@ class FluxTracer(DirectTracer):
         glossy
             whether the scene has glossy surfaces, whose turns are sampled too.
         """
-        super().__init__(scene, camera, projector, 1, geometry, spread=True)
-        self._glossy = glossy
+        self._rays, self._receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
+        self._sensor = SensorPoints(geometry.half_width, spread=True)
+        self._pixels, self._glossy = projector.n**2, glossy
 
-    def at(self, pixels: IntArray) -> FluxTracer:
-        """The same for the projector pixels ``pixels`` (m,) alone."""
-        part = copy(self)
-        part._pixels = pixels
-        return part
-
-    def sums(self, seed: int, first: int = 0, samples: int = 1) -> FloatArray:
-        """(m,) light of each pixel, summed over some samples [W m^-2].
+    def sums(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
+        """(groups, m) light of m blocks of samples, each summed [W m^-2].
 
         Parameters
         ----------
-        seed, first, samples
-            as for :meth:`mitsim.transport.paths.Tracer.trace`.
+        seed
+            of the random numbers.
+        groups
+            independent estimates.
+        pixels, first
+            (m,) projector pixel of each block, and the number of its first sample: samples ``first`` .. ``first +
+            samples - 1`` of the pixel's sequence are traced.
+        samples
+            of each block.
 
         Raises
         ------
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        lanes = len(self._pixels)
-        total = np.zeros(lanes)
-        for sample, lane in launches(lanes, first, samples, lanes * max(1, self.lanes_per_launch // lanes)):
-            seen, *_ = self._sightings(seed, sample, lane)
-            light = np.array(seen.value).reshape(-1, lanes)
-            check_finite(light)
-            total += light.sum(axis=0, dtype=np.float64)
+        blocks, at_once = groups * len(pixels), max(1, self.lanes_per_launch // samples)
+        total = np.empty(blocks)
+        numbers, starts = mi.UInt32(pixels), mi.UInt32(first)
+        # Opaque numbers keep the compiled kernel the same for all of them.
+        each, count = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, len(pixels))
+        for start in range(0, blocks, at_once):
+            stop = min(start + at_once, blocks)
+            lane = dr.arange(mi.UInt32, (stop - start) * samples)
+            place = lane // each
+            block = place + dr.opaque(mi.UInt32, start)
+            group = block // count
+            number = block - group * count
+            sample = dr.gather(mi.UInt32, starts, number) + (lane - place * each)
+            light = self._light(seed, group, dr.gather(mi.UInt32, numbers, number), sample)
+            total[start:stop] = np.array(dr.block_sum(mi.Float64(light), samples))
+        check_finite(total)
+        return total.reshape(groups, -1)
+
+    def _light(self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Float:
+        """Mean irradiance that one ray of each ``pixel`` brings to the sensor."""
+        pixels = dr.opaque(mi.UInt32, self._pixels)
+        shared, rng = streams(seed, pixel + group * pixels, sample)
+        jitter = stratified(sample, shared)
+        wavelengths, spectral = sampled_wavelengths(self._receiver.camera, rng)
+        ray = self._rays.sample(pixel, jitter, rng, wavelengths)
+        point = stratified(shuffled(sample, shared), shared)
+        turn = stratified(shuffled(sample, shared), shared) if self._glossy else None
+        sensor, flux = self._sensor.inside(point), self._rays.flux(pixel, wavelengths) * spectral
+
+        def seen_at(
+            si: mi.SurfaceInteraction3f,
+            direction: mi.Vector3f,
+            light: mi.Spectrum,
+            active: mi.Bool,
+            state: tuple[mi.Float, mi.PCG32],
+        ) -> tuple[mi.Float, mi.PCG32]:
+            total, rng = state
+            if turn is None:
+                return total + self._connected(si, direction, light, sensor, active), rng
+            total = total + self._turned(si, direction, light, (rng.next_float32(), turn), active)
+            return total + self._connected(si, direction, light, sensor, active), rng
+
+        total, _ = self._receiver.passage.along(ray, flux, (mi.Float(0), rng), seen_at)
         return total
 
-    def _received(
+    def _turned(
         self,
         si: mi.SurfaceInteraction3f,
         direction: mi.Vector3f,
         light: mi.Spectrum,
-        sensor: mi.Point3f,
+        numbers: tuple[mi.Float, mi.Point2f],
         active: mi.Bool,
-        rng: mi.PCG32,
-    ) -> tuple[Reception, mi.Float]:
-        if not self._glossy:
-            return super()._received(si, direction, light, sensor, active, rng)
+    ) -> mi.Float:
+        """What ``light`` that comes to surfaces in a ``direction`` brings over turns, which ``numbers`` draw."""
         si.wi = si.to_local(-direction)
         context = mi.BSDFContext(mi.TransportMode.Importance)
-        number, point = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        turn, _ = si.bsdf().sample(context, si, number, point, active)
+        turn, _ = si.bsdf().sample(context, si, *numbers, active)
         lobe = active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        place = landing(self.receiver, si, si.to_world(turn.wo), lobe)
-        half = dr.opaque(mi.Float, self.receiver.geometry.half_width)
+        place = landing(self._receiver, si, si.to_world(turn.wo), lobe)
+        half = dr.opaque(mi.Float, self._sensor.half_width)
         lobe = place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
-        met = self._shared(si, direction, light, mi.Point3f(place.x, place.y, 0), lobe)
-        connected = self._shared(si, direction, light, sensor, active)
-        return connected[0], connected[1] + met[1]
+        return self._connected(si, direction, light, mi.Point3f(place.x, place.y, 0), lobe)
 
-    def _shared(
+    def _connected(
         self,
         si: mi.SurfaceInteraction3f,
         direction: mi.Vector3f,
         light: mi.Spectrum,
         point: mi.Point3f,
         active: mi.Bool,
-    ) -> tuple[Reception, mi.Float]:
-        """What comes to ``point`` of the sensor, over 1 + A q."""
-        reception, value = self._connected(si, direction, light, point, active)
+    ) -> mi.Float:
+        """What it brings to a ``point`` of the sensor; over glossy surfaces, over 1 + A q."""
+        reception = self._receiver.receive(si, -direction, point, active)
+        value = panchromatic(reception.irradiance * light)
+        if not self._glossy:
+            return value
         si.wi = si.to_local(-direction)
         context = mi.BSDFContext(mi.TransportMode.Importance)
         density = si.bsdf().pdf(context, si, si.to_local(reception.direction), active)
-        area = 4 * dr.square(dr.opaque(mi.Float, self.receiver.geometry.half_width))
-        met = value > 0
-        return reception, dr.select(met, value / (1 + area * density * reception.solid_angle(point)), 0)
+        area = 4 * dr.square(dr.opaque(mi.Float, self._sensor.half_width))
+        return dr.select(value > 0, value / (1 + area * density * reception.solid_angle(point)), 0)
