@@ -1,6 +1,6 @@
 """Entry point of the program: the worker process first, and in it the command line, which takes time to import."""
 
-from mitsim.core.worker import end_stopped, enter_worker, stopped
+from mitsim.core.worker import end_stopped, end_with, enter_worker, stopped
 
 
 def main() -> None:
@@ -10,6 +10,9 @@ def main() -> None:
         from mitsim.cli import run
 
         run()
+    except SystemExit as ended:
+        end_with(ended.code)
+        raise
     except KeyboardInterrupt:  # before the command line is there to take it
         end_stopped()
     except Exception:

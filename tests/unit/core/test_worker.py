@@ -34,9 +34,9 @@ STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + WAIT
 
 
 def start(work: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM.format(work=work)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command, pipe = [sys.executable, "-c", PROGRAM.format(work=work)], subprocess.PIPE
+    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=buffered)
 
 
 def started(work: str) -> tuple[subprocess.Popen[str], int]:
@@ -50,6 +50,29 @@ def started(work: str) -> tuple[subprocess.Popen[str], int]:
 def test_an_exit_status_is_passed_on(status: int) -> None:
     process = start(f"print('out'); print('err', file=sys.stderr); sys.exit({status})")
     assert (*process.communicate(), process.returncode) == ("out\n", "err\n", status)
+
+
+LEAVING = """
+import atexit, threading
+from mitsim.core.worker import end_with
+class Library:
+    def __del__(self): os.write(1, b"taken apart")
+kept = Library()
+threading.Timer(0.1, print, ["thread"]).start()
+atexit.register(print, "exit function")
+print("unflushed")
+end_with(3)
+sys.exit(3)
+"""
+
+
+def test_a_worker_ends_once_all_is_done_and_takes_nothing_apart() -> None:
+    """(Planted: no flush; ended at once instead of at exit; a status of none that is noted.)"""
+    process = start(LEAVING)
+    said = "unflushed\nthread\nexit function\n"
+    assert (*process.communicate(), process.returncode) == (said, "", 3)
+    process = start(LEAVING.replace("(3)", "('words')"))
+    assert (*process.communicate(), process.returncode) == (said + "taken apart", "words\n", 1)
 
 
 @pytest.mark.parametrize(
