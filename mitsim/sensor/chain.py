@@ -99,11 +99,12 @@ def expose(
         streams of their own, so that switching one noise off leaves the other's draw as it was.
     """
     light = checked_light(expected_electrons, "expected_electrons")
+    dark = model.superpixel_dark_current_e_per_s * exposure_s
     frame = np.empty(light.shape, np.float64 if model.largest_dn is None else np.uint32)
     light, numbers = light.reshape(-1), frame.reshape(-1)
     for start in range(0, light.size, _BLOCK):
         block = slice(start, start + _BLOCK)
-        expected = add_dark_current(light[block], exposure_s, model)
+        expected = light[block] + dark
         electrons = clip_at_full_well(draw_electrons(expected, shot_rng), model)
         numbers[block] = quantise(amplify(add_read_noise(electrons, model, read_rng), model), model)
     return frame
@@ -144,9 +145,10 @@ def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray
     few = expected < _MANY
     if np.all(few):
         return np.asarray(rng.poisson(expected), dtype=np.float64)
+    if not np.any(few):
+        return poisson_count(expected, rng.standard_normal(np.shape(expected)))
     drawn = poisson_count(np.maximum(expected, _MANY), rng.standard_normal(np.shape(expected)))
-    if np.any(few):
-        drawn[few] = rng.poisson(expected[few])
+    drawn[few] = rng.poisson(expected[few])
     return drawn
 
 
@@ -158,9 +160,17 @@ def poisson_count(expected: FloatArray, z: FloatArray) -> FloatArray:
     holds the third cumulant and the correction for rounding. Off the law by a total variation of 4e-6 at 256, 5e-7
     at 1000, 2e-8 at 1e4; its variance by 1e-7 of it, its third moment by 7e-4.
     """
-    count = poisson_quantile(expected, z)
-    count -= z * (np.square(z) + 2) / (72 * np.sqrt(expected))
-    return np.rint(count, out=count)
+    # In place, in two thirds of the time.
+    root, square = np.sqrt(expected), np.square(z)
+    count = root * z
+    count += expected
+    count += (square - 1) / 6
+    square += 2
+    square *= z
+    root *= 72
+    square /= root
+    count -= square
+    return np.asarray(np.rint(count))
 
 
 def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
@@ -199,8 +209,10 @@ def quantise(signal_dn: FloatArray, model: SensorModel) -> Digital:
     """
     if model.largest_dn is None:
         return signal_dn
-    codes = np.minimum(np.maximum(np.rint(signal_dn), 0), model.largest_dn)
-    return np.asarray(codes).astype(np.uint32)
+    codes = np.asarray(np.rint(signal_dn))
+    np.maximum(codes, 0, out=codes)
+    np.minimum(codes, model.largest_dn, out=codes)
+    return codes.astype(np.uint32)
 
 
 def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
