@@ -1,0 +1,35 @@
+"""Plans that tests keep are those of the same question: each part of it makes another one."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import open_bench
+from mitsim.rig.patterns import Lighting, parse_patterns
+from tests.kept_plans import question
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def test_each_part_of_a_question_makes_another(small_scene: Callable[..., Path]) -> None:
+    """A scene that is opened again is the same one. (Planted: each part left out.)"""
+    path = small_scene(reflectance=np.full((16, 16), 100))
+    bench, again, uniform = open_bench(path), open_bench(path), Lighting.uniform(16)
+    asked = question(bench, uniform, 1e-2, 3, {})
+    assert question(again, uniform, 1e-2, 3, {}) == asked
+    dots = parse_patterns("dots:2", 16).lighting
+    sensor = bench.sensor.model_copy(update={"read_noise_e": 9.0})
+    others = [
+        question(bench, dots, 1e-2, 3, {}),
+        question(bench, dots.shots([0]), 1e-2, 3, {}),
+        question(bench, uniform, 2e-2, 3, {}),
+        question(bench, uniform, 1e-2, 4, {}),
+        question(bench, uniform, 1e-2, 3, {"blur": False}),
+        question(bench.with_board(0.99), uniform, 1e-2, 3, {}),
+        question(replace(bench, rig=replace(bench.rig, sensor=sensor)), uniform, 1e-2, 3, {}),
+        question(open_bench(small_scene(reflectance=np.arange(256).reshape(16, 16))), uniform, 1e-2, 3, {}),
+    ]
+    assert len({asked, *others}) == 1 + len(others)
