@@ -12,11 +12,12 @@ from mitsim.rig.patterns import Lighting, parse_patterns
 from tests.kept_plans import question
 
 pytestmark = pytest.mark.usefixtures("variant")
+SHADES = np.arange(256).reshape(16, 16)
 
 
 def test_each_part_of_a_question_makes_another(small_scene: Callable[..., Path]) -> None:
     """A scene that is opened again is the same one. (Planted: each part left out.)"""
-    path = small_scene(reflectance=np.full((16, 16), 100))
+    path = small_scene(reflectance=SHADES)
     bench, again, uniform = open_bench(path), open_bench(path), Lighting.uniform(16)
     asked = question(bench, uniform, 1e-2, 3, {})
     assert question(again, uniform, 1e-2, 3, {}) == asked
@@ -30,6 +31,6 @@ def test_each_part_of_a_question_makes_another(small_scene: Callable[..., Path])
         question(bench, uniform, 1e-2, 3, {"blur": False}),
         question(bench.with_board(0.99), uniform, 1e-2, 3, {}),
         question(replace(bench, rig=replace(bench.rig, sensor=sensor)), uniform, 1e-2, 3, {}),
-        question(open_bench(small_scene(reflectance=np.arange(256).reshape(16, 16))), uniform, 1e-2, 3, {}),
+        question(open_bench(small_scene(reflectance=SHADES[::-1])), uniform, 1e-2, 3, {}),
     ]
     assert len({asked, *others}) == 1 + len(others)
