@@ -226,7 +226,7 @@ class Trays:
         return self.mean_weights(self.sharp.bundle.anchors)
 
     def mean_weights(self, anchors: int) -> FloatArray:
-        """(anchors,) weight of each anchor in the mean over the sensor."""
+        """(anchors,) weight of each of so many ``anchors`` in the mean over the sensor."""
         edges = self.physics.geometry.pixel_edges
         positions = anchor_positions(anchors, self.physics.geometry.half_width)
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))

@@ -105,9 +105,11 @@ def plan_within(
     aim = affordable(Candidates(look.evidence, switches), seconds - around - again, 0.0, kept=False)
     if found.fits and aim.fits and aim.accuracy < FIRST_LOOK:
         around += again
-        look = pilot.Look(bench, lighting, aim.accuracy, seed)
-        finer = affordable(Candidates(look.evidence, switches), seconds - around, aim.accuracy)
-        found = finer if finer.fits else found
+        closer = pilot.Look(bench, lighting, aim.accuracy, seed)
+        finer = affordable(Candidates(closer.evidence, switches), seconds - around, aim.accuracy)
+        # It may say that no accuracy is kept at all, and then has the loosest.
+        if finer.fits and finer.accuracy <= found.accuracy:
+            look, found = closer, finer
     plan = _decided(look, found.accuracy, switches).taking(plan=time.perf_counter() - started)
     return replace(plan, asked_seconds=seconds, warnings=(*told(found, seconds, around), *plan.warnings))
 

@@ -69,7 +69,7 @@ class NeighbourTracer(IndirectTracer):
         return self._taking(np.asarray(repeats, dtype=np.int64))
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
-        """Light of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
+        """``samples`` of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
         return [self.trace(seed, 0, samples) for seed in seeds]
 
     def shares(self) -> bool:

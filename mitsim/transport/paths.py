@@ -127,7 +127,7 @@ class Tracer(ABC):
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
-        """The same as :meth:`trace` finds for each of some ``seeds``, in as few kernels as may be."""
+        """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
         each, found = self.lanes * samples, list[Deposits]()
         together = min(self.lanes_per_launch // each, _TOGETHER)
         if together < 2:

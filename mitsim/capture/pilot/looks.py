@@ -31,7 +31,7 @@ _SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
 where they show fewer pixels than this all together, which are no fair sample of the scene, or a mirror does."""
 _PLACES = 128
 """Rows and columns of pixels that the pilot looks at: a frame's neighbours are alike, and each costs its forming. Where
-they meet, changes are told to 2 to 4 % (photograph, gift_card, compact_disc, lamp_bench, against all 512)."""
+they meet, most changes are told to 2 to 6 % (photograph, gift_card, compact_disc, lamp_bench, against all 512)."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 """Steps by it never meet a mask's features in one phase."""
 _DIGITS = 12

@@ -32,16 +32,18 @@ class Invented:
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
         price = PRICE * (self.evidence.dearer if len(self.evidence.asked) > 1 else 1.0) / accuracy
-        return price * (1.0 if self.switches.get("diffraction", True) else 0.5), accuracy >= KEPT
+        kept = self.evidence.kept if len(self.evidence.asked) > 1 else KEPT
+        return price * (1.0 if self.switches.get("diffraction", True) else 0.5), accuracy >= kept
 
 
 @dataclass
 class Looks:
-    """Accuracies and seeds of all looks, and what was decided at last; a finer look may find all dearer."""
+    """Accuracies and seeds of all looks, and what was decided at last; a finer look may find all dearer, or less kept."""
 
     asked: list[tuple[float, int]] = field(default_factory=list)
     decided: tuple[object, float, Mapping[str, bool]] | None = None
     dearer: float = 1.0
+    kept: float = KEPT
 
 
 @pytest.fixture(scope="module")
@@ -121,3 +123,10 @@ def test_a_finer_look_that_finds_all_dearer_buys_less_or_nothing(looks: Looks, d
     looks.dearer = dearer
     found = within(11.01)
     assert len(looks.asked) == 2 and found.accuracy == bought and found.warnings == (OWN,)
+
+
+def test_a_finer_look_that_finds_no_accuracy_kept_takes_none_away(looks: Looks) -> None:
+    """What the first look bought stands. (Planted: the loosest of all, 0.3, which the finer look can pay.)"""
+    looks.kept = 1.0
+    found = within(11.01)
+    assert len(looks.asked) == 2 and found.accuracy == 1e-3 and found.warnings == (OWN,)
