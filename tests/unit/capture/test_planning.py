@@ -38,7 +38,7 @@ class Invented:
 
 @dataclass
 class Looks:
-    """Accuracies and seeds of all looks, and what was decided at last; a finer one may find all dearer, or less kept."""
+    """Accuracies and seeds of looks, and what was decided at last; a finer one may find all dearer, or less kept."""
 
     asked: list[tuple[float, int]] = field(default_factory=list)
     decided: tuple[object, float, Mapping[str, bool]] | None = None
