@@ -30,11 +30,11 @@ from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, Reception, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, streams
 
-_SHARP = 10.0
-"""Density [1/sr] of a turn above which its lobe counts as sharp, as a GGX lobe of roughness 0.09 does, or one of 0.02
-that takes a twentieth of the light.
+_SHARP, _SHARP_OF_MANY = 100.0, 10.0
+"""Density [1/sr] of a turn above which its lobe counts as sharp, as a GGX lobe of roughness 0.03 does; times the part
+of a pixel's turns that are sharp, down to the second: as one of 0.02 does that takes a twentieth of the light.
 
-Such a lobe fills 0.1 sr, all of the shipped projector's window: connections from all of it meet broader ones.
+Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
 """
 _PLENTY = 2**12
 """Rays met on the sensor that tell the light of a few pixels to a few percent; fewer are followed by a second look."""
@@ -108,11 +108,13 @@ def sharp_light(
     """
     lanes = projector.n**2
     lobes = _Lobes(scene, camera, projector, geometry)
-    if not len(lobes.look(np.arange(lanes), seed, 0, -(-samples // _FEWER), _WIDER).widths):
+    first = lobes.look(np.arange(lanes), seed, 0, -(-samples // _FEWER), _WIDER)
+    if not len(first.widths):
         return SharpLight.none(lanes)
+    lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _SHARP_OF_MANY, _SHARP).astype(np.float32))
     found = lobes.look(np.arange(lanes), seed, 0, samples)
     if len(found.widths) < _PLENTY:
-        search = _Connections(scene, camera, projector, 1, geometry, spread=True).over(sharp=True)
+        search = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=True)
         lit = np.bincount(search.trace(seed, 0, max(1, _SEARCHING // lanes)).pixel, minlength=lanes)
         pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), projector.n)
         if len(pixels):
@@ -121,7 +123,7 @@ def sharp_light(
     hits = total**2 / moment if moment else 0.0
     rest = 0.0
     if total:
-        others = _Connections(scene, camera, projector, 1, geometry, spread=True).over(sharp=False)
+        others = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=False)
         count = max(1, _CONNECTIONS // lanes)
         rest = float(others.trace(seed, 0, count).value.sum()) / count
     width = _quantile(found.widths, found.weights, _SHARPEST)
@@ -150,10 +152,12 @@ def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Irradiance and second moment of every projector pixel, the former's error, and width and weight of each lobe."""
+    """Irradiance and second moment of every projector pixel, the part of its turns that are sharp, the irradiance's
+    error, and width and weight of each lobe."""
 
     by_pixel: FloatArray
     moments: FloatArray
+    sharp: FloatArray
     error: float
     widths: FloatArray
     weights: FloatArray
@@ -181,11 +185,19 @@ class _Connections(DirectTracer):
     """Direct light over sharp lobes alone, or all other."""
 
     _over_sharp: bool
+    _least: mi.Float
+    _of_lane: mi.Float
 
-    def over(self, sharp: bool) -> _Connections:
-        """The same over ``sharp`` lobes, or over all others."""
-        self._over_sharp = sharp
+    def over(self, least: mi.Float, sharp: bool) -> _Connections:
+        """The same over ``sharp`` lobes, of at ``least`` such a density [1/sr] by pixel, or over all others."""
+        self._least, self._over_sharp = least, sharp
         return self
+
+    def _place(
+        self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
+    ) -> tuple[mi.Point2f, mi.Float]:
+        self._of_lane = dr.gather(mi.Float, self._least, number)
+        return super()._place(number, row, column, jitter)
 
     def _connected(
         self,
@@ -196,18 +208,25 @@ class _Connections(DirectTracer):
         active: mi.Bool,
     ) -> tuple[Reception, mi.Float]:
         reception, value = super()._connected(si, direction, light, sensor, active)
-        sharp = reception.pdf > dr.opaque(mi.Float, _SHARP)
+        sharp = reception.pdf > self._of_lane
         return reception, dr.select(sharp == self._over_sharp, value, 0)
 
 
 class _Lobes:
-    """Rays of the projector that sharp lobes of the surfaces that they light send to the sensor."""
+    """Rays of the projector that sharp lobes of the surfaces that they light send to the sensor.
+
+    Attributes
+    ----------
+    least
+        (n^2,) density [1/sr] above which a lobe counts as sharp, by projector pixel.
+    """
 
     def __init__(
         self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry
     ) -> None:
         self.camera, self.geometry = camera, geometry
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
+        self.least = dr.full(mi.Float, _SHARP_OF_MANY, projector.n**2)
 
     def look(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _Found:
         """What rays of the projector meet on the sensor.
@@ -240,7 +259,7 @@ class _Lobes:
         variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
         pixel_of, densities = (np.concatenate(parts) for parts in zip(*met, strict=True))
         widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
-        return _Found(by_pixel, moments, math.sqrt(variance / samples), widths, np.concatenate(weights))
+        return _Found(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
 
     def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float) -> tuple[FloatArray, ...]:
         """Estimates x of the mean irradiance, x I, density q of one of the points met, and sharp turns; (lanes,).
@@ -259,20 +278,24 @@ class _Lobes:
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         flux = self.rays.flux(pixel, wavelengths) * spectral
         none = _Met(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
-        met, _ = self.receiver.passage.along(ray, flux, (none, rng), partial(self._at, half))
+        met, _ = self.receiver.passage.along(
+            ray, flux, (none, rng), partial(self._at, half, dr.gather(mi.Float, self.least, pixel))
+        )
         dr.eval(met)
         return tuple(np.array(values, dtype=np.float64) for values in vars(met).values())
 
     def _at(
         self,
         half: mi.Float,
+        least: mi.Float,
         si: mi.SurfaceInteraction3f,
         direction: mi.Vector3f,
         light: mi.Spectrum,
         active: mi.Bool,
         state: tuple[_Met, mi.PCG32],
     ) -> tuple[_Met, mi.PCG32]:
-        """What a turn that is sampled at the surface meets, on a sensor of such a ``half`` width."""
+        """What a turn that is sampled at the surface meets on a sensor of a ``half`` width, over lobes of ``least``
+        density."""
         met, rng = state
         si.wi = si.to_local(-direction)
         context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -280,12 +303,12 @@ class _Lobes:
         turn, _ = si.bsdf().sample(context, si, number, point, active)
         density = si.bsdf().pdf(context, si, turn.wo, active)
         active = active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        turns = dr.select(active & (density > dr.opaque(mi.Float, _SHARP)), mi.Float(1), 0)
+        turns = dr.select(active & (density > least), mi.Float(1), 0)
         place = landing(self.receiver, si, si.to_world(turn.wo), active)
         active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
         sensor = mi.Point3f(place.x, place.y, 0)
         reception = self.receiver.receive(si, -direction, sensor, active)
-        active &= reception.pdf > dr.opaque(mi.Float, _SHARP)
+        active &= reception.pdf > least
         per_area = density * reception.solid_angle(sensor)
         connected = dr.select(active, panchromatic(reception.irradiance * light), 0)
         mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)

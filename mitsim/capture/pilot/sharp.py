@@ -26,6 +26,9 @@ _WORTH = 0.5
 """Part of the paths that tracing apart must save before it is done for their sake alone; it costs a pass of its own."""
 SHARP_RATE = 0.75
 """Power of the samples that the error falls with, as rays are stratified (flat plates of 1e-3 and 1e-4: 0.7 to 0.9)."""
+_WELL_MET = 30.0
+"""Hits of one connection of each pixel from which even points meet lobes often enough, where few anchors do: in
+compact_disc (125 hits) tracing 600 pixels apart took 1.5 times the time for the same error."""
 _SEEN = 0.5
 """Hits of one connection of each pixel from which the pilot's ordinary looks, 64 connections or more, tell how a lobe's
 light varies over the sensor: they meet it thirty times."""
@@ -60,7 +63,7 @@ def sharp_pixels(
         return None
     whole, rate = sharp.irradiance + light, math.asinh(sharp.width / simulation.physics.geometry.half_width)
     anchors = max(2, math.ceil(math.log(1 / (_LEFT * accuracy)) / rate))
-    if anchors > _MOST:
+    if anchors > _MOST or (anchors <= _FEW and sharp.hits >= _WELL_MET):
         return None
     order = np.argsort(-sharp.moments, kind="stable")
     lit = min(int(np.count_nonzero(sharp.moments)), len(order) - 1)
