@@ -30,9 +30,10 @@ from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, Reception, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, streams
 
-_SHARP, _SHARP_OF_MANY = 100.0, 10.0
-"""Density [1/sr] of a turn above which its lobe counts as sharp, as a GGX lobe of roughness 0.03 does; times the part
-of a pixel's turns that are sharp, down to the second: as one of 0.02 does that takes a twentieth of the light.
+_SHARP, _LEAST_SHARP = 100.0, 10.0
+"""Density [1/sr] of a turn above which its lobe counts as sharp where all turns of a pixel are, as a GGX lobe of
+roughness 0.03 does; where a part of them is, that part of it, but no less than the second: as a lobe of roughness 0.02
+does that takes a twentieth of the light.
 
 Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
 """
@@ -111,7 +112,7 @@ def sharp_light(
     first = lobes.look(np.arange(lanes), seed, 0, -(-samples // _FEWER), _WIDER)
     if not len(first.widths):
         return SharpLight.none(lanes)
-    lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _SHARP_OF_MANY, _SHARP).astype(np.float32))
+    lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
     found = lobes.look(np.arange(lanes), seed, 0, samples)
     if len(found.widths) < _PLENTY:
         search = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=True)
@@ -226,7 +227,7 @@ class _Lobes:
     ) -> None:
         self.camera, self.geometry = camera, geometry
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
-        self.least = dr.full(mi.Float, _SHARP_OF_MANY, projector.n**2)
+        self.least = dr.full(mi.Float, _LEAST_SHARP, projector.n**2)
 
     def look(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _Found:
         """What rays of the projector meet on the sensor.
