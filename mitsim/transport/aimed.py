@@ -38,7 +38,7 @@ _FEWEST = 6
 """Axes below which nothing is told: three numbers along each direction are fitted."""
 _SHARP = 100.0
 """Density [1/sr] of a turn above which it tells an axis: of lobes that take most of the light. To aim at fainter ones
-costs the rest of a pixel's light more than it gains (varnish that takes a twentieth: 1 to 3.7 times the connections)."""
+costs the rest of a pixel's light more than it gains (varnish that takes a twentieth: 1 to 3.7 times connections)."""
 _SEED = 20
 """Of the axes' rays: any will do, for they decide how fast light is found and not how much of it there is."""
 _ROUND = 1e-6
