@@ -19,7 +19,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
 from mitsim.capture.filing import FiledLight
 from mitsim.capture.plan import Plan
-from mitsim.capture.prices import CHECKED_SHOTS, LAST_CHECKED_SHOTS
+from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
 from mitsim.capture.simulation import Simulation, Stage
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels, Progress, silent
@@ -45,6 +45,10 @@ _LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 1.5
 _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 """Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
 what direct light brings), direct light's with their 0.8th power or faster."""
+_FIRST = 0.7
+"""Part of the samples that the plan predicts with which sampling begins where most paths are of followed light: the
+prediction is safe, and a look costs less than samples that are too many (corner took 1.4 times what its target
+needs)."""
 _WAITING = 2
 """Traced parts that wait to be filed, at most: some 0.2 GB each."""
 _VIEW_SAMPLES = 64
@@ -77,6 +81,31 @@ class Sampling:
 
 
 @dataclass(frozen=True, eq=False)
+class Looked:
+    """What a look at the error of frames found, for who forms them.
+
+    Attributes
+    ----------
+    groups, simulation
+        that it was a look at.
+    rows
+        class of each row of theirs.
+    probed
+        of its :class:`ExpectedFrames`.
+    """
+
+    groups: tuple[FiledLight, ...]
+    simulation: Simulation
+    rows: Labels
+    probed: FloatArray
+
+    def at(self, light: Light, rows: Labels) -> FloatArray | None:
+        """``probed`` where it is of a ``light`` whose rows belong to the classes ``rows``; else None."""
+        same = light.groups is self.groups and light.simulation is self.simulation
+        return self.probed if same and np.array_equal(rows, self.rows) else None
+
+
+@dataclass(frozen=True, eq=False)
 class Light:
     """Sampled light of one scene.
 
@@ -100,6 +129,8 @@ class Light:
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     samples
         of each group, by the name of what was traced; empty where nobody kept them.
+    looked
+        what the last look at its error found.
     """
 
     groups: tuple[FiledLight, ...]
@@ -113,6 +144,7 @@ class Light:
     sampling_error: float
     reached: bool
     samples: Mapping[str, int] = field(default_factory=dict)
+    looked: Looked | None = None
 
     def __repr__(self) -> str:
         return f"Light({self.paths:.2g} paths, relative error {self.sampling_error:.1e}, of {self.bench!r})"
@@ -157,7 +189,9 @@ class Light:
         ValueError
             for shots that split a class of the light.
         """
-        return self.simulation.expected(self.groups, self.rows_of(lighting), lighting, seed, leaking)
+        rows = self.rows_of(lighting)
+        probed = self.looked.at(self, rows) if self.looked and seed == self.seed else None
+        return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
 
     def rows_of(self, lighting: Lighting) -> Labels:
         """(rows,) class of ``lighting`` that each row of the light belongs to; ValueError as :meth:`frames`."""
@@ -227,7 +261,7 @@ def trace_light(
 ) -> Light:
     """Trace until the Monte Carlo error of the frames meets its target, or the limit of 2^32 paths.
 
-    Each group gets the same number of samples; a few shots, evenly spread, are formed to see the error.
+    Each group gets the same number of samples; after each round a look at all shots, or a few, tells the error.
 
     Parameters
     ----------
@@ -245,11 +279,10 @@ def trace_light(
     sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
-    checked, last = (_some(lighting, count) for count in (CHECKED_SHOTS, LAST_CHECKED_SHOTS))
     followed = bool(simulation.indirect or simulation.from_camera)
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, labels, stream) for stream in streams]
-    rounds = 1.0
+    rounds = _FIRST if _mostly_followed(simulation) else 1.0
     while True:
         for group in groups:
             group.sample(rounds)
@@ -266,19 +299,16 @@ def trace_light(
             reached=False,
             samples=dict(groups[0].done),
         )
-        # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
-        expected = light.frames(checked, seed, leaking=False)
-        more = _unchecked(light, lighting, checked)
-        error, bound = (ratio * of_checked for ratio, of_checked in zip(more, expected.sampling_error(), strict=True))
+        light, bound = _looked(light, lighting, followed)
         # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
-        target = sampling.target(expected) if sampling.target else plan.sampling_target
-        seen = error if sampling.target else bound
-        if seen <= target and followed and not sampling.target and len(last.weights) > len(checked.weights):
-            # Followed light has heavy paths, which strike single shots: what is stated in the end is seen before.
-            error, seen = light.frames(last, seed, leaking=False).sampling_error()
+        if sampling.target:
+            target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
+        else:
+            target = plan.sampling_target
+        seen = light.sampling_error if sampling.target else bound
         progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
         if seen <= target or light.paths >= _MOST_PATHS:
-            return replace(light, sampling_error=error, reached=seen <= target)
+            return replace(light, reached=seen <= target)
         rate, least = (_FOLLOWED_RATE, _LEAST_GROWTH) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH)
         # Capped before the power as well: a target that was set very low would overflow it.
         growth = min(seen / target, _LARGEST_GROWTH) ** rate
@@ -304,6 +334,36 @@ def traced_again(light: Light, simulation: Simulation, purpose: str = "scene") -
         group.trace(light.samples)
     flux = np.mean([group.flux for group in groups], axis=0)
     return replace(light, groups=tuple(group.light for group in groups), simulation=simulation, flux=flux)
+
+
+def _mostly_followed(simulation: Simulation) -> bool:
+    """Whether most paths that a plan predicts are of light over several surfaces."""
+    paths = {name: stage.predicted * stage.tracer.lanes for name, stage in simulation.tracers().items()}
+    return sum(count for name, count in paths.items() if name not in EVEN) > sum(paths.values()) / 2
+
+
+def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, float]:
+    """The light with the Monte Carlo error of the frames, and what that is below at 95 %.
+
+    Parameters
+    ----------
+    light, lighting
+        whose frames of which shots.
+    followed
+        whether it is light over several surfaces.
+    """
+    shots, classes = lighting.weights.shape
+    whole = tells_all(classes, shots, light.bench.geometry.pixels)
+    seen = lighting if whole else _some(lighting, MOST_CHECKED if followed else CHECKED_SHOTS)
+    # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
+    expected = light.frames(seen, light.seed, leaking=False)
+    more = _unchecked(light, lighting, seen)
+    error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
+    light = replace(light, sampling_error=error)
+    if whole and expected.probed is not None:
+        found = Looked(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
+        light = replace(light, looked=found)
+    return light, bound
 
 
 def _some(lighting: Lighting, count: int) -> Lighting:

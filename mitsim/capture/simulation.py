@@ -208,7 +208,13 @@ class Simulation(Trays):
         return replace(found, irradiance=found.irradiance[:, self.places][:, :, self.places])
 
     def expected(
-        self, groups: Sequence[FiledLight], rows: Labels, lighting: Lighting, seed: int, leaking: bool = True
+        self,
+        groups: Sequence[FiledLight],
+        rows: Labels,
+        lighting: Lighting,
+        seed: int,
+        leaking: bool = True,
+        probed: FloatArray | None = None,
     ) -> ExpectedFrames:
         """Expected frames of all shots of a lighting.
 
@@ -224,8 +230,10 @@ class Simulation(Trays):
             of the probes that tell the Monte Carlo error.
         leaking
             whether black pixels leak, so that every shot lights all of them; without, shots of few pixels form faster.
+        probed
+            what the frames of other shots say of the same classes, as :class:`ExpectedFrames` takes it.
         """
-        return expected_of([(self, groups)], rows, lighting, seed, leaking)
+        return expected_of([(self, groups)], rows, lighting, seed, leaking, probed)
 
 
 def expected_of(
@@ -234,6 +242,7 @@ def expected_of(
     lighting: Lighting,
     seed: int,
     leaking: bool = True,
+    probed: FloatArray | None = None,
 ) -> ExpectedFrames:
     """Expected frames of light in several parts.
 
@@ -242,14 +251,14 @@ def expected_of(
     parts
         simulations of one rig, each with the light that it filed; black pixels leak as the first says, glint is that of
         the last.
-    rows, lighting, seed, leaking
+    rows, lighting, seed, leaking, probed
         as for :meth:`Simulation.expected`.
     """
     light = emitted(parts[0][0].physics, lighting, leaking)
     filed = [simulation.filed(groups, len(rows)) for simulation, groups in parts]
     lights, ambient = ([each for part in filed for each in part[kind]] for kind in (0, 1))
     glint = parts[-1][0].glint_frames(lighting.labels)
-    return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint)
+    return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint, probed)
 
 
 def emitted(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:

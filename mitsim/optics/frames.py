@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -159,6 +160,8 @@ class ExpectedFrames:
         light (1, cells) of every shot, its groups paired with those of ``lights``.
     glint
         frames to be added to those of some classes.
+    probed
+        :attr:`probed` of other shots of the same lights, classes and seed.
     """
 
     def __init__(
@@ -168,6 +171,7 @@ class ExpectedFrames:
         seed: int,
         ambient: Sequence[Filed] = (),
         glint: ClassFrames | None = None,
+        probed: FloatArray | None = None,
     ) -> None:
         self._lights, self._ambient, self._glint = tuple(lights), tuple(ambient), glint
         self._seed, self._weights = seed, lighting.weights
@@ -186,7 +190,7 @@ class ExpectedFrames:
         self._formed: tuple[FloatArray, FloatArray] | None = None
         self._always: tuple[FloatArray, FloatArray] | None = None
         self._leaked: tuple[FloatArray, FloatArray] | None = None
-        self._seen: FloatArray | None = None
+        self._probed = probed if self._mixed else None
 
     def __len__(self) -> int:
         return int(self._weights.shape[0])
@@ -206,13 +210,13 @@ class ExpectedFrames:
     @property
     def _ambient_formed(self) -> tuple[FloatArray, FloatArray] | None:
         if self._ambient and self._always is None:
-            self._always = _formed(self._ambient, _ALL, self._seed)
+            self._always = self._form_with_probes(self._ambient, _ALL)
         return self._always
 
     @property
     def _leak_formed(self) -> tuple[FloatArray, FloatArray] | None:
         if self._leak is not None and self._leaked is None:
-            self._leaked = _formed(self._lights, self._leak, self._seed)
+            self._leaked = self._form_with_probes(self._lights, self._leak)
         return self._leaked
 
     def __iter__(self) -> Iterator[Frame]:
@@ -254,47 +258,56 @@ class ExpectedFrames:
         """
         count, energy = self._groups, 0.0
         parts = np.zeros(count)
+        if count < 2:
+            return 0.0, 0.0
         for start in range(0, len(self), _AT_ONCE):
-            for probed in self._probed(start, min(start + _AT_ONCE, len(self))):
+            for probed in self._shots_probed(start, min(start + _AT_ONCE, len(self))):
                 by_group = probed.reshape(self._pixels, count, -1)
                 mean = by_group.mean(axis=1)
                 energy += float(np.square(mean).sum())
                 parts += _squares(by_group - mean[:, None])
-        if count < 2 or not energy:
+        if not energy:
             return 0.0, 0.0
         parts /= count * (count - 1)
         return float(np.sqrt(parts.sum() / energy)), bound_of(parts, energy)
 
-    def _probed(self, start: int, stop: int) -> FloatArray:
-        """(shots, pixels * groups * probes) frames of single groups as random signs see them."""
-        if self._mixed:
-            if self._seen is None:
-                self._seen = self._with_glint(_formed(self._lights, self._basis, self._seed, False)[1], 0)
-            probed = _mix(self._weights[start:stop], self._seen)
-        else:
-            basis = self._basis[start:stop]
-            probed = self._with_glint(_formed(self._lights, basis, self._seed, False)[1], start)
-            if self._leak_formed is not None:
-                probed = probed + self._leak_formed[1][0]
-        if self._ambient:
-            probed = probed + _formed(self._ambient, _ALL, self._seed, False)[1][0]
-        return probed
+    @property
+    def probed(self) -> FloatArray | None:
+        """(classes, pixels * groups * probes) frames of classes by single groups, as random signs see them.
 
-    def _with_glint(self, probed: FloatArray, start: int) -> FloatArray:
-        """The same of mixtures from ``start`` on with glint, which is in every group."""
-        if self._glint is not None:
-            signs = _probes(self._pixels, self._seed)
-            brought = np.repeat((self._glint.irradiance @ signs)[:, :, None], self._groups, axis=2)
-            shares = self._shares[start : start + len(probed)][:, self._glint.classes]
-            probed = probed + shares @ brought.reshape(len(brought), -1)
+        None where shots are formed one by one.
+        """
+        if self._mixed and self._probed is None:
+            self._probed = _formed(self._lights, self._basis, self._probes, False)[1]
+        return self._probed
+
+    def _shots_probed(self, start: int, stop: int) -> FloatArray:
+        """(shots, pixels * groups * probes) frames of single groups as random signs see them."""
+        classes, weights = self.probed, self._weights[start:stop]
+        if classes is not None:
+            probed = _mix(weights, classes)
+        else:
+            probed = _formed(self._lights, self._basis[start:stop], self._probes, False)[1]
+            if self._leak_formed is not None:
+                probed += self._leak_formed[1][0]
+        if self._glint is not None:  # in every group
+            brought = np.repeat((self._glint.irradiance @ self._probes)[:, :, None], self._groups, axis=2)
+            probed += weights[:, self._glint.classes] @ brought.reshape(len(brought), -1)
+        if self._ambient:
+            probed += _formed(self._ambient, _ALL, self._probes, False)[1][0]
         return probed
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) those of groups as signs see them.
 
-        Glint is exact: it is in the frames alone, as no difference between groups has any.
+        Glint is exact: it is in the frames alone, as no difference between groups has any. Classes that were probed
+        before are not probed again.
         """
-        frames, probed = _formed(self._lights, self._basis[start:stop], self._seed)
+        basis = self._basis[start:stop]
+        if self._probed is None:
+            frames, probed = self._form_with_probes(self._lights, basis)
+        else:
+            frames, probed = _formed(self._lights, basis, None)[0], self._probed[start:stop]
         if not self._mixed and self._leak_formed is not None:
             frames += self._leak_formed[0]
             probed += self._leak_formed[1]
@@ -304,6 +317,14 @@ class ExpectedFrames:
                 for index in np.flatnonzero(share):
                     frame += share[index] * self._glint.irradiance[index]
         return frames, probed
+
+    def _form_with_probes(self, lights: Sequence[Filed], basis: sparse.csr_array) -> tuple[FloatArray, FloatArray]:
+        """As :func:`_formed`; a single group's frames differ from no others."""
+        return _formed(lights, basis, self._probes if self._groups > 1 else None)
+
+    @cached_property
+    def _probes(self) -> FloatArray:
+        return _probes(self._pixels, self._seed)
 
     @property
     def _groups(self) -> int:
@@ -348,14 +369,13 @@ def _squares(deviations: FloatArray) -> FloatArray:
 
 
 def _formed(
-    lights: Sequence[Filed], basis: sparse.csr_array, seed: int, with_frames: bool = True
+    lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray | None, with_frames: bool = True
 ) -> tuple[FloatArray, FloatArray]:
-    """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and the groups' own as random signs see them.
+    """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and the groups' own as ``probes`` see them.
 
-    The latter are (b, pixels * groups * probes); none for a single group. No frames unless ``with_frames``.
+    The latter are (b, pixels * groups * probes); none without probes. No frames unless ``with_frames``.
     """
     pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
-    probes = _probes(pixels, seed) if groups > 1 or not with_frames else None
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     count = basis.shape[0]
     frames = np.zeros((count if with_frames else 0, pixels, pixels))
@@ -364,7 +384,7 @@ def _formed(
     def form(row: int) -> None:
         for number, (optics, parts) in enumerate(mixed):
             estimates = [_row(part, row) for part in parts]
-            if probes is not None and not with_frames:
+            if not with_frames:
                 probed[row] += optics.probe(estimates, probes).ravel()
                 continue
             frame, seen = optics.seen(estimates, probes, None if number else frames[row])
