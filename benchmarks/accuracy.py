@@ -60,7 +60,7 @@ def answer(scene: str, noise: float) -> npt.NDArray[np.float32]:
     bench = ms.open_bench(scene)
     family = bench.family(PATTERNS, SEED)
     stand = Stand(bench, family, ANSWERS[0], Job(), FINEST / SEEN)
-    finest = stand.finest(stand.plan(FINEST), 1.0)
+    finest = stand.finest(stand.plan(FINEST))
     samples = predicted(noise, stand.evidence, finest.settings, {}).settings
     plan = replace(finest, settings=samples, sampling_target=noise)
     halves = []

@@ -21,6 +21,7 @@ import argparse
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -154,7 +155,7 @@ def main() -> None:
         cases = {(distance, k): case(factors[distance], k, shown) for distance, k in bands}
         for convention in CONVENTIONS:
             for rule in RULES:
-                row = {
+                row: dict[str, Any] = {
                     "images": brightness,
                     "convention": convention,
                     "lambda": rule,

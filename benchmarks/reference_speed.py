@@ -41,6 +41,7 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def film(pixels: int) -> dict[str, object]:
     return {"type": "hdrfilm", "width": pixels, "height": pixels, **of_one}
 
 
-def cameras(bench: ms.Bench) -> dict[str, object]:
+def cameras(bench: ms.Bench) -> dict[str, Any]:
     """All cameras by name, at the place of the bench's own."""
     import drjit as dr
     import mitsuba as mi
@@ -117,7 +118,7 @@ def cameras(bench: ms.Bench) -> dict[str, object]:
     return {kind: made(kind) for kind in CAMERAS}
 
 
-def rendered(bench: ms.Bench, camera: object, spp: int, seed: int) -> tuple[float, np.ndarray]:
+def rendered(bench: ms.Bench, camera: Any, spp: int, seed: int) -> tuple[float, np.ndarray]:
     """Processor seconds of one pass, and its frame."""
     import mitsuba as mi
 
