@@ -26,6 +26,9 @@ _LARGEST_BASIS, _BASIS_BYTES = 256, 7 * 2**28
 4 GiB has room for: 56 frames of a sensor of 2048 pixels. Beyond them frames are formed twice."""
 PROBES = 8
 """Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`_probes`."""
+_FEW = 2
+"""Classes a shot, beside what all shots light alike, up to which adding up their frames takes less than a product of
+matrices: a twentieth for dots whose black pixels leak."""
 _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
 _FLOAT = 8
@@ -179,7 +182,8 @@ class ExpectedFrames:
         indicator = sparse.csr_array((np.ones(rows), (lighting.labels, np.arange(rows))), shape=(classes, rows))
         self._mixed = mixes(classes, shots, self._pixels)
         self._shares = np.eye(classes) if self._mixed else self._weights
-        least = self._weights.min(axis=0)
+        least = self._least = self._weights.min(axis=0)
+        self._own = sparse.csr_array(self._weights - least)
         if self._mixed or shots < 2 or 2 * np.count_nonzero(self._weights == least) < self._weights.size:
             least = np.zeros(classes)
         self._leak = sparse.csr_array(sparse.csr_array(least[None]) @ indicator) if least.any() else None
@@ -229,12 +233,11 @@ class ExpectedFrames:
             self._formed = self._form(0, self._basis.shape[0])
         irradiance, probed = self._formed
         for start in range(0, len(self), step):
-            weights = self._weights[start : start + step]
+            stop = min(start + step, len(self))
             if np.array_equal(self._weights, np.eye(len(self))):
-                stop = start + len(weights)
                 yield from self._frames(irradiance[start:stop], probed[start:stop])
             else:
-                yield from self._frames(_mix(weights, irradiance), _mix(weights, probed))
+                yield from self._frames(*(self._mix(basis, start, stop) for basis in self._formed))
 
     def by_group(self, columns: IntArray) -> FloatArray:
         """(groups, shots, pixels, c) frames that each group of the light makes by itself, at c ``columns`` of pixels.
@@ -285,7 +288,7 @@ class ExpectedFrames:
         """(shots, pixels * groups * probes) frames of single groups as random signs see them."""
         classes, weights = self.probed, self._weights[start:stop]
         if classes is not None:
-            probed = _mix(weights, classes)
+            probed = self._mix(classes, start, stop)
         else:
             probed = _formed(self._lights, self._basis[start:stop], self._probes, False)[1]
             if self._leak_formed is not None:
@@ -296,6 +299,27 @@ class ExpectedFrames:
         if self._ambient:
             probed += _formed(self._ambient, _ALL, self._probes, False)[1][0]
         return probed
+
+    def _mix(self, basis: FloatArray, start: int, stop: int) -> FloatArray:
+        """(shots, ...) sums of a ``basis`` (classes, ...) as the shots from ``start`` to ``stop`` light the classes."""
+        if self._own.nnz > _FEW * len(self):
+            return _mix(self._weights[start:stop], basis)
+        common = _mix(self._least[None], basis)[0] if self._least.any() else None
+        mixed = np.zeros((stop - start, *basis.shape[1:]))
+
+        def add(shot: int) -> None:
+            total = mixed[shot - start]
+            classes, weights = _row(self._own, shot)
+            for place, (number, weight) in enumerate(zip(classes, weights, strict=True)):
+                if place:
+                    total += weight * basis[number]
+                else:
+                    np.multiply(basis[number], weight, out=total)
+            if common is not None:
+                total += common
+
+        in_threads(add, range(start, stop))
+        return mixed
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) those of groups as signs see them.
