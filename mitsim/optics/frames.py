@@ -239,20 +239,6 @@ class ExpectedFrames:
             else:
                 yield from self._frames(*(self._mix(basis, start, stop) for basis in self._formed))
 
-    def by_group(self, columns: IntArray) -> FloatArray:
-        """(groups, shots, pixels, c) frames that each group of the light makes by itself, at c ``columns`` of pixels.
-
-        Nothing is set to zero that came out below it, so differences of frames stay linear in the light.
-        """
-        shots = sparse.csr_array(sparse.csr_array(self._weights) @ self._indicator)
-        frames = _seen(self._lights, shots, columns)
-        if self._ambient:
-            frames += _seen(self._ambient, _ALL, columns)
-        if self._glint is not None:
-            shares = self._weights[:, self._glint.classes]
-            frames += np.tensordot(shares, self._glint.irradiance[:, :, columns], 1)
-        return frames
-
     def sampling_error(self) -> tuple[float, float]:
         """Relative Monte Carlo error of all frames, and what it is below at 95 %, without forming any.
 
@@ -433,23 +419,6 @@ def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_arr
     product.sort_indices()
     wide = places[product.indices] if len(places) else product.indices
     return sparse.csr_array((product.data, wide, product.indptr), shape=(basis.shape[0], light.shape[1]))
-
-
-def _seen(lights: Sequence[Filed], basis: sparse.csr_array, columns: IntArray) -> FloatArray:
-    """(groups, b, pixels, c) frames of mixtures ``basis`` (b, rows) of each group's light, at c ``columns``."""
-    pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
-    chosen = np.zeros((pixels, len(columns)))
-    chosen[columns, np.arange(len(columns))] = 1
-    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
-    frames = np.zeros((groups, basis.shape[0], pixels, len(columns)))
-
-    def form(row: int) -> None:
-        for optics, parts in mixed:
-            seen = optics.probe([_row(part, row) for part in parts], chosen)
-            frames[:, row] += np.moveaxis(seen.reshape(pixels, groups, -1), 1, 0)
-
-    in_threads(form, range(basis.shape[0]))
-    return frames
 
 
 def _probes(pixels: int, seed: int) -> FloatArray:

@@ -67,7 +67,8 @@ def answer(bench: Bench, shots: Lighting, depth: float, seed: int, effort: Effor
         ]
         groups.append(sum(parts[1:], parts[0]))
     rows = np.arange(shots.weights.shape[1])
-    return simulation.expected(groups, rows, shots, 0).by_group(np.arange(bench.geometry.pixels))
+    formed = [simulation.expected([group], rows, shots, 0) for group in groups]
+    return np.array([[frame.irradiance for frame in frames] for frames in formed])
 
 
 def _layers(bench: Bench, base: Settings, seed: int, count: int) -> tuple[float, ...]:

@@ -42,23 +42,6 @@ def test_the_predicted_variance_is_the_actual_one(groups: int) -> None:
 
 
 @pytest.mark.parametrize("family", BESIDE)
-def test_each_group_makes_frames_by_itself(family: str) -> None:
-    """Those of a capture whose light is that group alone, with its ambient light and what is exact."""
-    labels, weights = BESIDE[family]
-    optics, groups, lamps = small_optics(8), random_groups(3, 7, 0.1), ambient_groups(3)
-    columns, brought = np.array([1, 6]), np.random.default_rng(3).random((2, 8, 8))
-    exact = ClassFrames(np.array([1, 3]), brought)
-    found = expected_frames(optics, groups, labels, weights, 0, ambient=[Filed(optics, lamps)], glint=exact).by_group(
-        columns
-    )
-    assert found.shape == (3, len(weights), 8, 2)
-    for frames, group, lamp in zip(found, groups, lamps, strict=True):
-        alone = expected_frames(optics, [group], labels, weights, 0, ambient=[Filed(optics, (lamp,))], glint=exact)
-        for frame, expected in zip(frames, alone, strict=True):
-            assert np.allclose(frame, expected.irradiance[:, columns], rtol=1e-10)
-
-
-@pytest.mark.parametrize("family", BESIDE)
 def test_the_sampling_error_is_told_without_frames(family: str) -> None:
     """That of the frames, and its bound, but for the energy, which the same signs tell.
 
