@@ -155,7 +155,7 @@ def _value(physics: Physics, name: str) -> object:
 
 
 def _changed(owner: Any, name: str, value: object) -> Any:
-    if getattr(owner, name) is value or getattr(owner, name) == value:
+    if getattr(owner, name) == value:
         return owner  # with what it remembers
     return owner.model_copy(update={name: value}) if isinstance(owner, BaseModel) else replace(owner, **{name: value})
 
