@@ -40,8 +40,10 @@ _MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _LARGEST_GROWTH = 8.0
 """Most that the samples grow by in one round, because the first rounds know their error badly."""
-_LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 1.5
+_LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 4 / 3
 """Least that they grow by: a tenth, and where all come in even numbers (2^k, 3 * 2^k) as far as the next of them."""
+_BEYOND = 1.05
+"""Growth beyond what the error asks for, so that another round is rare; even numbers are rounded up as it is."""
 _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 """Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
 what direct light brings), direct light's with their 0.8th power or faster."""
@@ -309,10 +311,12 @@ def trace_light(
         progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
         if seen <= target or light.paths >= _MOST_PATHS:
             return replace(light, reached=seen <= target)
-        rate, least = (_FOLLOWED_RATE, _LEAST_GROWTH) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH)
+        rate, least, beyond = (
+            (_FOLLOWED_RATE, _LEAST_GROWTH, _BEYOND) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH, 1.0)
+        )
         # Capped before the power as well: a target that was set very low would overflow it.
         growth = min(seen / target, _LARGEST_GROWTH) ** rate
-        rounds *= min(max(1.05 * growth, least), _LARGEST_GROWTH)
+        rounds *= min(max(beyond * growth, least), _LARGEST_GROWTH)
 
 
 @single_threaded_blas()
