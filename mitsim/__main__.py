@@ -1,5 +1,7 @@
 """Entry point of the program: the worker process first, and in it the command line, which takes time to import."""
 
+import os
+
 from mitsim.core.worker import end_stopped, end_with, enter_worker, stopped
 
 
@@ -7,6 +9,8 @@ def main() -> None:
     """:func:`mitsim.cli.run` in a worker process, whose death leaves a clear line and status."""
     try:
         enter_worker()
+        # Pydantic would read the entry points of all installed packages, 20 ms, for plugins that nothing here uses.
+        os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
         from mitsim.cli import run
 
         run()

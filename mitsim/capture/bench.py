@@ -8,18 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
+# What needs numpy, or the renderer, is imported where it is used: a misspelt name is refused without them.
 from mitsim.core.configuration import load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import checksum
-from mitsim.core.manifests import Parallax
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.patterns import PatternFamily, parse_patterns
-from mitsim.rig.projector import ProjectorModel, Spectrum
-from mitsim.rig.rig import Rig
-from mitsim.rig.sensor import SensorModel, load_sensor
+from mitsim.scene.guard.files import SceneFiles
+from mitsim.scene.guard.outline import Outline
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -29,9 +23,15 @@ if TYPE_CHECKING:
     from mitsim.capture.plan import Plan
     from mitsim.capture.render import Rendered
     from mitsim.core.job import Job
+    from mitsim.core.manifests import Parallax
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
+    from mitsim.rig.camera import CameraGeometry
+    from mitsim.rig.patterns import PatternFamily
+    from mitsim.rig.projector import ProjectorModel, Spectrum
     from mitsim.rig.recipe import SessionRecipe
+    from mitsim.rig.rig import Rig
+    from mitsim.rig.sensor import SensorModel
     from mitsim.scene.load import LoadedScene
     from mitsim.transport.projector import ProjectorOptics
 
@@ -283,6 +283,8 @@ class Bench:
     @property
     def parallax(self) -> Parallax:
         """How a calibration's factors move with depth, as its manifest states it."""
+        from mitsim.core.manifests import Parallax
+
         depth = self.geometry.scene_distance
         farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
         shift = 1 / (2 * depth) - 1 / depth
@@ -309,6 +311,8 @@ class Bench:
 
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
         """The family ``patterns`` on this projector, ``seed`` for random ones; MitsimError when it does not fit."""
+        from mitsim.rig.patterns import parse_patterns
+
         return parse_patterns(patterns, self.n, seed)
 
     def identity(self) -> dict[str, Any]:
@@ -327,6 +331,8 @@ class Bench:
 
     def provenance(self) -> dict[str, Any]:
         """Where the scene came from: path, checksums of the XML and all that it reads, parameters, variant."""
+        from mitsim.core.framefile import checksum
+
         return {
             "scene": str(self.loaded.path),
             "scene_sha256": checksum(self.loaded.path),
@@ -394,10 +400,16 @@ def open_bench(
         for anything wrong with the files, or a camera file whose pixel pitch is not the scene's.
     """
     path = locate(scene, "scenes", "scene.xml")
-    sensor_path = locate(camera if camera is not None else "imx249", "calibration", ".toml")
-    sensor = load_sensor(sensor_path)
-    light = load_model(locate(projector if projector is not None else "mp_cl1", "calibration", ".toml"), ProjectorModel)
     defines = {name: _text(value) for name, value in parameters.items()}
+    Outline(path, defines, SceneFiles(path, allow_outside_files))  # what it refuses needs no renderer
+    sensor_path = locate(camera if camera is not None else "imx249", "calibration", ".toml")
+    projector_path = locate(projector if projector is not None else "mp_cl1", "calibration", ".toml")
+    from mitsim.rig.projector import ProjectorModel
+    from mitsim.rig.rig import Rig
+    from mitsim.rig.sensor import load_sensor
+
+    sensor = load_sensor(sensor_path)
+    light = load_model(projector_path, ProjectorModel)
     # Only now, with all else checked: the renderer takes a second to import.
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
@@ -423,6 +435,7 @@ def _text(value: object) -> str:
 
 def _scalar_transform(camera: mi.Sensor) -> mi.ScalarAffineTransform4f:
     import mitsuba as mi
+    import numpy as np
 
     matrix = np.array(camera.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
     return mi.ScalarAffineTransform4f(matrix.tolist())

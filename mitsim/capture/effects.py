@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel
 
 from mitsim.core.errors import ArgumentError
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.projector import Spectrum
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsim.capture.bench import Bench
+    from mitsim.rig.camera import CameraGeometry
+    from mitsim.rig.projector import Spectrum
     from mitsim.transport.projector import ProjectorOptics
 
 DIRECT, FOLLOWED = "direct", "followed"

@@ -22,7 +22,8 @@ from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
 from mitsim.capture.simulation import Simulation, Stage
 from mitsim.capture.truth import Truth, trace_truth
-from mitsim.core.arrays import FloatArray, Labels, Progress, silent
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.job import Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, bound_of

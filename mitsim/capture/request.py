@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from mitsim.capture.effects import check_switches, parse_switches
 from mitsim.core.configuration import validated
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.manifests import MOST_SHOTS
-from mitsim.rig.patterns import NAMES, check_patterns
+from mitsim.core.seeds import check_root
+from mitsim.rig.families import NAMES, check_patterns
 from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
-from mitsim.sensor.chain import exposure_for_peak
 
 if TYPE_CHECKING:
     from mitsim.rig.rig import Rig
@@ -47,7 +46,7 @@ class Exposure:
 
     def check(self, rig: Rig) -> None:
         """MitsimError when the time is to follow from a full well that the camera of ``rig`` does not have."""
-        if self.seconds is None and not np.isfinite(rig.sensor.full_well_e):
+        if self.seconds is None and not math.isfinite(rig.sensor.full_well_e):
             raise MitsimError(
                 f"camera {rig.camera_file}: full_well_e is inf, so there is no full well to fill; "
                 "give a finite one, or an exposure in seconds"
@@ -57,6 +56,8 @@ class Exposure:
         """Exposure time [s] of ``rig`` for frames whose brightest expected pixel has ``peak_irradiance`` [W m^-2]."""
         if self.seconds is not None:
             return self.seconds
+        from mitsim.sensor.chain import exposure_for_peak  # here: it needs numpy, and checking a request does not
+
         wavelength = rig.projector.effective_wavelength_nm
         return exposure_for_peak(peak_irradiance, self.fraction, rig.sensor, wavelength)
 
@@ -125,6 +126,11 @@ class Request(BaseModel):
             raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
         return seconds
 
+    @field_validator("seed")
+    @classmethod
+    def _a_root(cls, seed: int) -> int:
+        return check_root(seed)
+
     @field_validator("effects")
     @classmethod
     def _known(cls, effects: dict[str, bool]) -> dict[str, bool]:
@@ -149,7 +155,11 @@ class Request(BaseModel):
     @field_validator("ambient_shots")
     @classmethod
     def _a_number_of_shots(cls, shots: int | None) -> int | None:
-        if shots is not None and not 1 <= shots <= MOST_SHOTS:
+        if shots is None:
+            return None
+        from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests have no shots
+
+        if not 1 <= shots <= MOST_SHOTS:
             raise ArgumentError(
                 "ambient_shots", f"{shots}: give 1 to {MOST_SHOTS} shots, or none for the patterns' own"
             )

@@ -129,12 +129,12 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
-    from mitsim.study.demo import demo as run_demo
-
     request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
     with job_of(quiet or as_json) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
+        from mitsim.study.demo import demo as run_demo  # only now: it takes seconds to import
+
         result = run_demo(bench, output, request, job)
     return finish(as_json, result.payload(), result.lines(), result.warnings)
 
@@ -266,13 +266,14 @@ def calibrate(
     from mitsim.core.resources import memory_from_here, peak_memory
     from mitsim.rig.recipe import load_recipe
 
+    request = request_of(accuracy=accuracy, seed=seed)
     session = load_recipe(recipe)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
         held = memory_from_here()
-        factors = bench.calibrate(seed, accuracy, session, output, resume, job)
+        factors = bench.calibrate(**request, recipe=session, output=output, resume=resume, job=job)
     taken = max(peak_memory() - held, 0.0)
     payload = {**factors.manifest.result, "memory_bytes": taken, "output": str(output)}
     # JSON has no numbers beyond the finite ones.

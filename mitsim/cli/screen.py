@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mitsim.capture.plan import Plan
-    from mitsim.core.arrays import Progress
+    from mitsim.core.job import Progress
 
 
 SECONDS_A_LINE = 60.0
@@ -22,7 +22,7 @@ SECONDS_A_LINE = 60.0
 def showing_progress(hidden: bool) -> Iterator[Progress]:
     """Progress on stderr: a bar on a terminal, else a line a minute; nothing when ``hidden``."""
     if hidden:
-        from mitsim.core.arrays import silent
+        from mitsim.core.job import silent
 
         yield silent
     elif not sys.stderr.isatty():

@@ -1,6 +1,5 @@
-"""Types of arrays that several rooms exchange, and of the progress report that long work takes."""
+"""Types of arrays that several rooms exchange."""
 
-from collections.abc import Callable
 from dataclasses import fields
 
 import numpy as np
@@ -10,8 +9,6 @@ FloatArray = npt.NDArray[np.float64]
 """Real numbers in double precision."""
 Labels = npt.NDArray[np.int64]
 """Index of the class or row that each item belongs to."""
-Progress = Callable[[str, float], None]
-"""Called with a stage's name and its finished part, 0 to 1."""
 
 
 def sum_of_squares(values: FloatArray) -> float:
@@ -38,7 +35,3 @@ class ByValue:
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-
-
-def silent(stage: str, fraction: float) -> None:
-    """Ignore the progress of ``stage``, its finished ``fraction``: the :data:`Progress` of who wants none."""

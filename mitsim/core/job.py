@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from mitsim.core.arrays import Progress, silent
 from mitsim.core.resources import Limits
+
+Progress = Callable[[str, float], None]
+"""Called with a stage's name and its finished part, 0 to 1."""
+
+
+def silent(stage: str, fraction: float) -> None:
+    """Ignore the progress of ``stage``, its finished ``fraction``: the :data:`Progress` of who wants none."""
 
 
 class Clock:

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.output import whole_file
 from mitsim.core.plainfile import read_text
@@ -22,7 +20,7 @@ def plain(value: Any) -> Any:
     infinities null (JSON has no such numbers). TypeError for anything else."""
     if hasattr(value, "model_dump"):
         value = value.model_dump()
-    if isinstance(value, (np.ndarray, np.generic)):
+    if hasattr(value, "tolist"):  # arrays and numbers of numpy, which plain data can do without
         value = value.tolist()
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}

@@ -5,7 +5,6 @@ the process (`Cannot select ... fminimum`, SIGABRT, no exception). So a library 
 17 or newer and a child process has compiled with it.
 """
 
-import importlib.metadata
 import json
 import os
 import platform
@@ -174,6 +173,8 @@ def _names() -> Iterable[Path]:
 
 def _cached_probe(path: Path) -> Probe:
     """`probe`, remembering good results on disk: it costs about a second, and start-up should not."""
+    import importlib.metadata  # here: it takes 20 ms to import, and no refusal needs it
+
     store = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsim" / "llvm.json"
     try:
         stat = path.stat()

@@ -9,8 +9,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
-from filelock import FileLock, Timeout
-
 from mitsim.core.errors import MitsimError
 from mitsim.core.plainfile import read_text
 
@@ -102,6 +100,8 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
+    from filelock import FileLock, Timeout  # here: it takes 20 ms to import, and no refusal needs it
+
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(blocking=False)

@@ -18,7 +18,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
-from mitsim.core.parallel import workers
+from mitsim.core.resources import workers
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status after Control-C, as in a shell."""

@@ -17,13 +17,10 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
+from mitsim.rig.families import read_name
 
 PatternFactor = npt.NDArray[np.int8]
 """(n, K) of 0/1 or +-1: one side of K separable patterns."""
-_MOST_DIGITS = 9
-"""Digits of K that are read; no projector has 1e9 pixels a side."""
-NAMES = "uniform, dots:K, dots:RxC, hadamard:K or random:K"
-"""How families are called."""
 
 
 @dataclass(frozen=True)
@@ -228,38 +225,10 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     MitsimError
         for an unknown family, a K that is not a whole number, or K outside 1..n.
     """
-    name, periods = _read(text, n)
+    name, periods = read_name(text, n)
     if name == "random":
         return PatternFamily(text, *(_random_binary(n, periods[0], seed, side) for side in ("left", "right")))
     if len(periods) == 2:
         return PatternFamily(text, *(_shifting_dots(n, period) for period in periods))
     factor = _SAME_BOTH_SIDES[name](n, periods[0])
     return PatternFamily(text, factor, factor)
-
-
-def check_patterns(text: str) -> str:
-    """The ``text``, where it names a family that some projector has; MitsimError as :func:`parse_patterns`."""
-    _read(text, None)
-    return text
-
-
-def _read(text: str, n: int | None) -> tuple[str, list[int]]:
-    """Name and periods of the patterns ``text``, for ``n`` projector pixels a side, or any number of them."""
-    name, colon, size = text.partition(":")
-    if name not in (*_SAME_BOTH_SIDES, "random") or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
-        raise MitsimError(f"patterns {text!r}: use {NAMES}")
-    rows, _, columns = size.partition("x")
-    both = [rows, columns] if name == "dots" and rows and columns else [size or "1"]
-    return name, [_period(text, period, n) for period in both]
-
-
-def _period(text: str, size: str, n: int | None) -> int:
-    """K of the patterns ``text``, written as ``size``, for ``n`` projector pixels a side, or any number of them."""
-    most = "the projector's pixels a side" if n is None else n
-    if not (size.isascii() and size.isdigit() and len(size) <= _MOST_DIGITS):
-        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {most}")
-    k = int(size)
-    if k < 1 or (n is not None and k > n):
-        most = most if n is None else f"{n}, the projector's pixels a side"
-        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {most}")
-    return k

@@ -31,7 +31,7 @@ class SensorModel(BaseModel):
     Ranges hold every device known, with room: what lies outside is a slip of the unit or of the keyboard.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
     name: str = Field(description="what the sensor is called in reports")
     pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="distance between centres of the square pixels, um")

@@ -17,7 +17,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import whole_file
-from mitsim.core.parallel import workers
+from mitsim.core.resources import workers
 from mitsim.core.versions import versions
 from mitsim.study import ALL, PAPER, find_experiment
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Scope

@@ -30,8 +30,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, Progress
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.job import Progress
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.optics.shadow import scene_factor

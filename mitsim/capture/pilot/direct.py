@@ -17,7 +17,8 @@ from mitsim.capture.filing import Tray
 from mitsim.capture.pilot.looks import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, known, ladder, noise, norm
 from mitsim.capture.simulation import Simulation, emitted
 from mitsim.core.arrays import FloatArray, Labels
-from mitsim.core.parallel import in_threads, workers
+from mitsim.core.parallel import in_threads
+from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.rig.patterns import Lighting
