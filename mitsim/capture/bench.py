@@ -135,7 +135,11 @@ class Bench:
             for a request that cannot be served, an output that cannot be written or holds something else, or more
             memory, disk or time than the job's limits allow.
         """
-        from mitsim.capture.run import capture, request_of
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.capture.run import capture, request_of
 
         known = None if isinstance(plan, str) else plan
         return capture(self, request_of(plan, request), job, output, resume, known)
@@ -171,7 +175,11 @@ class Bench:
         MitsimError
             as :meth:`capture`.
         """
-        from mitsim.capture.calibrate import calibrate
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.capture.calibrate import calibrate
 
         return calibrate(self, seed, accuracy, recipe, output, resume, job)
 

@@ -167,15 +167,16 @@ def capture(
             light = light or trace_light(bench, plan, lighting, request.seed, _sampling(bench, request), job.progress)
         with job.clock.stage("truth"):
             truth = light.apparent
-        expected = light.frames(lighting, request.seed)
         with job.clock.stage("optics"):
+            expected = light.frames(lighting, request.seed)
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
             totals = Totals.of(expected)
         exposure_s = request.timing.choose(bench.rig, totals.peak)
         exposer = Exposer(bench.rig, exposure_s, request.seed, light.simulation.physics.speckle)
         digital = digital_scale(bench, exposure_s)
-        recorder.begin()
-        recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
+        with job.clock.stage("write"):
+            recorder.begin()
+            recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
         with job.clock.stage("ambient frame"):
             ambient = _ambient(request, family, expected, exposer)
         if ambient:

@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import Physics, names
 from mitsim.capture.evidence import Settings
 from mitsim.capture.prices import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_GROUPS, TRUTH_PART, TRUTH_SAMPLES
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.core.seeds import integer
 from mitsim.rig.recipe import load_recipe
 from mitsim.transport.flux import FluxTracer, IntArray
@@ -133,7 +132,7 @@ class _Flux:
             a pixel whose samples happen to agree would get no more of them, and be further off than it says.
         """
         # An edge goes on in the next pixel, where all samples so far may have missed it.
-        likely = likely + uniform_filter(likely.reshape(self._shape), 3, mode="nearest").ravel()
+        likely = likely + mean_of_neighbours(likely.reshape(self._shape)).ravel()
         likely += _ANYWHERE * likely.mean() or 1.0
         most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
         while (error := _rms(_over(self.standard_error, unit))) > target:

@@ -17,6 +17,17 @@ def sum_of_squares(values: FloatArray) -> float:
     return float(np.einsum("i,i->", flat, flat))
 
 
+def mean_of_neighbours(values: FloatArray) -> FloatArray:
+    """(rows, columns) mean over the 3 x 3 neighbours of each of the ``values``; beyond an edge, what stands there.
+
+    scipy.ndimage has the same, and takes 50 ms to import.
+    """
+    for _ in ("rows", "columns"):
+        wide = np.pad(values, ((1, 1), (0, 0)), mode="edge")
+        values = ((wide[:-2] + wide[1:-1] + wide[2:]) / 3).T
+    return values
+
+
 class ByValue:
     """A dataclass (with ``eq=False``) that compares and hashes by its values, arrays by their bytes."""
 

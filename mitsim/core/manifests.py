@@ -309,7 +309,9 @@ class RunManifest(RunHead):
     lost_light: float | None = Field(
         default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"
     )
-    seconds: dict[str, float] = Field(default={}, description="by stage")
+    seconds: dict[str, float] = Field(
+        default={}, description="by stage; `imports`: of modules that no earlier work needed"
+    )
     predicted_memory_bytes: float | None = Field(
         default=None, description="memory that this was predicted to take at most, beyond what the program held before"
     )

@@ -18,9 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
-from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import check_finite
@@ -148,7 +147,7 @@ def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
     side
         of the square.
     """
-    return np.flatnonzero(ndimage.binary_dilation(chosen.reshape(side, side), np.ones((3, 3))))
+    return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, mean_of_neighbours
 
 SIDE = 4
 """Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""
@@ -56,7 +55,7 @@ def chosen_repeats(moments: FloatArray) -> npt.NDArray[np.int64]:
     """
     if not moments.any():
         return np.ones(moments.shape, dtype=np.int64)
-    smooth = uniform_filter(moments, 3, mode="nearest")
+    smooth = mean_of_neighbours(moments)
     wanted = np.sqrt(smooth + 0.1 * smooth.mean())
     tried = [np.clip(np.rint(scale * wanted / wanted.mean()), 1, _MOST).astype(np.int64) for scale in _SCALES]
     return min(tried, key=lambda repeats: float(np.prod(effect_of(repeats, smooth))))

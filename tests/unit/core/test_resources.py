@@ -4,6 +4,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -80,3 +81,9 @@ def test_the_disk_of_a_place_that_is_not_there_yet(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=disks[place]))
     assert free_disk(tmp_path / "a" / "b") == free_disk(tmp_path) == 3e9
     assert free_disk(tmp_path / "mounted" / "a" / "b") == 7e9
+
+
+def test_the_seconds_since_the_start_are_those_of_psutil_to_its_whole_second() -> None:
+    """psutil adds the time of boot, of which Linux tells whole seconds: up to one more than it was."""
+    by_psutil = time.time() - psutil.Process().create_time()
+    assert -0.1 < by_psutil - resources.running_seconds() < 1.1  # 0.1: a tick, and the time between both
