@@ -328,7 +328,7 @@ class Bench:
         grid = self.loaded.pixels
         return {
             "geometry": self.geometry.identity,
-            "sensor": self.sensor.model_dump(exclude={"source"}),
+            "sensor": self.sensor.identity,
             "projector": {
                 "name": self.projector.name,
                 "n": grid.n,

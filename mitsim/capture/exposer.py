@@ -19,14 +19,16 @@ from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.optics.speckle import speckled
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.rig import Rig
+from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.chain import (
     Digital,
-    add_dark_current,
     dn_to_electrons,
     electrons_from_irradiance,
     expose,
+    most_gathered,
 )
 from mitsim.sensor.moments import mean_variance
+from mitsim.sensor.specimen import specimen
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
 _CAN_SATURATE = 1e-3
@@ -90,9 +92,9 @@ class Exposer:
         well, brightest = sensor.superpixel_full_well_e, float(digital.max())
         if sensor.largest_dn is not None and brightest >= sensor.largest_dn:
             return True
-        if np.isinf(well) or brightest < np.floor(well * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn):
+        if np.isinf(well) or brightest < np.floor(sensor.full_well_dn):
             return False
-        peak = add_dark_current(electrons.max(), self.exposure_s, sensor)
+        peak = most_gathered(electrons, self.exposure_s, sensor)
         return bool(special.pdtrc(np.ceil(well) - 1, peak) * electrons.size >= _CAN_SATURATE)
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
@@ -160,3 +162,23 @@ class NoiseTarget:
 def peak_irradiance(expected: ExpectedFrames) -> float:
     """Irradiance [W m^-2] of the brightest pixel of ``expected`` frames."""
     return max(float(frame.irradiance.max()) for frame in expected)
+
+
+def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str]:
+    """What a ``sensor`` does to frames of a ``shape`` that an image of them does not know of."""
+    if sensor.has_defects:
+        own = specimen(sensor, (shape[0], shape[1]))
+        yield (
+            f"defect pixels: {own.hot} are hot and {own.dead} dead, and frames have them as they are read; an image "
+            "takes what they read for light; leave them out of the camera's file, or look at its misfit"
+        )
+    if sensor.row_noise_e:
+        yield (
+            f"row noise: {sensor.superpixel_row_noise_e:g} electrons are shared by a row's pixels, and an image's "
+            "uncertainty takes all noise for independent; it is larger than stated"
+        )
+    if sensor.linearity:
+        yield (
+            f"linearity: a full well reads {sum(sensor.linearity):+.1%} off what a linear camera reads, and an image "
+            "takes the frames for linear"
+        )

@@ -16,7 +16,7 @@ from mitsim.capture.ambient import AmbientFrame, is_taken, shots_for
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frame_seconds, frames_cost
 from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.exposer import Exposer, NoiseTarget
+from mitsim.capture.exposer import Exposer, NoiseTarget, camera_warnings
 from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.losses import known_losses
 from mitsim.capture.plan import Plan
@@ -251,14 +251,14 @@ def _record_ambient(recorder: Recorder, ambient: AmbientFrame, exposer: Exposer)
 def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
     sensor = bench.sensor
-    full = sensor.superpixel_full_well_e * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn
+    full = sensor.full_well_dn
     largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
     return DigitalScale(
         exposure_s=exposure_s,
         black_level_dn=sensor.superpixel_black_level_dn,
         gain_dn_per_e=sensor.gain_dn_per_e,
         dark_current_e_per_s=sensor.superpixel_dark_current_e_per_s,
-        read_noise_e=sensor.superpixel_read_noise_e,
+        read_noise_e=sensor.superpixel_reading_noise_e,
         step_dn=0.0 if sensor.largest_dn is None else 1.0,
         saturation_dn=None if math.isinf(min(full, largest)) else float(min(np.floor(full), largest)),
     )
@@ -284,6 +284,7 @@ def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request
         )
     if shooting.ambient is not None and shooting.ambient.saturated:
         yield "saturation: the ambient frame has pixels at the full well or the ADC's end; expose for less"
+    yield from camera_warnings(light.bench.sensor, shooting.always.shape)
     if shooting.always.any():
         yield from _of_ambient_light(shooting, accuracy, total.bound * shooting.dilution)
     if shooting.saturated:

@@ -155,7 +155,7 @@ class LitSession:
         """
         sensor, time = self.session.bench.sensor, self.exposure_s
         light = float(self._white_rate.mean()) + 2 * sensor.superpixel_dark_current_e_per_s
-        read = sensor.superpixel_read_noise_e**2
+        read = sensor.superpixel_reading_noise_e**2
         if self.session.pairs:
             return float(np.sqrt(light / time + 2 * read / time**2))
         return float(np.sqrt(3 * light / time + 5 * read / time**2))

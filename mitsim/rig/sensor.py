@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mitsim.core.configuration import load_model
@@ -17,16 +18,23 @@ ExposureFraction = Annotated[
 ]
 _LARGEST_CODE = 2**32 - 1
 """What a frame's uint32 holds."""
+_ALWAYS = {"binning", "dark_current_e_per_s", "black_level_dn", "bits"}
+"""Fields that manifests hold whatever they are: calibrations of 0.4 do."""
+_LEVELS = 256
+"""Parts of the full well at which the linearity polynomial must rise: its terms end at the fifth power."""
 
 
 class SensorModel(BaseModel):
-    """A linear camera after EMVA 1288: per-pixel electronics and how pixels are binned.
+    """A camera after EMVA 1288 release 4.0: per-pixel electronics and how pixels are binned.
 
     The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2
     pixels whose values are summed. The `superpixel_` properties follow: area, full well and dark current
     times b^2, gain unchanged, read noise times b (b^2 independent readings), black level and largest code
     times b^2 (the sum of b^2 codes needs more bits than one). The sum is rounded once where a camera rounds
-    each pixel, which leaves out (b^2 - 1)/12 DN^2 of variance.
+    each pixel, which leaves out (b^2 - 1)/12 DN^2 of variance. With `binning_on_chip` charge is summed and read
+    once: read noise, row noise, offsets, black level and largest code are those of one reading.
+
+    Every field that is left out is an effect that the camera does not have: nothing is computed for it.
 
     Ranges hold every device known, with room: what lies outside is a slip of the unit or of the keyboard.
     """
@@ -44,6 +52,50 @@ class SensorModel(BaseModel):
     """0.2 in the quietest cameras, some 1e4 in photodiode arrays."""
     dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10, description="electrons a second and pixel")
     """Warm infrared arrays have 1e8."""
+    dark_current_temperature_c: float | None = Field(
+        default=None, ge=-273.15, le=200, description="temperature that the dark current is stated at, degrees Celsius"
+    )
+    dark_doubling_c: float | None = Field(
+        default=None, ge=1, le=100, description="rise of the temperature that doubles the dark current, kelvin"
+    )
+    """5 to 10 in silicon."""
+    temperature_c: float | None = Field(
+        default=None, ge=-273.15, le=200, description="temperature of the sensor, degrees Celsius; none: as stated"
+    )
+    dark_current_spread_e_per_s: float = Field(
+        default=0.0, ge=0, le=1e10, description="its standard deviation over the pixels, electrons a second"
+    )
+    dsnu_pixel_e: float = Field(
+        default=0.0, ge=0, le=1e6, description="standard deviation of pixels' offsets, electrons"
+    )
+    dsnu_row_e: float = Field(default=0.0, ge=0, le=1e6, description="the same of offsets that a row shares")
+    dsnu_column_e: float = Field(default=0.0, ge=0, le=1e6, description="the same of offsets that a column shares")
+    """As read noise."""
+    prnu_pixel: float = Field(default=0.0, ge=0, le=0.1, description="relative standard deviation of pixels' response")
+    prnu_row: float = Field(default=0.0, ge=0, le=0.1, description="the same of what a row shares")
+    prnu_column: float = Field(default=0.0, ge=0, le=0.1, description="the same of what a column shares")
+    """Cameras have some 1e-2; beyond 0.1 the normal law of the response would reach zero."""
+    row_noise_e: float = Field(
+        default=0.0, ge=0, le=1e6, description="standard deviation of a noise that a row's pixels share, electrons"
+    )
+    hot_pixels: float = Field(default=0.0, ge=0, le=0.5, description="part of the pixels that are hot")
+    hot_dark_current_e_per_s: float = Field(
+        default=0.0, ge=0, le=1e10, description="what a hot pixel has of dark current beyond others, electrons a second"
+    )
+    dead_pixels: float = Field(default=0.0, ge=0, le=0.5, description="part of the pixels that do not respond to light")
+    pattern_seed: int = Field(
+        default=0, ge=0, lt=2**64, description="which specimen: root of all that is fixed in space, apart from a run's"
+    )
+    linearity: Annotated[tuple[float, ...], Field(strict=False, max_length=4)] = Field(
+        default=(), description="c_k of N (1 + sum c_k (N/F)^k), k = 1, 2, ..: what N of F electrons are read as"
+    )
+    crosstalk: float = Field(
+        default=0.0, ge=0, le=0.5, description="part of a pixel's light that its four neighbours get, a quarter each"
+    )
+    binning_on_chip: bool = Field(default=False, description="charge is summed and read once, in place of readings")
+    binned_full_well_e: float | None = Field(
+        default=None, ge=0.1, le=1e14, description="electrons a superpixel holds on chip; none: binning^2 full wells"
+    )
     quantum_efficiency: float = Field(ge=1e-6, le=1, description="electrons per photon, at source's wavelength")
     """One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
     gain_dn_per_e: float = Field(ge=1e-12, le=1e6, description="digital numbers per electron")
@@ -76,6 +128,109 @@ class SensorModel(BaseModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _effects_are_whole(self) -> "SensorModel":
+        if self.temperature_c is not None and None in (self.dark_current_temperature_c, self.dark_doubling_c):
+            raise ValueError(
+                f"temperature_c {self.temperature_c:g} moves the dark current only with dark_current_temperature_c "
+                "and dark_doubling_c; give both, or leave it out"
+            )
+        if self.dark_current_spread_e_per_s and not self.dark_current_e_per_s:
+            raise ValueError(
+                f"dark_current_spread_e_per_s {self.dark_current_spread_e_per_s:g} is of a dark current of 0; "
+                "give dark_current_e_per_s"
+            )
+        if bool(self.hot_pixels) != bool(self.hot_dark_current_e_per_s):
+            raise ValueError("hot_pixels and hot_dark_current_e_per_s go together; give both, or none")
+        if self.binned_full_well_e is not None and not self.binning_on_chip:
+            raise ValueError(
+                f"binned_full_well_e {self.binned_full_well_e:g} is of charge summed on chip; set binning_on_chip"
+            )
+        if self.linearity and not math.isfinite(self.full_well_e):
+            raise ValueError("linearity is relative to the full well; give a finite full_well_e")
+        if self.linearity:
+            part = np.arange(_LEVELS + 1) / _LEVELS
+            rises = sum(((k + 1) * c * part**k for k, c in enumerate(self.linearity, 1)), start=np.ones(_LEVELS + 1))
+            if not (np.isfinite(rises).all() and rises.min() > 0):
+                raise ValueError(f"linearity {self.linearity} falls below the full well; more light must read as more")
+        return self
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """What manifests say of it: all fields but the source, and but effects that it does not name."""
+        fields = type(self).model_fields
+        return {
+            name: value
+            for name, value in self.model_dump(exclude={"source"}).items()
+            if name in _ALWAYS or value != fields[name].default
+        }
+
+    @property
+    def has_fixed_pattern(self) -> bool:
+        """Whether its pixels differ: in offset, response, dark current, or by defects."""
+        return any((*self.offset_parts, *self.response_parts, self.dark_current_spread_e_per_s, self.has_defects))
+
+    @property
+    def has_defects(self) -> bool:
+        """Whether some pixels are hot or dead."""
+        return self.hot_pixels > 0 or self.dead_pixels > 0
+
+    @property
+    def offset_parts(self) -> tuple[float, float, float]:
+        """Standard deviations of a superpixel's offset by pixel, row and column [electrons].
+
+        Of b^2 readings b share a row's offset, in each of b rows: (b^2, b^3, b^3)^(1/2) of one pixel's; on chip it is
+        one reading.
+        """
+        pixel, line = self._readings
+        return self.dsnu_pixel_e * pixel, self.dsnu_row_e * line, self.dsnu_column_e * line
+
+    @property
+    def response_parts(self) -> tuple[float, float, float]:
+        """Relative standard deviations of a superpixel's response by pixel, row and column: of means of b^2, b, b."""
+        line = math.sqrt(self.binning)
+        return self.prnu_pixel / self.binning, self.prnu_row / line, self.prnu_column / line
+
+    @property
+    def _readings(self) -> tuple[float, float]:
+        """How many times a pixel's own noise, and one that a row shares, a superpixel has."""
+        return (1.0, 1.0) if self.binning_on_chip else (float(self.binning), self.binning**1.5)
+
+    @property
+    def codes(self) -> int:
+        """Codes that are summed in a superpixel."""
+        return 1 if self.binning_on_chip else self.binning**2
+
+    @property
+    def dark_factor(self) -> float:
+        """Dark current over the stated one, 2^((T - T_stated) / T_doubling) (EMVA 1288 4.0, dark current)."""
+        if self.temperature_c is None or self.dark_current_temperature_c is None or self.dark_doubling_c is None:
+            return 1.0
+        return float(2 ** ((self.temperature_c - self.dark_current_temperature_c) / self.dark_doubling_c))
+
+    @property
+    def superpixel_crosstalk(self) -> float:
+        """Part of a superpixel's light that its neighbours get: of even light, that of the pixels at its sides."""
+        return self.crosstalk / self.binning
+
+    @property
+    def superpixel_row_noise_e(self) -> float:
+        """Standard deviation of the noise that a row of superpixels shares [electrons]."""
+        return self.row_noise_e * self._readings[1]
+
+    @property
+    def superpixel_reading_noise_e(self) -> float:
+        """Standard deviation of all noise of a superpixel's reading, its own and its row's [electrons]."""
+        own = self.superpixel_read_noise_e
+        return math.hypot(own, self.superpixel_row_noise_e) if self.row_noise_e else own
+
+    @property
+    def full_well_dn(self) -> float:
+        """Digital number, not yet rounded, of a superpixel whose full well is full; inf without one."""
+        full = self.superpixel_full_well_e
+        bent = full * (1 + sum(self.linearity)) if self.linearity else full
+        return bent * self.gain_dn_per_e + self.superpixel_black_level_dn
+
     @property
     def superpixel_pitch_um(self) -> float:
         """Distance between superpixel centres, um."""
@@ -88,30 +243,31 @@ class SensorModel(BaseModel):
 
     @property
     def superpixel_full_well_e(self) -> float:
-        """Electrons a superpixel holds: b^2 full wells."""
-        return self.full_well_e * self.binning**2
+        """Electrons a superpixel holds: b^2 full wells, or what the node on chip does."""
+        full = self.full_well_e * self.binning**2
+        return full if self.binned_full_well_e is None else min(full, self.binned_full_well_e)
 
     @property
     def superpixel_read_noise_e(self) -> float:
         """Standard deviation of a superpixel's reading, electrons: b^2 independent readings add in
-        variance.
+        variance; on chip it is one.
         """
-        return self.read_noise_e * self.binning
+        return self.read_noise_e * self._readings[0]
 
     @property
     def superpixel_dark_current_e_per_s(self) -> float:
-        """Dark electrons a second and superpixel."""
-        return self.dark_current_e_per_s * self.binning**2
+        """Dark electrons a second and superpixel at the sensor's temperature, without those of hot pixels."""
+        return self.dark_current_e_per_s * self.binning**2 * self.dark_factor
 
     @property
     def superpixel_black_level_dn(self) -> float:
         """Digital number of a superpixel without charge."""
-        return self.black_level_dn * self.binning**2
+        return self.black_level_dn * self.codes
 
     @property
     def largest_dn(self) -> int | None:
-        """The largest code of a superpixel, b^2 (2^bits - 1); None for real-valued output."""
-        return None if self.bits is None else (2**self.bits - 1) * self.binning**2
+        """The largest code of a superpixel, b^2 (2^bits - 1), on chip 2^bits - 1; None for real-valued output."""
+        return None if self.bits is None else (2**self.bits - 1) * self.codes
 
 
 def load_sensor(path: Path | str) -> SensorModel:

@@ -1,7 +1,8 @@
 """Irradiance on the sensor in, digital numbers out, stage by stage after EMVA 1288 release 4.0.
 
 The order is physics and not to be permuted: irradiance x area x time -> photons -> quantum efficiency ->
-photoelectrons + dark current -> Poisson -> full-well clip -> read noise -> gain -> black level -> quantise.
+photoelectrons -> crosstalk -> response of each pixel -> + dark current -> Poisson -> full-well clip -> linearity ->
++ offset, row noise, read noise -> gain -> black level -> quantise. A stage that a camera does not name is left out.
 Means and variances in closed form are in `mitsim.sensor.moments`. All values are per superpixel (see
 `SensorModel`); arrays keep their shape and are float64 until the last stage.
 """
@@ -15,6 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.units import photon_energy
 from mitsim.rig.sensor import SensorModel
+from mitsim.sensor.specimen import neighbours, specimen
 
 Digital = FloatArray | npt.NDArray[np.uint32]
 """Digital numbers: codes, or real values of a sensor without bits."""
@@ -90,22 +92,25 @@ def expose(
     Parameters
     ----------
     expected_electrons
-        photoelectrons, any shape.
+        photoelectrons, any shape; (rows, columns) of a camera whose pixels differ, share noise or light.
     exposure_s
         adds its dark electrons.
     model
         the sensor.
     shot_rng, read_rng
-        streams of their own, so that switching one noise off leaves the other's draw as it was.
+        streams of their own, so that switching one noise off leaves the other's draw as it was. Row noise is drawn
+        from a child of the latter.
     """
-    light = checked_light(expected_electrons, "expected_electrons")
-    dark = model.superpixel_dark_current_e_per_s * exposure_s
+    light, dark = gathered(expected_electrons, exposure_s, model)
+    offset = reading_offset(np.shape(light), model, read_rng)
     frame = np.empty(light.shape, np.float64 if model.largest_dn is None else np.uint32)
     light, numbers = light.reshape(-1), frame.reshape(-1)
     for start in range(0, light.size, _BLOCK):
         block = slice(start, start + _BLOCK)
         expected = light[block] + dark
-        electrons = clip_at_full_well(draw_electrons(expected, shot_rng), model)
+        electrons = bend(clip_at_full_well(draw_electrons(expected, shot_rng), model), model)
+        if offset is not None:
+            electrons = electrons + offset[block]
         numbers[block] = quantise(amplify(add_read_noise(electrons, model, read_rng), model), model)
     return frame
 
@@ -134,6 +139,73 @@ def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model
     """
     expected = checked_light(expected_electrons, "expected_electrons")
     return expected + model.superpixel_dark_current_e_per_s * exposure_s
+
+
+def gathered(
+    expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
+) -> tuple[FloatArray, FloatArray | float]:
+    """Light after crosstalk and each pixel's response, and dark electrons: their sum is what is drawn. Deterministic.
+
+    Of a camera without these: the light as it was, and one number of dark electrons. Charge that strays before it is
+    counted leaves the counts of pixels independent and Poisson, so crosstalk is of the mean.
+
+    Parameters
+    ----------
+    expected_electrons
+        photoelectrons, any shape, or (rows, columns) as :func:`expose` says; ValueError where negative or NaN.
+    exposure_s, model
+        time and sensor.
+    """
+    light = checked_light(expected_electrons, "expected_electrons")
+    dark: FloatArray | float = model.superpixel_dark_current_e_per_s * exposure_s
+    if model.crosstalk:
+        _frame_shape(light.shape, model)
+        light = neighbours(light, model.superpixel_crosstalk)
+    if not model.has_fixed_pattern:
+        return light, dark
+    own = specimen(model, _frame_shape(light.shape, model))
+    if own.response is not None:
+        light = light * own.response
+    # One array of both: the blocks of a frame take it apart.
+    return (light, dark) if own.dark_e_per_s is None else (light + own.dark_e_per_s * exposure_s, 0.0)
+
+
+def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> float:
+    """Most electrons, dark ones too, that a pixel is expected to gather.
+
+    Parameters
+    ----------
+    expected_electrons, exposure_s, model
+        as :func:`gathered` has them.
+    """
+    if model.has_fixed_pattern or model.crosstalk:
+        light, dark = gathered(expected_electrons, exposure_s, model)
+        return float((light + dark).max())
+    return float(add_dark_current(expected_electrons.max(), exposure_s, model))
+
+
+def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Generator | None) -> FloatArray | None:
+    """What is added to the charge of each pixel when it is read, flat [electrons]: fixed offset, and a row's noise.
+
+    None where the camera has neither.
+
+    Parameters
+    ----------
+    shape
+        of the frame.
+    model
+        the sensor.
+    rng
+        whose child the row noise is drawn from; None: the offset alone.
+    """
+    fixed = specimen(model, _frame_shape(shape, model)).offset_e if any(model.offset_parts) else None
+    offset = None if fixed is None else fixed.astype(np.float64)
+    if model.row_noise_e and rng is not None:
+        rows, columns = _frame_shape(shape, model)
+        (own,) = rng.spawn(1)
+        lines = model.superpixel_row_noise_e * own.standard_normal((rows, 1))
+        offset = np.broadcast_to(lines, (rows, columns)) if offset is None else offset + lines
+    return None if offset is None else offset.reshape(-1)
 
 
 def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -183,6 +255,21 @@ def clip_at_full_well(electrons: FloatArray, model: SensorModel) -> FloatArray:
     return np.minimum(electrons, model.superpixel_full_well_e)
 
 
+def bend(electrons: FloatArray, model: SensorModel) -> FloatArray:
+    """What ``electrons`` (any shape) are read as by a ``model`` that is not linear: N (1 + sum c_k (N/F)^k).
+
+    Its moments: `moments.bent_moments`.
+    """
+    if not model.linearity:
+        return electrons
+    part = electrons / model.superpixel_full_well_e
+    factor = np.zeros_like(part)
+    for coefficient in reversed(model.linearity):
+        factor += coefficient
+        factor *= part
+    return np.asarray(electrons * (1 + factor))
+
+
 def add_read_noise(electrons: FloatArray, model: SensorModel, rng: np.random.Generator) -> FloatArray:
     """Electrons with normal noise added; mean unchanged, variance plus sigma_d^2.
 
@@ -217,6 +304,16 @@ def quantise(signal_dn: FloatArray, model: SensorModel) -> Digital:
 
 def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
     return model.quantum_efficiency * model.superpixel_area_m2 / photon_energy(wavelength_nm)
+
+
+def _frame_shape(shape: tuple[int, ...], model: SensorModel) -> tuple[int, int]:
+    """``shape`` of a frame; ValueError where it is none."""
+    if len(shape) != 2:
+        raise ValueError(
+            f"expected_electrons: the shape is {shape}; sensor {model.name!r} has pixels that differ, or that share "
+            "light or noise, so give a frame of rows and columns"
+        )
+    return shape[0], shape[1]
 
 
 def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:

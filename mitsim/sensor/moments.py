@@ -12,7 +12,16 @@ from scipy import special
 
 from mitsim.core.arrays import FloatArray
 from mitsim.rig.sensor import SensorModel
-from mitsim.sensor.chain import add_dark_current, amplify, checked_light, clip_at_full_well, poisson_quantile
+from mitsim.sensor.chain import (
+    add_dark_current,
+    amplify,
+    bend,
+    checked_light,
+    clip_at_full_well,
+    gathered,
+    poisson_quantile,
+    reading_offset,
+)
 
 _FEW = 64.0
 """Electrons below which moments behind the ADC are summed count by count; chosen: some 150 counts hold all."""
@@ -23,6 +32,9 @@ _DITHERED = 0.8
 """Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
 _SMOOTH = 2.0
 """Standard deviation [DN] from which a sum over codes is an integral to 1e-4."""
+_STEP, _FINEST = 1 / 8, 1 / 64
+"""Distance of the offsets at which moments near the ADC's ends are formed, in deviations of the noise of reading, which
+smooths them: linear between them to 1/500 of it; and the least one [DN], for readings without noise."""
 
 
 def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatArray, FloatArray]:
@@ -93,10 +105,13 @@ def frame_moments(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (DN) and variance (DN^2) of `expose`'s output (EMVA 1288 4.0, photon transfer).
 
+    Of one specimen: what is fixed in space moves means, and what is drawn anew in every frame is in the variance. Row
+    noise is in it too; the covariance of two pixels of a row is its variance.
+
     Parameters
     ----------
     expected_electrons
-        photoelectrons, any shape; ValueError where negative or NaN.
+        photoelectrons, any shape, or (rows, columns) as `expose` says; ValueError where negative or NaN.
     exposure_s, model
         time and sensor.
 
@@ -105,13 +120,94 @@ def frame_moments(
     Where an end of the ADC is within eight deviations, or too little noise dithers its codes, the moments are those of
     rounded and cut numbers: summed over the counts below 1e4 electrons, and averaged over 129 of them above.
     """
-    expected = np.asarray(add_dark_current(expected_electrons, exposure_s, model))
+    light, dark = gathered(expected_electrons, exposure_s, model)
+    expected = np.asarray(light + dark)
+    offset = reading_offset(expected.shape, model, None)
+    if offset is not None or model.linearity:
+        return _general(expected, None if offset is None else offset.reshape(expected.shape), model)
     mean, variance = np.asarray(amplify(expected, model)), _linear_variance(expected, model)
     first, last = _linear(model)
     rest = (expected < first) | (expected > last)
     if rest.any():
         mean[rest], variance[rest] = _cut(expected[rest], model)
     return mean, variance
+
+
+def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+    """:func:`frame_moments` of ``expected`` electrons, dark ones too, with ``offset`` [electrons] and linearity."""
+    level, spread = bent_moments(expected, model)
+    mean = np.asarray(amplify(level if offset is None else level + offset, model))
+    noise = np.asarray(_linear_variance(spread, model))
+    rest = expected > model.superpixel_full_well_e - 12 * math.sqrt(min(model.superpixel_full_well_e, 1e300))
+    if model.largest_dn is not None:
+        deviation = np.sqrt(noise)
+        dither = np.where(expected < _SOME, model.superpixel_reading_noise_e * model.gain_dn_per_e, deviation)
+        room = np.minimum(mean, model.largest_dn - mean)
+        rest |= (room < 8 * deviation) | (dither < _DITHERED)
+    if rest.any():
+        mean[rest], noise[rest] = _cut_apart(expected[rest], 0.0 if offset is None else offset[rest], model)
+    return mean, noise
+
+
+def _cut_apart(expected: FloatArray, offset: FloatArray | float, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+    """:func:`_cut` of pixels (pixels,) whose offsets differ: an offset is another black level.
+
+    Moments are formed at black levels that are close to each other, and linear between two of them.
+    """
+    if not np.ptp(offset):
+        return _cut(expected, _blacker(model, float(np.mean(offset))))
+    read = model.superpixel_reading_noise_e * model.gain_dn_per_e
+    step = max(_STEP * read, _FINEST) / model.gain_dn_per_e
+    place = np.asarray(offset) / step
+    below = np.floor(place)
+    part = place - below
+    mean, variance = np.zeros_like(expected), np.zeros_like(expected)
+    for node in np.unique(np.concatenate([below, below + 1])):
+        for here, weight in ((below == node, 1 - part), (below + 1 == node, part)):
+            if here.any():
+                first, second = _cut(expected[here], _blacker(model, node * step))
+                mean[here] += weight[here] * first
+                variance[here] += weight[here] * second
+    return mean, variance
+
+
+def _blacker(model: SensorModel, offset: float) -> SensorModel:
+    """The ``model`` with a black level higher by an ``offset`` [electrons] of its superpixels; it may be below 0."""
+    black = model.black_level_dn + offset * model.gain_dn_per_e / model.codes
+    return model.model_copy(update={"black_level_dn": black})
+
+
+def bent_moments(expected: npt.ArrayLike, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance [electrons] of `chain.bend` of Poisson counts of mean ``expected`` (any shape), unclipped.
+
+    With g the polynomial of the ``model``, a_j = g^(j)(mu) / j! and m_j the central moments of the Poisson law,
+    m_{j+1} = mu (m_j' + j m_{j-1}) (Kendall and Stuart): E = sum a_j m_j and Var = sum a_i a_j (m_{i+j} - m_i m_j), i
+    and j from 1. The differences are formed as polynomials in mu, so no digits cancel.
+    """
+    mean = checked_light(expected, "expected")
+    if not model.linearity:
+        return mean.copy(), mean.copy()
+    well = model.superpixel_full_well_e
+    g = np.polynomial.Polynomial([0.0, 1.0, *(c / well**k for k, c in enumerate(model.linearity, 1))])
+    degree = g.degree()
+    central = _central_moments(2 * degree)
+    moments = [moment(mean) for moment in central]
+    slopes = [np.asarray(g.deriv(j)(mean) / math.factorial(j)) if j else g(mean) for j in range(degree + 1)]
+    level, spread = np.asarray(slopes[0]), np.zeros_like(mean)
+    for i in range(1, degree + 1):
+        level = level + slopes[i] * moments[i]
+        for j in range(1, degree + 1):
+            spread += slopes[i] * slopes[j] * (central[i + j] - central[i] * central[j])(mean)
+    return level, spread
+
+
+def _central_moments(most: int) -> list[np.polynomial.Polynomial]:
+    """Central moments 0 .. ``most`` of the Poisson law, as polynomials in its mean."""
+    mu = np.polynomial.Polynomial([0.0, 1.0])
+    found = [np.polynomial.Polynomial([1.0]), np.polynomial.Polynomial([0.0])]
+    for j in range(1, most):
+        found.append(mu * (found[j].deriv() + j * found[j - 1]))
+    return found
 
 
 def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> float:
@@ -122,6 +218,8 @@ def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: S
     expected_electrons, exposure_s, model
         as there.
     """
+    if model.has_fixed_pattern or model.linearity or model.crosstalk:
+        return float(frame_moments(expected_electrons, exposure_s, model)[1].mean())
     light = checked_light(expected_electrons, "expected_electrons")
     low, high, mean = (
         float(add_dark_current(value, exposure_s, model)) for value in (light.min(), light.max(), light.mean())
@@ -134,7 +232,7 @@ def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: S
 
 def _linear_variance(expected: FloatArray | np.float64, model: SensorModel) -> FloatArray:
     """Variance [DN^2] of counts and read noise, rounded, where nothing is cut."""
-    read, gain = model.superpixel_read_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
+    read, gain = model.superpixel_reading_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     return np.asarray(expected * gain**2 + (read**2 + (0.0 if model.largest_dn is None else 1 / 12)))
 
 
@@ -150,7 +248,7 @@ def _linear(model: SensorModel) -> tuple[float, float]:
     if top is None:
         return 0.0, last
     gain, black = model.gain_dn_per_e, model.superpixel_black_level_dn
-    read = model.superpixel_read_noise_e * gain
+    read = model.superpixel_reading_noise_e * gain
     offset = 64 * (gain * black - read**2)
     under = (32 * gain) ** 2 - offset
     first = (32 * gain + math.sqrt(under) - black) / gain if under > 0 else 0.0
@@ -164,11 +262,13 @@ def _linear(model: SensorModel) -> tuple[float, float]:
 def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """:func:`frame_moments` of expected electrons (pixels,), dark ones among them, without short cuts."""
     clipped, variance = clipped_moments(expected, model.superpixel_full_well_e)
-    read, gain = model.superpixel_read_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
+    read, gain = model.superpixel_reading_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
+    dim, some = expected < _FEW, (expected >= _FEW) & (expected < _SOME)
+    if model.linearity:
+        return _summed_up(expected, (dim, some), np.ones(expected.shape, bool), (mean, noise), model)
     if model.largest_dn is None:
         return mean, noise
-    dim, some = expected < _FEW, (expected >= _FEW) & (expected < _SOME)
     room, deviation = np.minimum(mean, model.largest_dn - mean), np.sqrt(noise)
     # Counts are a lattice that only read noise blurs, as long as they are few; and so is what fills the full well.
     full = model.superpixel_full_well_e - expected < 8 * np.sqrt(expected)
@@ -176,10 +276,22 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
     total = np.asarray(noise + 1 / 12)
     gone = room < -10 * deviation
     mean[gone], total[gone] = model.largest_dn, 0.0
-    for part, moments in ((dim, _counted), (some, _summed), (~dim & ~some, _averaged)):
-        part = hard & ~gone & part
+    return _summed_up(expected, (dim, some), hard & ~gone, (mean, total), model)
+
+
+def _summed_up(
+    expected: FloatArray,
+    few: tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]],
+    hard: npt.NDArray[np.bool_],
+    moments: tuple[FloatArray, FloatArray],
+    model: SensorModel,
+) -> tuple[FloatArray, FloatArray]:
+    """`moments` with those of the `hard` pixels summed over counts; `few`: which are dim, and which have some."""
+    (dim, some), (mean, total) = few, moments
+    for part, found in ((dim, _counted), (some, _summed), (~dim & ~some, _averaged)):
+        part = hard & part
         if part.any():
-            mean[part], total[part] = moments(expected[part], model)
+            mean[part], total[part] = found(expected[part], model)
     return mean, total
 
 
@@ -252,9 +364,10 @@ def _between(
 
 def _read_out(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """Mean and variance [DN] of what the ADC makes of known electrons (pixels,), before the full well."""
-    assert model.largest_dn is not None
-    signal = amplify(clip_at_full_well(electrons, model), model)
-    read = np.full(signal.shape, model.superpixel_read_noise_e * model.gain_dn_per_e)
+    signal = amplify(bend(clip_at_full_well(electrons, model), model), model)
+    read = np.full(signal.shape, model.superpixel_reading_noise_e * model.gain_dn_per_e)
+    if model.largest_dn is None:
+        return signal, np.square(read)
     return _rounded(signal, read, model.largest_dn)
 
 

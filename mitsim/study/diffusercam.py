@@ -95,7 +95,7 @@ def take(
         time /= len(expected)
     unit = float(electrons_from_irradiance(WHITE_W_M2, time, sensor, WAVELENGTH_NM))
     dark = sensor.superpixel_dark_current_e_per_s * time
-    full = sensor.superpixel_full_well_e * sensor.gain_dn_per_e + sensor.superpixel_black_level_dn
+    full = sensor.full_well_dn
     frames, saturated = np.empty_like(expected), 0
     for index, frame in enumerate(expected):
         shot, read = (stream(seed, "diffuser camera", noise, family.name, index) for noise in ("shot", "read"))

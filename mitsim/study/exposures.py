@@ -210,7 +210,7 @@ class Unexposed:
         """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
         exposer, sensor = self.exposer(seconds), self.lit.bench.sensor
         rounding = 0.0 if sensor.bits is None else 1 / (12 * sensor.gain_dn_per_e**2)
-        read = sensor.superpixel_read_noise_e**2 + sensor.superpixel_dark_current_e_per_s * seconds + rounding
+        read = sensor.superpixel_reading_noise_e**2 + sensor.superpixel_dark_current_e_per_s * seconds + rounding
         variances = [exposer.electrons(frame).mean() + read for frame in self.expected]
         return float(np.sqrt(np.mean(variances))) / seconds
 

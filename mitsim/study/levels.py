@@ -204,7 +204,7 @@ def fills_well(sensor: SensorModel, speckle: float) -> bool:
     if largest is not None:
         well = min(well, (largest - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
     peak = Exposure().fraction * sensor.superpixel_full_well_e
-    noise = math.hypot(math.sqrt(peak), sensor.superpixel_read_noise_e)
+    noise = math.hypot(math.sqrt(peak), sensor.superpixel_reading_noise_e)
     return speckle > 0 or peak + _SURE * noise > well
 
 

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 from mitsim.capture import exposer as exposing
-from mitsim.capture.exposer import Exposer
+from mitsim.capture.exposer import Exposer, camera_warnings
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import Frame
 from mitsim.rig.patterns import parse_patterns
 from mitsim.rig.rig import Rig
 from mitsim.rig.sensor import SensorModel
+from tests.invented import sensor
 
 SENSOR = SensorModel(
     name="bare",
@@ -138,3 +139,11 @@ def test_sensor_noise_is_shot_and_read_noise_in_electrons() -> None:
     electrons = np.array([[10.0, 30.0]])
     camera = exposer(gain_dn_per_e=4.0, dark_current_e_per_s=40.0)
     assert camera.sensor_noise(electrons) == pytest.approx(np.sqrt(20 + 40 * 0.25 + 9), rel=1e-12)
+
+
+def test_what_an_image_does_not_know_of_a_camera_is_said() -> None:
+    quiet = sensor(dsnu_pixel_e=2.0, prnu_pixel=0.01)
+    assert not list(camera_warnings(quiet, (10, 10)))
+    loud = sensor(dead_pixels=0.03, row_noise_e=2.0, linearity=(-0.01,))
+    defects, rows, bent = camera_warnings(loud, (10, 10))
+    assert "0 are hot and 3 dead" in defects and "2 electrons" in rows and "-1.0%" in bent

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.rig.sensor import SensorModel, load_sensor, paper_sensor
+from tests.invented import sensor
 
 BASE = {
     "name": "test",
@@ -113,3 +114,13 @@ def test_the_paper_s_model_has_the_paper_s_numbers() -> None:
     assert model.gain_dn_per_e == pytest.approx(2e-4)  # G / F
     assert model.read_noise_e == pytest.approx(10.0)  # F 10^(-R/20)
     assert model.bits is None and model.black_level_dn == 0.0 and math.isinf(model.full_well_e)
+
+
+def test_a_camera_s_identity_has_the_effects_that_it_names_and_no_others() -> None:
+    """Calibrations of 0.4, which know no effects, fit the cameras that they were made of."""
+    plain = sensor().identity
+    assert set(plain) == {
+        "name", "pixel_pitch_um", "binning", "full_well_e", "read_noise_e", "dark_current_e_per_s",
+        "quantum_efficiency", "gain_dn_per_e", "black_level_dn", "bits",
+    }  # fmt: skip
+    assert sensor(prnu_row=0.01).identity == {**plain, "prnu_row": 0.01}
