@@ -432,6 +432,11 @@ def open_bench(
             f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
             "use the camera of that scene, or change pixel_pitch, or binning"
         )
+    if not for_render and sensor.quantum_efficiency is None:
+        raise MitsimError(
+            f"camera {sensor_path}: states no quantum_efficiency, so light makes no known number of electrons; "
+            "give one, with its source"
+        )
     rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
     return Bench(loaded, rig, variant, defines)
 

@@ -96,7 +96,12 @@ class SensorModel(BaseModel):
     binned_full_well_e: float | None = Field(
         default=None, ge=0.1, le=1e14, description="electrons a superpixel holds on chip; none: binning^2 full wells"
     )
-    quantum_efficiency: float = Field(ge=1e-6, le=1, description="electrons per photon, at source's wavelength")
+    quantum_efficiency: float | None = Field(
+        default=None,
+        ge=1e-6,
+        le=1,
+        description="electrons per photon, at source's wavelength; none: no source gives it",
+    )
     """One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
     gain_dn_per_e: float = Field(ge=1e-12, le=1e6, description="digital numbers per electron")
     """1e-12 spreads the largest full well over one number; electron multiplication brings some 1e3."""

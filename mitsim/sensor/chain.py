@@ -303,6 +303,11 @@ def quantise(signal_dn: FloatArray, model: SensorModel) -> Digital:
 
 
 def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
+    if model.quantum_efficiency is None:
+        raise MitsimError(
+            f"sensor {model.name!r}: its file states no quantum efficiency, so light makes no known number of "
+            "electrons; give quantum_efficiency"
+        )
     return model.quantum_efficiency * model.superpixel_area_m2 / photon_energy(wavelength_nm)
 
 
