@@ -1,0 +1,203 @@
+"""Flat and dark frames of a camera in, the figures of EMVA 1288 release 4.0 out; frames may be real or simulated.
+
+Photon transfer: pairs of flat frames over a ladder of light tell the system gain, quantum efficiency, saturation and
+linearity; pairs of dark frames over a series of exposures the dark current; stacks of dark and of half-bright frames
+the nonuniformity, split into rows, columns and pixels. Statistics may have leading axes: many sessions at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+
+QUANTISATION = 1 / 12
+"""Variance of rounding [DN^2] (EMVA 1288, "noise model")."""
+_FITTED, _LEAST, _MOST = 0.7, 0.05, 0.95
+"""Parts of saturation: gain and responsivity are fitted up to 70 %, linearity from 5 to 95 % (EMVA 1288 4.0)."""
+SPLIT = ("total", "row", "column", "pixel")
+"""Parts of a nonuniformity."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Of two frames under the same light: mean (...) [DN], temporal variance, and its part that rows share [DN^2]."""
+
+    mean: FloatArray
+    variance: FloatArray
+    rows: FloatArray
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Of the mean of L frames, all (...).
+
+    Attributes
+    ----------
+    mean
+        of all pixels [DN].
+    total
+        spatial variance of all pixels [DN^2], as all variances without what is left of temporal noise.
+    rows, columns
+        variance of the means of rows, and of columns.
+    """
+
+    mean: FloatArray
+    total: FloatArray
+    rows: FloatArray
+    columns: FloatArray
+
+    def parts(self, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Variances (total, row, column, pixel) [DN^2] for frames of a ``shape`` of M rows and N columns.
+
+        A pixel's part is left in the means of rows as 1/N of it, and of columns as 1/M (EMVA 1288 4.0, "row, column and
+        pixel spatial variances").
+        """
+        m, n = shape
+        pixel = m * n / (m * n - m - n) * (self.total - self.rows - self.columns)
+        return self.total, self.rows - pixel / n, self.columns - pixel / m, pixel
+
+
+@dataclass(frozen=True)
+class Session:
+    """What the frames of one characterisation say; S steps of light, T exposures in the dark.
+
+    Attributes
+    ----------
+    shape
+        rows and columns of the frames.
+    photons
+        (S,) mean photons that fall on a pixel, rising, to beyond saturation.
+    ladder
+        pairs (..., S) under them, all at one exposure time.
+    dark
+        the pair (...) in the dark at that time.
+    overexposed
+        mean (...) [DN] of frames far beyond saturation.
+    dark_times
+        (T,) exposures [s] of the series of dark pairs.
+    dark_series
+        these pairs (..., T).
+    dark_stack, bright_stack
+        at that time, in the dark and at half of saturation.
+    """
+
+    shape: tuple[int, int]
+    photons: FloatArray
+    ladder: Pair
+    dark: Pair
+    overexposed: FloatArray
+    dark_times: FloatArray
+    dark_series: Pair
+    dark_stack: Stack
+    bright_stack: Stack
+
+
+def pair_of(first: npt.ArrayLike, second: npt.ArrayLike) -> Pair:
+    """Statistics of two frames, ``first`` and ``second`` (M, N) [DN].
+
+    sigma^2 = <(a - b)^2>/2 - (<a> - <b>)^2/2: free of all that is fixed in space, and of a drift of the light.
+    """
+    a, b = (np.asarray(frame, dtype=np.float64) for frame in (first, second))
+    off = a - b
+    off -= off.mean()
+    m, n = off.shape
+    variance = float(np.square(off).sum()) / 2 / (off.size - 1)
+    lines = float(np.square(off.mean(axis=1)).sum()) / 2 / (m - 1)
+    return Pair(
+        np.asarray((a.mean() + b.mean()) / 2), np.asarray(variance), np.asarray((lines - variance / n) * n / (n - 1))
+    )
+
+
+def pairs_of(pairs: Sequence[Pair]) -> Pair:
+    """``pairs`` side by side, (count,) each."""
+    return Pair(*(np.array([getattr(pair, name) for pair in pairs]) for name in ("mean", "variance", "rows")))
+
+
+def stack_of(frames: Iterable[npt.ArrayLike]) -> Stack:
+    """Statistics of the mean of ``frames`` (M, N) [DN], two or more; what temporal noise leaves in it is taken off."""
+    count, total, squares = 0, np.zeros(()), np.zeros(())
+    first: FloatArray | None = None
+    for frame in frames:
+        values = np.asarray(frame, dtype=np.float64)
+        first = values if first is None else first
+        # About the first frame: squares of small numbers keep their digits.
+        total = total + (values - first)
+        squares = squares + np.square(values - first)
+        count += 1
+    if count < 2 or first is None:
+        raise ValueError(f"stack_of: {count} frames tell no temporal noise; give 2 or more")
+    m, n = first.shape
+    mean = first + total / count
+    noise = float((squares - np.square(total) / count).mean()) / (count - 1)
+    about = mean - mean.mean()
+    return Stack(
+        mean=np.asarray(mean.mean()),
+        total=np.asarray(np.square(about).sum() / (about.size - 1) - noise / count),
+        rows=np.asarray(np.square(about.mean(axis=1)).mean() - noise / count / n),
+        columns=np.asarray(np.square(about.mean(axis=0)).mean() - noise / count / m),
+    )
+
+
+def figures(session: Session) -> dict[str, FloatArray]:
+    """The figures (...) of a ``session``, by name; variances may come out below zero, where there is nothing to find.
+
+    `system_gain` [DN/e-], `quantum_efficiency` [e-/photon], `dark_noise` [e-], `saturation_capacity` (at the largest
+    variance of the ladder) and `full_well` (of overexposed frames) [e-], `linearity_min` and `linearity_max` [1],
+    `dark_current` (by means) and `dark_current_by_variance` [e-/s]; as variances `row_noise` [e-^2], `dsnu_PART` [e-^2]
+    and `prnu_PART` [1] for each PART of :data:`SPLIT`.
+    """
+    photons, ladder, dark = session.photons, session.ladder, session.dark
+    signal = ladder.mean - dark.mean[..., None]
+    noise = ladder.variance - dark.variance[..., None]
+    peak = ladder.variance.argmax(axis=-1)
+    full = np.take_along_axis(signal, peak[..., None], axis=-1)
+    fitted = (signal <= _FITTED * full) & (photons > 0)
+    gain = _slope(signal, noise, fitted)
+    efficiency = _slope(np.broadcast_to(photons, signal.shape), signal, fitted) / gain
+    low, high = _linearity(photons, signal, (signal >= _LEAST * full) & (signal <= _MOST * full))
+    times, series = session.dark_times, session.dark_series
+    about = times - times.mean()
+    slopes = [(values * about).sum(axis=-1) / np.square(about).sum() for values in (series.mean, series.variance)]
+    found = {
+        "system_gain": gain,
+        "quantum_efficiency": efficiency,
+        "dark_noise": np.sqrt(np.maximum(dark.variance - QUANTISATION, 0)) / gain,
+        "row_noise": dark.rows / gain**2,
+        "saturation_capacity": efficiency * photons[peak],
+        "full_well": (session.overexposed - dark.mean) / gain,
+        "linearity_min": low,
+        "linearity_max": high,
+        "dark_current": slopes[0] / gain,
+        "dark_current_by_variance": slopes[1] / gain**2,
+    }
+    dim, bright = session.dark_stack, session.bright_stack
+    contrast = bright.mean - dim.mean
+    for name, off, on in zip(SPLIT, dim.parts(session.shape), bright.parts(session.shape), strict=True):
+        found[f"dsnu_{name}"] = off / gain**2
+        found[f"prnu_{name}"] = (on - off) / contrast**2
+    return found
+
+
+def _slope(x: FloatArray, y: FloatArray, used: npt.NDArray[np.bool_]) -> FloatArray:
+    """Slope (...) of the least squares line from the origin of ``y`` over ``x`` (..., S), where they are ``used``."""
+    return np.asarray((x * y * used).sum(axis=-1) / (np.square(x) * used).sum(axis=-1))
+
+
+def _linearity(photons: FloatArray, signal: FloatArray, used: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Least and largest relative deviation (...) of ``signal`` from a line over ``photons``, where they are ``used``.
+
+    The line's squared *relative* deviations are least (EMVA 1288 4.0, "linearity"): weights 1 / signal^2.
+    """
+    weight = used / np.square(np.where(used, signal, 1.0))
+    total, first = weight.sum(axis=-1), (weight * photons).sum(axis=-1)
+    second, value = (weight * photons**2).sum(axis=-1), (weight * signal).sum(axis=-1)
+    cross = (weight * photons * signal).sum(axis=-1)
+    slope = (total * cross - first * value) / (total * second - first**2)
+    line = ((value - slope * first) / total)[..., None] + slope[..., None] * photons
+    off = np.where(used, (signal - line) / np.where(used, line, 1.0), 0.0)
+    return np.where(used, off, np.inf).min(axis=-1), np.where(used, off, -np.inf).max(axis=-1)

@@ -1,0 +1,105 @@
+"""Estimators of EMVA 1288 on frames whose statistics are known without them."""
+
+import numpy as np
+import pytest
+
+from mitsim.core.seeds import stream
+from mitsim.sensor.emva import Pair, Session, Stack, figures, pair_of, stack_of
+
+
+def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
+    """(Planted: the drift's square left in; the variance of a difference not halved.)"""
+    rng = stream(1, "pair")
+    fixed = rng.normal(0, 50, (200, 300))
+    first, second = (fixed + drift + rng.normal(0, 2, fixed.shape) for drift in (0.0, 3.0))
+    pair = pair_of(first, second)
+    assert pair.variance == pytest.approx(4, rel=5 * np.sqrt(2 / fixed.size))
+    assert pair.rows == pytest.approx(0, abs=5 * 4 / 300 * np.sqrt(2 / 200))
+    assert pair.mean == pytest.approx((first.mean() + second.mean()) / 2)
+
+
+def test_noise_that_rows_share_is_told_from_the_pixels_own() -> None:
+    rng = stream(2, "rows")
+    frames = [rng.normal(0, 3, (400, 1)) + rng.normal(0, 2, (400, 100)) for _ in range(2)]
+    assert pair_of(*frames).rows == pytest.approx(9, rel=5 * np.sqrt(2 / 400))
+
+
+def test_a_stack_tells_rows_columns_and_pixels_apart_and_takes_off_what_noise_is_left() -> None:
+    """Three parts of known mean squares, without noise exact to (M + N)/MN; then noise of five times their size."""
+    rng = stream(3, "stack")
+    rows, columns, pixels = rng.normal(0, 3, (60, 1)), rng.normal(0, 2, (1, 80)), rng.normal(0, 4, (60, 80))
+    pixels -= pixels.mean(axis=0)
+    pixels -= pixels.mean(axis=1, keepdims=True)
+    image = rows + columns + pixels
+    still = stack_of([image, image]).parts((60, 80))
+    exact = rows.var() + columns.var() + pixels.var(), rows.var(), columns.var(), pixels.var()
+    # Made without means, pixels have none in rows, where as many of random ones would leave 1/N of their variance.
+    np.testing.assert_allclose(still, exact, rtol=0.06)
+    noisy = stack_of(image + rng.normal(0, 20, image.shape) for _ in range(50))
+    left = 20**2 / 50
+    assert noisy.total == pytest.approx(exact[0], abs=5 * np.sqrt((2 * left**2 + 4 * left * exact[0]) / image.size))
+
+
+def test_a_stack_needs_two_frames() -> None:
+    with pytest.raises(ValueError, match="1 frames tell no temporal noise"):
+        stack_of([np.zeros((4, 4))])
+
+
+def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
+    """Statistics by the linear model's own formulas, no frame: K 0.5, eta 0.4, sigma_d 3, saturation at 9000."""
+    gain, efficiency, read, full, dark = 0.5, 0.4, 3.0, 9000.0, 7.0
+    electrons = np.linspace(200, 10_000, 50)
+    light = np.minimum(electrons, full)
+    variance = np.where(electrons < full, electrons, 0) * gain**2 + gain**2 * read**2 + 1 / 12
+    times = np.linspace(0, 10, 6)
+    still, none = np.full(6, gain**2 * read**2 + 1 / 12), np.zeros(())
+    spatial = {"total": 14.0, "row": 4.0, "column": 1.0}
+
+    def stack(light: float) -> Stack:
+        each = {name: part * gain**2 + (0.01 * light) ** 2 * part / 14 for name, part in spatial.items()}
+        pixel = each["total"] - each["row"] - each["column"]
+        size = 100 * 200
+        left = pixel * (size - 300) / size
+        rows, columns = each["row"] + pixel / 200, each["column"] + pixel / 100
+        return Stack(np.asarray(100 + light), np.asarray(rows + columns + left), np.asarray(rows), np.asarray(columns))
+
+    session = Session(
+        shape=(100, 200),
+        photons=electrons / efficiency,
+        ladder=Pair(100 + gain * light, variance, np.zeros(50)),
+        dark=Pair(np.asarray(100.0), still[0], none),
+        overexposed=np.asarray(100 + gain * full),
+        dark_times=times,
+        dark_series=Pair(100 + gain * dark * times, still + gain**2 * dark * times, np.zeros(6)),
+        dark_stack=stack(0.0),
+        bright_stack=stack(2000.0),
+    )
+    found = figures(session)
+    expected = {
+        "system_gain": gain, "quantum_efficiency": efficiency, "dark_noise": read, "full_well": full,
+        "saturation_capacity": electrons[electrons < full].max(),
+        "dark_current": dark, "dark_current_by_variance": dark,
+        "dsnu_row": 4.0, "dsnu_column": 1.0, "dsnu_pixel": 9.0, "prnu_row": 0.01**2 * 4 / 14,
+        "prnu_pixel": 0.01**2 * 9 / 14, "row_noise": 0.0, "linearity_min": 0.0, "linearity_max": 0.0,
+    }  # fmt: skip
+    for name, value in expected.items():
+        assert found[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
+
+
+def test_linearity_is_the_least_and_the_largest_relative_deviation() -> None:
+    """A square term of 2 % at saturation, against numpy's weighted fit of the same points."""
+    photons = np.linspace(100, 10_000, 50)
+    signal = photons * (1 - 0.02 * photons / 10_000)
+    variance = np.append(np.linspace(1, 50, 49), 0.0)
+    flat, zero = np.zeros(()), Stack(*(np.ones(()) for _ in range(4)))
+    session = Session(
+        (9, 9), photons, Pair(signal, variance, 0 * signal), Pair(flat, flat, flat), flat,
+        np.arange(3.0), Pair(np.zeros(3), np.zeros(3), np.zeros(3)), zero,
+        Stack(np.full((), 2.0), np.ones(()), np.ones(()), np.ones(())),
+    )  # fmt: skip
+    found = figures(session)
+    used = (signal >= 0.05 * signal[48]) & (signal <= 0.95 * signal[48])
+    line = np.polynomial.polynomial.polyfit(photons[used], signal[used], 1, w=1 / signal[used])
+    off = signal[used] / (line[0] + line[1] * photons[used]) - 1
+    assert found["linearity_min"] == pytest.approx(off.min(), rel=1e-6)
+    assert found["linearity_max"] == pytest.approx(off.max(), rel=1e-6)

@@ -1,0 +1,112 @@
+"""EMVA 1288's procedure on simulated frames: what was set comes out, and predicted errors are the actual ones."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.configuration import locate
+from mitsim.core.errors import MitsimError
+from mitsim.rig.sensor import SensorModel, load_sensor
+from mitsim.study.characterise import Bench, characterise
+from tests.invented import sensor
+
+SMALL = Bench(pixels=64, steps=25, frames=16)
+PLAIN = {
+    "full_well_e": 20_000.0, "read_noise_e": 4.0, "gain_dn_per_e": 0.19, "black_level_dn": 60.0, "bits": 12,
+    "quantum_efficiency": 0.6, "dark_current_e_per_s": 5.0,
+}  # fmt: skip
+CAMERAS: dict[str, dict[str, object]] = {
+    "plain": {},
+    "nonuniform": {
+        "dsnu_pixel_e": 2.0, "dsnu_row_e": 0.8, "dsnu_column_e": 1.0, "prnu_pixel": 0.008, "prnu_row": 0.002,
+        "prnu_column": 0.004, "dark_current_spread_e_per_s": 2.0,
+    },
+    "rows and defects": {
+        "row_noise_e": 2.0, "dsnu_row_e": 1.0, "dead_pixels": 0.002, "hot_pixels": 0.002,
+        "hot_dark_current_e_per_s": 200.0, "crosstalk": 0.1,
+    },
+    "bent": {"linearity": (-0.02, 0.01), "binning": 2, "binning_on_chip": True, "binned_full_well_e": 20_000.0},
+}  # fmt: skip
+
+
+def camera(name: str) -> SensorModel:
+    return sensor(**{**PLAIN, **CAMERAS[name]})
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_what_is_set_is_found_within_five_predicted_standard_errors(name: str) -> None:
+    """(Planted: gain 2 % off in the chain; 1/12 DN^2 left in the dark noise; response before the row split.)"""
+    done = characterise(camera(name), SMALL)
+    assert not done.warnings
+    rows = {row.name: row for row in done.rows}
+    for row in done.rows:
+        assert abs(row.deviations) < 5 and row.standard_error > 0, row
+    assert rows["system_gain"].set == 0.19 and (rows["system_gain"].expected is None) == (name != "bent")
+
+
+@pytest.mark.parametrize("name", ["imx249", "imx250", "imx255", "imx477", "mt9m031", "mt9m034"])
+def test_shipped_cameras_have_sources_and_are_found_as_their_files_say(name: str) -> None:
+    model = load_sensor(locate(name, "calibration", ".toml"))
+    assert "http" in model.source
+    assert not characterise(model, SMALL).warnings
+
+
+def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> None:
+    """Twelve sessions of a nonuniform camera: each figure's deviations, as a chi-square of 12 (significance 1e-4 each).
+
+    (Planted: a pair's variance with the error of one frame's; specimens' own errors left out.)
+    """
+    off = np.array(
+        [
+            [
+                row.deviations
+                for row in characterise(
+                    camera("nonuniform").model_copy(update={"pattern_seed": seed}), Bench(48, 20, 8, seed)
+                ).rows
+            ]
+            for seed in range(12)
+        ]
+    )
+    squares = np.square(off).sum(axis=0)
+    names = [row.name for row in characterise(camera("plain"), Bench(48, 20, 8)).rows]
+    for name, value in zip(names, squares, strict=True):
+        # The largest variance falls on the same step in all: its figure is known to a step, not to its noise.
+        least = 0.0 if name == "saturation_capacity" else 1.6
+        assert least < value < 39, (name, value)
+    assert np.square(off).mean() == pytest.approx(1, abs=0.45)
+
+
+def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mitsim.study import characterise as module
+
+    frames = module.expose
+    monkeypatch.setattr(module, "expose", lambda light, *rest: np.rint(60 + 1.2 * (frames(light, *rest) - 60.0)))
+    done = characterise(camera("plain"), SMALL)
+    assert any(line.startswith("system_gain: found 0.22") for line in done.warnings)
+
+
+def test_json_and_plots_lie_in_the_folder(tmp_path: Path) -> None:
+    done = characterise(camera("plain"), Bench(32, 20, 2), tmp_path / "found")
+    assert sorted(path.name for path in (tmp_path / "found").glob("[!.]*")) == [
+        "characterise.json", "dark_current.png", "deviations.png", "linearity.png", "photon_transfer.png",
+    ]  # fmt: skip
+    written = json.loads((tmp_path / "found" / "characterise.json").read_text())
+    assert written["kind"] == "characterise" and written["pixels"] == 32
+    assert [figure["name"] for figure in written["figures"]] == [row.name for row in done.rows]
+    assert done.lines()[-1] == f"JSON and plots: {tmp_path / 'found'}"
+
+
+def test_without_a_quantum_efficiency_light_is_counted_in_electrons() -> None:
+    done = characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), Bench(32, 20, 2))
+    assert "quantum_efficiency" not in {row.name for row in done.rows} and done.rows[0].name == "system_gain"
+
+
+def test_what_cannot_be_characterised_is_refused() -> None:
+    with pytest.raises(MitsimError, match="no light saturates it"):
+        characterise(sensor(full_well_e=math.inf))
+    for values, name in (({"pixels": 8}, "pixels"), ({"steps": 5}, "steps"), ({"frames": 1}, "frames")):
+        with pytest.raises(MitsimError, match=name):
+            Bench(**values)
