@@ -1,0 +1,102 @@
+"""`mitsim sense`: an image of irradiance or radiance behind a camera's sensor."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsim.capture.request import Exposure
+from mitsim.capture.sense import check_ending, irradiance_behind_lens, read_image, sense
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import read_frame, write_frame
+from mitsim.sensor import chain, moments
+from tests.invented import sensor
+
+CAMERA = sensor(
+    full_well_e=8000.0, read_noise_e=3.0, gain_dn_per_e=0.47, black_level_dn=200.0, bits=12, quantum_efficiency=0.5
+)
+IMAGE = np.linspace(0, 2e-6, 60 * 80).reshape(60, 80)
+
+
+def test_an_image_is_exposed_and_read_as_a_capture_s_frame() -> None:
+    """Auto exposure fills 0.8 of the well at the brightest pixel; squared z-scores of all 4800 pixels, 5 deviations."""
+    frame = sense(IMAGE, CAMERA, seed=3)
+    assert frame.exposure_s == chain.exposure_for_peak(2e-6, 0.8, CAMERA, 550.0)
+    assert frame.electrons.max() == pytest.approx(6400, rel=1e-12)
+    mean, variance = moments.frame_moments(frame.electrons, frame.exposure_s, CAMERA)
+    squares = float((np.square(frame.digital - mean) / variance).sum())
+    assert abs(squares - IMAGE.size) < 5 * math.sqrt(2 * IMAGE.size)
+    assert np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=3).digital)
+    assert not np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=4).digital)
+    assert not frame.warnings and frame.summary()["shape"] == [60, 80]
+
+
+def test_seconds_by_hand_and_saturation_are_as_a_capture_has_them() -> None:
+    auto = sense(IMAGE, CAMERA)
+    longer = sense(IMAGE, CAMERA, Exposure(2 * auto.exposure_s))
+    np.testing.assert_allclose(longer.electrons, 2 * auto.electrons)
+    # Beyond 8000 of 12 800 electrons: the upper 3/8 of the pixels, half of those at the well itself by read noise.
+    assert 0.17 < longer.saturated / IMAGE.size < 0.39
+    assert "saturation" in longer.warnings[0]
+
+
+def test_a_lens_of_f_number_n_images_radiance_l_as_pi_l_over_4_n_squared() -> None:
+    assert irradiance_behind_lens(np.array([[4.0]]), 2.0)[0, 0] == pytest.approx(math.pi / 4)
+    with pytest.raises(MitsimError, match="f_number"):
+        irradiance_behind_lens(IMAGE, 0.1)
+
+
+@pytest.mark.parametrize("ending", [".png", ".exr", ".npy"])
+def test_numbers_are_written_whole_in_every_format(tmp_path: Path, ending: str) -> None:
+    frame = sense(IMAGE, CAMERA)
+    path = frame.save(tmp_path / f"frame{ending}")
+    if ending == ".exr":
+        channels, facts = read_frame(path)
+        numbers = channels["DN"]
+        assert facts["exposure_s"] == frame.exposure_s and set(channels) == {"DN", "electrons"}
+    else:
+        numbers = np.load(path) if ending == ".npy" else np.asarray(Image.open(path))
+    assert np.array_equal(numbers, frame.digital)
+
+
+def test_images_of_other_renderers_are_read(tmp_path: Path) -> None:
+    parts = {name: np.full((2, 3), value, np.float32) for name, value in (("R", 1.0), ("G", 2.0), ("B", 4.0))}
+    write_frame(tmp_path / "rgb.exr", parts, {})
+    light, notes = read_image(tmp_path / "rgb.exr")
+    np.testing.assert_allclose(light, 0.2126 + 2 * 0.7152 + 4 * 0.0722, rtol=1e-6)
+    assert "luminance" in notes[0] and read_image(tmp_path / "rgb.exr", "G")[0][0, 0] == 2
+    write_frame(tmp_path / "render.exr", {"Y": parts["R"], "error.Y": parts["B"]}, {})
+    assert read_image(tmp_path / "render.exr")[0].max() == 1 and not read_image(tmp_path / "render.exr")[1]
+    np.save(tmp_path / "image.npy", IMAGE)
+    assert np.array_equal(read_image(tmp_path / "image.npy")[0], IMAGE)
+
+
+def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
+    write_frame(tmp_path / "two.exr", {name: np.ones((2, 2), np.float32) for name in "ab"}, {})
+    for name, channel, message in (
+        ("two.exr", None, "a, b"),
+        ("two.exr", "c", "no channel 'c'"),
+        ("x.jpg", None, "OpenEXR"),
+    ):
+        with pytest.raises(MitsimError, match=message):
+            read_image(tmp_path / name, channel)
+    (tmp_path / "bad.npy").write_text("no array")
+    with pytest.raises(MitsimError, match="not an array"):
+        read_image(tmp_path / "bad.npy")
+    for image in (np.array([[1.0, -1.0]]), np.array([[math.nan]]), np.ones(3), np.ones((0, 2))):
+        with pytest.raises(MitsimError, match="image"):
+            sense(image, CAMERA)
+    with pytest.raises(MitsimError, match="quantum_efficiency"):
+        sense(IMAGE, sensor(quantum_efficiency=None))
+    with pytest.raises(MitsimError, match="wavelength"):
+        sense(IMAGE, CAMERA, wavelength_nm=0.0)
+
+
+def test_a_png_holds_16_bits(tmp_path: Path) -> None:
+    for model in (sensor(bits=None), sensor(bits=16, binning=2)):
+        with pytest.raises(MitsimError, match="16 bits end"):
+            check_ending(tmp_path / "x.png", model)
+    with pytest.raises(MitsimError, match="ends in"):
+        check_ending(tmp_path / "x.jpg")
