@@ -21,7 +21,7 @@ import pytest
 from mitsim.study import accuracy, solver
 from mitsim.study.solver_cost import make_problem, time_solver
 
-VERBS = ("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "doctor")
+VERBS = ("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "doctor")
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 
 
@@ -187,6 +187,22 @@ def test_doctor(call: Callable[..., Any]) -> None:
     found = call("doctor", "--json", "--quiet", "--variant", "llvm_ad_mono").payload
     assert found["ok"] is True and len(found["checks"]) == 9, found
     assert all({"name", "ok", "detail", "remedy"} <= check.keys() for check in found["checks"])
+
+
+def test_characterise_and_sense(call: Callable[..., Any], tmp_path: Path) -> None:
+    small = "--pixels", 32, "--steps", 20, "--frames", 2, "--json", "--quiet", "--variant", "llvm_ad_mono"
+    found = call("characterise", "imx477", "-o", tmp_path / "figures", *small).payload
+    assert {"camera", "pixels", "steps", "frames", "seed", "exposure_s", "warnings", "output"} <= found.keys()
+    for figure in found["figures"]:
+        assert {"name", "symbol", "unit", "set", "expected", "found", "standard_error", "deviations"} == figure.keys()
+        assert number(figure["standard_error"]) and isinstance(figure["found"], float)
+    np.save(tmp_path / "image.npy", np.full((4, 6), 1e-6))
+    options = "--camera", "imx249", "-o", tmp_path / "frame.png", "--json", "--quiet", "--variant", "llvm_ad_mono"
+    sensed = call("sense", tmp_path / "image.npy", *options).payload
+    assert sensed["shape"] == [4, 6] and (tmp_path / "frame.png").is_file() and sensed["saturated_pixels"] == 0
+    assert {"camera", "exposure_s", "wavelength_nm", "seed", "mean_dn", "largest_dn", "notes"} <= sensed.keys()
+    refused = call("sense", tmp_path / "image.npy", "--camera", "imx477", "-o", tmp_path / "other.png")
+    assert refused.code == 2 and "quantum_efficiency" in refused.err and not (tmp_path / "other.png").exists()
 
 
 # ---- exit statuses ---------------------------------------------------------------------------------------------------
