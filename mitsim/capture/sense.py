@@ -30,6 +30,7 @@ ENDINGS = (".png", ".exr", ".npy")
 _LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
 """Weights of linear RGB in luminance (ITU-R BT.709)."""
 _LARGEST_PNG = 2**16 - 1
+"""What 16 bits of grey hold."""
 _WAVELENGTHS_NM = 1.0, 1e6
 """As a projector's."""
 
