@@ -48,6 +48,7 @@ docs/notebooks/index
 docs/architecture
 docs/physics
 docs/formats
+docs/exchange
 docs/studies
 docs/extending
 docs/robustness

@@ -24,6 +24,7 @@ import pytest
 
 import mitsim
 from mitsim.core.configuration import shipped
+from tests.exchanged import made
 from tests.robustness import Recorder, Row, page_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -176,7 +177,19 @@ def measured_responses() -> dict[str, object]:
     }
 
 
-GIVEN: dict[str, Callable[[], dict[str, object]]] = {"docs/formats.md": measured_responses}
+def exchanged_file() -> dict[str, object]:
+    """The file that docs/exchange.md reads."""
+    from mitsim.exchange.export import export_run
+
+    bench = made(Path())
+    export_run(bench.run, "hdf5", "all.h5", bench.calibration)
+    return {}
+
+
+GIVEN: dict[str, Callable[[], dict[str, object]]] = {
+    "docs/formats.md": measured_responses,
+    "docs/exchange.md": exchanged_file,
+}
 SLOW = {"README.md"}
 
 

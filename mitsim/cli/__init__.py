@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 
 import mitsim
+from mitsim.cli import exchange
 from mitsim.cli.options import (
     DAY,
     Accuracy,
@@ -438,6 +439,9 @@ def _only(scenes: list[str] | None) -> str | None:
     if scenes and len(scenes) > 1:
         raise MitsimError(f"{' '.join(scenes)}: give one scene")
     return scenes[0] if scenes else None
+
+
+app.registered_commands += exchange.app.registered_commands
 
 
 @app.command()

@@ -11,7 +11,7 @@ from mitsim.core.errors import MitsimError, cut
 from mitsim.core.output import whole_file
 from mitsim.core.plainfile import read_text
 
-_MOST_BYTES = 32 << 20
+MOST_BYTES = 32 << 20
 """A little more than the largest manifest that a capture writes: 65536 shots of 4096 x 256 patterns make 29 MB."""
 
 
@@ -35,10 +35,14 @@ def plain(value: Any) -> Any:
     raise TypeError(f"plain: {value!r} is {type(value).__name__}, which JSON cannot hold; convert it first")
 
 
+def json_text(obj: Any) -> str:
+    """``obj`` (see :func:`plain`) as indented JSON."""
+    return json.dumps(plain(obj), indent=1, allow_nan=False) + "\n"
+
+
 def write_json(path: Path | str, obj: Any) -> None:
-    """Write ``obj`` (see :func:`plain`) to ``path`` as indented JSON, all or nothing. MitsimError when the file cannot
-    be written."""
-    text = json.dumps(plain(obj), indent=1, allow_nan=False) + "\n"
+    """Write ``obj`` to ``path`` as :func:`json_text`, all or nothing. MitsimError when the file cannot be written."""
+    text = json_text(obj)
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
 
@@ -64,6 +68,6 @@ def read_json(path: Path | str) -> Any:
     """The object in the JSON file ``path`` of at most 32 MiB. MitsimError when it cannot be read, is not JSON, or has a
     key twice."""
     try:
-        return parse_json(read_text(path, _MOST_BYTES))
+        return parse_json(read_text(path, MOST_BYTES))
     except ValueError as error:
         raise MitsimError(f"file {path}: not valid JSON ({error}); write or copy it again") from error

@@ -34,6 +34,8 @@ if TYPE_CHECKING:  # and where it computes: numpy takes 0.1 s to import, and a r
     from mitsim.core.arrays import FloatArray
 
 MANIFEST = "manifest.json"
+SIDES = ("left", "right")
+"""The two factors of a calibration, as their files in a CAL folder are called."""
 FORMAT = 1
 """Number of the format that is written here and the newest that is read."""
 MOST_PIXELS = 4096
@@ -385,13 +387,33 @@ def read_manifest(folder: Path, model: type[Manifest]) -> Manifest:
     if not folder.is_dir():
         command = {"capture": "capture", "calibration": "calibrate"}[kind]
         raise MitsimError(f"{folder}: no such folder; give the output of `mitsim {command}`")
-    data = read_json(folder / MANIFEST)
+    return checked_manifest(read_json(folder / MANIFEST), model, folder)
+
+
+def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
+    """The manifest of a finished run or calibration.
+
+    Parameters
+    ----------
+    data
+        as JSON holds it.
+    model
+        of the manifest that it is to be.
+    place
+        where it was found, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when it is of another kind, unfinished, or breaks a rule of its format.
+    """
+    kind = model.model_fields["kind"].default
     if not isinstance(data, dict) or data.get("kind") != kind:
         actual = data.get("kind") if isinstance(data, dict) else type(data).__name__
-        raise MitsimError(f"{folder}: holds a {cut(str(actual))}, not a {kind}; give the right folder")
+        raise MitsimError(f"{place}: holds a {cut(str(actual))}, not a {kind}; give the right folder")
     if data.get("status") != "complete":
-        raise MitsimError(f"{folder}: the {kind} is {cut(str(data.get('status')))}; finish it with resume=True")
-    return validated(model, data, f"{folder}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
+        raise MitsimError(f"{place}: the {kind} is {cut(str(data.get('status')))}; finish it with resume=True")
+    return validated(model, data, f"{place}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
 
 
 def read_head(folder: Path) -> RunHead:

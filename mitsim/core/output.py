@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -96,6 +97,22 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
             with suppress(OSError):  # not empty: what was written stays
                 folder.rmdir()
         raise
+
+
+@contextmanager
+def whole_folder(path: Path | str) -> Iterator[Path]:
+    """The new or empty folder ``path``, for files that appear together: after an error none of them is left.
+
+    MitsimError as for :func:`output_folder`.
+    """
+    with output_folder(path) as folder:
+        try:
+            yield folder
+        except BaseException:
+            for item in folder.iterdir():
+                if item.name != LOCK:
+                    shutil.rmtree(item) if item.is_dir() and not item.is_symlink() else item.unlink()
+            raise
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from mitsim.core.framefile import Channel, Channels, Metadata, checksum, finite_
 from mitsim.core.manifests import MANIFEST, RunManifest, read_manifest
 from mitsim.core.measurement import Ambient, Measurement
 from mitsim.core.pictures import card, scaled, span
-from mitsim.core.recorders import AMBIENT, TRUTH, Recorder, claimed
+from mitsim.core.recorders import TRUTH, Recorder, claimed, frame_name
 
 _SHOWN = 3
 """Frames that a notebook shows: with the truth they fill a line."""
@@ -49,10 +49,10 @@ class Capture:
         folder
             that holds the files.
         memory
-            channels and metadata by file name, instead of a folder.
+            channels and metadata by file name, instead of a folder; read as they are asked for.
         """
         self.manifest, self.folder = manifest, folder
-        self._memory = dict(memory or {})
+        self._memory = memory or {}
 
     @classmethod
     def recorded(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
@@ -73,24 +73,23 @@ class Capture:
     def electrons(self) -> Channel | None:
         """(shots, rows, columns) expected photoelectrons; None for a real camera, whose expectation nobody knows."""
         first = self.manifest.patterns.captures[0].file
-        return self._stacked("electrons") if "electrons" in self._read(first)[0] else None
+        return self._stacked("electrons") if "electrons" in self.read(first)[0] else None
 
     @cached_property
     def truth(self) -> FloatArray | None:
         """(n, n) apparent reflectance, relative to the board of :attr:`truth_board`; None for a real camera."""
-        known = TRUTH in self._memory if self.folder is None else (self.folder / TRUTH).is_file()
-        return self._channel(TRUTH, "reflectance") if known else None
+        return self._channel(TRUTH, "reflectance") if self._has_truth else None
 
     @cached_property
     def truth_standard_error(self) -> FloatArray | None:
         """(n, n) standard error of :attr:`truth`, from sampling; None where nobody stated it, as in 0.4.0."""
-        known = self.truth is not None and "standard_error" in self._read(TRUTH)[0]
+        known = self.truth is not None and "standard_error" in self.read(TRUTH)[0]
         return self._channel(TRUTH, "standard_error") if known else None
 
     @property
     def truth_board(self) -> float | None:
         """Reflectance of the board that counts as 1 in :attr:`truth`, where that is known."""
-        board = None if self.truth is None else self._read(TRUTH)[1].get("board_reflectance")
+        board = None if self.truth is None else self.read(TRUTH)[1].get("board_reflectance")
         return None if board is None else float(board)
 
     @property
@@ -161,9 +160,25 @@ class Capture:
             )
         return light - ambient
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the capture's files: its shots', the ambient frame's and the truth's, where there are such."""
+        ambient = self.manifest.ambient_frame
+        names = [shot.file for shot in self.manifest.patterns.captures] + ([] if ambient is None else [ambient.file])
+        return (*names, TRUTH) if self._has_truth else tuple(names)
+
+    def read(self, name: str) -> tuple[Channels, Metadata]:
+        """Channels and metadata of one of the :attr:`files`, by its ``name``. MitsimError for one that is missing or
+        damaged."""
+        if self.folder is None:
+            return self._memory[name]
+        verify(self.folder, name, self.manifest.checksums, "capture it again with resume=True")
+        return read_frame(self.folder / name)
+
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 that captures of the same frames share, in memory or on disk."""
+        """SHA-256 that captures of the same frames share: of mitsim's in memory or on disk, of a real camera's in the
+        same place."""
         manifest = self.manifest
         # What is not stated is left out: folders of 0.4.0 keep their fingerprints.
         digest = hashlib.sha256(manifest.digital.model_dump_json(exclude_defaults=True).encode())
@@ -176,6 +191,8 @@ class Capture:
             if self.folder and not (manifest.configuration_sha256 and file in manifest.checksums):
                 verify(self.folder, file, {}, "")  # no link out of it
                 digest.update(checksum(self.folder / file).encode())
+            elif not self.folder and not manifest.configuration_sha256:
+                digest.update(self.read(file)[0]["DN"].tobytes())
         return digest.hexdigest()
 
     def summary(self) -> dict[str, Any]:
@@ -214,17 +231,15 @@ class Capture:
         """
         with claimed(Path(folder), self.manifest, resume=False) as run:
             if self.folder is not None:
-                ambient = self.manifest.ambient_frame
-                also = () if ambient is None else (ambient.file,)
-                for name in (*(shot.file for shot in self.manifest.patterns.captures), *also, TRUTH, MANIFEST):
+                for name in (*self.files, MANIFEST):
                     if (self.folder / name).is_file():
                         shutil.copyfile(self.folder / name, run.folder / name)
             else:
                 run.begin()
-                for index, shot in enumerate(self.manifest.patterns.captures):
-                    run.write_frame(index, *self._memory[shot.file])
-                for name in (TRUTH, AMBIENT):
-                    if name in self._memory:
+                for index, name in enumerate(self.files):
+                    if name == frame_name(index):
+                        run.write_frame(index, *self._memory[name])
+                    else:
                         run.write(name, *self._memory[name])
                 run.finish(self.manifest)
         return run.folder
@@ -244,6 +259,10 @@ class Capture:
         return card(f"Capture: {self._family}", {**pictures, **truth}, (facts, *self.warnings))
 
     @property
+    def _has_truth(self) -> bool:
+        return TRUTH in self._memory if self.folder is None else (self.folder / TRUTH).is_file()
+
+    @property
     def _family(self) -> str:
         return self.manifest.patterns.family or "patterns"
 
@@ -253,22 +272,18 @@ class Capture:
         rows, columns = self._channel(shots[0].file, "DN").shape
         return f"{len(shots)} shots of {rows} x {columns} pixels"
 
-    def _read(self, name: str) -> tuple[Channels, Metadata]:
-        if self.folder is None:
-            return self._memory[name]
-        verify(self.folder, name, self.manifest.checksums, "capture it again with resume=True")
-        return read_frame(self.folder / name)
-
     def _channel(self, name: str, channel: str) -> FloatArray:
-        return finite_channel(self._read(name)[0], channel, self.folder / name if self.folder else Path(name))
+        return finite_channel(self.read(name)[0], channel, self.folder / name if self.folder else Path(name))
 
     def _stacked(self, channel: str) -> Channel:
         shots = self.manifest.patterns.captures
-        stack: Channel = np.array([self._read(shot.file)[0][channel] for shot in shots])
-        if self.folder is None:  # one copy: the shots become views of the stack
+        stack: Channel = np.array([self.read(shot.file)[0][channel] for shot in shots])
+        if self.folder is None and isinstance(self._memory, dict):  # one copy: the shots become views of the stack
+            known = self._memory.copy()
             for shot, values in zip(shots, stack, strict=True):
-                channels, metadata = self._memory[shot.file]
-                self._memory[shot.file] = {**channels, channel: values}, metadata
+                channels, metadata = known[shot.file]
+                known[shot.file] = {**channels, channel: values}, metadata
+            self._memory = known
         return stack
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,8 +13,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.framefile import checksum, finite_channel, read_frame, verify, write_frame
-from mitsim.core.manifests import CalibrationManifest, FactorNoise, read_manifest, write_manifest
+from mitsim.core.framefile import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
+from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.output import output_folder
 from mitsim.core.pictures import card, scaled, span
 from mitsim.core.runs import Capture
@@ -25,8 +25,6 @@ from mitsim.rig.patterns import PatternFamily, parse_patterns
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
-
-_FILES = ("left", "right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +105,9 @@ class Factors:
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:
             metadata["reflectance"] = self.manifest.board_reflectance
-        for name, factor in zip(_FILES, (self.left, self.right), strict=True):
+        for name, factor in zip(SIDES, (self.left, self.right), strict=True):
             write_frame(folder / f"{name}.exr", {"factor": factor.astype(np.float32)}, metadata)
-        checksums = {f"{name}.exr": checksum(folder / f"{name}.exr") for name in _FILES}
+        checksums = {f"{name}.exr": checksum(folder / f"{name}.exr") for name in SIDES}
         write_manifest(folder, self.manifest.model_copy(update={"checksums": checksums, "status": "complete"}))
         return folder
 
@@ -201,7 +199,7 @@ class Factors:
         return card(f"Factors: {self.status.verdict.value}", pictures, (str(self.status), *self.warnings))
 
     def _sides(self) -> tuple[tuple[str, FloatArray], ...]:
-        return tuple(zip(_FILES, (self.left, self.right), strict=True))
+        return tuple(zip(SIDES, (self.left, self.right), strict=True))
 
 
 def _factor_noise(estimate: Estimate) -> FactorNoise | None:
@@ -219,12 +217,36 @@ def load_calibration(folder: Path | str) -> Factors:
     """The factors in the CAL folder ``folder``. MitsimError when it is not a complete calibration."""
     folder = Path(folder)
     manifest = read_manifest(folder, CalibrationManifest)
-    factors = []
-    for name in _FILES:
-        verify(folder, f"{name}.exr", manifest.checksums, "calibrate again")
-        path = folder / f"{name}.exr"
-        factors.append(finite_channel(read_frame(path)[0], "factor", path))
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        """Channels and metadata of the file ``name``."""
+        verify(folder, name, manifest.checksums, "calibrate again")
+        return read_frame(folder / name)
+
+    return factors_of(manifest, read, str(folder))
+
+
+def factors_of(
+    manifest: CalibrationManifest, read: Callable[[str], tuple[Channels, Metadata]], name: str = "in memory"
+) -> Factors:
+    """Factors from a calibration's manifest and files.
+
+    Parameters
+    ----------
+    manifest
+        of the calibration.
+    read
+        channels and metadata of a file, by its name.
+    name
+        where they lie, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when a factor is not there, or not finite.
+    """
+    left, right = (finite_channel(read(f"{side}.exr")[0], "factor", Path(name) / f"{side}.exr") for side in SIDES)
     sentence = manifest.estimate or "Factors from elsewhere, without a word on how good they are"
     known = {verdict.value: verdict for verdict in Verdict}
     status = Status(known.get(manifest.verdict or "", Verdict.UNKNOWN), sentence.rstrip("."))
-    return Factors(factors[0], factors[1], manifest, status, str(folder))
+    return Factors(left, right, manifest, status, name)

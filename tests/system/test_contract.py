@@ -21,7 +21,10 @@ import pytest
 from mitsim.study import accuracy, solver
 from mitsim.study.solver_cost import make_problem, time_solver
 
-VERBS = ("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "doctor")
+VERBS = (
+    *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "export"),
+    *("import", "doctor"),
+)
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 
 

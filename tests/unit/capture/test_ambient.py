@@ -147,7 +147,7 @@ def test_its_noise_is_what_it_says(light: Light, captured: Capture) -> None:
 
 def test_it_is_taken_off_each_frame(captured: Capture) -> None:
     """Measurements have the mean of the projector's light: residuals of 16 x 4096 pixels within five deviations."""
-    off = captured._read("ambient.exr")[0]["electrons"].astype(float)
+    off = captured.read("ambient.exr")[0]["electrons"].astype(float)
     scores = []
     for index, (rate, _, _) in enumerate(captured.measurements()):
         expected = (captured.electrons[index] - off) / captured.exposure_s
@@ -228,7 +228,7 @@ def test_a_sky_and_a_lamp_brighter_than_the_projector(small_scene: Callable[...,
     shots = bright.capture("dots:2", accuracy=0.1, effects="-diffraction,-interreflection")
     block = shots.manifest.ambient_frame
     assert block is not None and block.part > 0.9
-    off = shots._read("ambient.exr")[0]["electrons"].astype(float) / shots.exposure_s
+    off = shots.read("ambient.exr")[0]["electrons"].astype(float) / shots.exposure_s
     light = shots.electrons / shots.exposure_s - off
     noise = np.stack([rate for rate, _, _ in shots.measurements()]) - light
     assert np.linalg.norm(noise) / np.linalg.norm(light) == pytest.approx(block.noise, rel=0.05)

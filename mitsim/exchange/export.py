@@ -1,0 +1,108 @@
+"""A RUN folder, and perhaps a CAL folder, in; one file, or one folder, of a format that other programs read out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mitsim.core.errors import ArgumentError
+from mitsim.core.manifests import CalibrationManifest, RunManifest
+from mitsim.core.output import prepare_output
+from mitsim.exchange.packed import Packed, packed_calibration, packed_run
+
+Run = Packed[RunManifest]
+Calibration = Packed[CalibrationManifest]
+Written = tuple[str, ...]
+"""Sentences on what of the run the format does not hold, or how it is used."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format that runs are exported to.
+
+    Attributes
+    ----------
+    what
+        that a user gets, in a few words.
+    kind
+        whether it is one file or a folder.
+    calibration
+        whether a calibration is needed, or may be given.
+    write
+        from the place, the run and the calibration to what is said about them.
+    """
+
+    what: str
+    kind: Literal["file", "folder"]
+    calibration: Literal["needed", "optional", "none"]
+    write: Callable[[Path, Run, Calibration | None], Written]
+
+
+def _hdf5(path: Path, run: Run, calibration: Calibration | None) -> Written:
+    from mitsim.exchange.hdf5 import write_hdf5
+
+    write_hdf5(path, run, calibration)
+    return ()
+
+
+FORMATS: dict[str, Format] = {
+    "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", _hdf5),
+}
+"""Formats by the name that `--format` takes."""
+
+
+def export_run(
+    run: Path | str,
+    format: str,
+    output: Path | str,
+    calibration: Path | str | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Write a run in a format that other programs read.
+
+    Parameters
+    ----------
+    run
+        RUN folder.
+    format
+        a key of :data:`FORMATS`.
+    output
+        file or folder to make.
+    calibration
+        CAL folder that goes with it.
+    overwrite
+        whether a file may be replaced.
+
+    Returns
+    -------
+    dict
+        `format`, `output`, `frames`, `calibration`, `notes`: what the command line prints.
+
+    Raises
+    ------
+    MitsimError
+        before anything is written, for an unknown format, a missing calibration, a place that holds something, or a
+        folder that is none; and for a run that the format cannot hold.
+    """
+    if format not in FORMATS:
+        raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
+    chosen = FORMATS[format]
+    if calibration is None and chosen.calibration == "needed":
+        raise ArgumentError("calibration", f"is not given, and {format} is of its factors; give a folder of it")
+    if calibration is not None and chosen.calibration == "none":
+        raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
+    shots = packed_run(Path(run))
+    factors = None if calibration is None else packed_calibration(Path(calibration))
+    place = Path(output)
+    if chosen.kind == "file":
+        prepare_output(place, overwrite, "file")
+    notes = chosen.write(place, shots, factors)
+    return {
+        "format": format,
+        "frames": len(shots.manifest.patterns.captures),
+        "calibration": None if calibration is None else str(calibration),
+        "notes": list(notes),
+        "output": str(place),
+    }

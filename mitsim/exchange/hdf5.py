@@ -1,0 +1,293 @@
+"""A RUN folder, and a CAL folder beside it, in one HDF5 file: folders in, the file out, and back, bit for bit.
+
+The layout stands in docs/formats.md. Shots are chunks of their own, so that one is read without the others.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitsim import __version__
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import Channels, Metadata, Value
+from mitsim.core.jsonfile import parse_json
+from mitsim.core.manifests import CalibrationManifest, RunManifest
+from mitsim.core.output import whole_file
+from mitsim.core.plainfile import check_plain
+from mitsim.core.recorders import TRUTH
+from mitsim.core.runs import Capture
+from mitsim.exchange.packed import (
+    FACTORS,
+    MOST_SIDE,
+    Packed,
+    checked_channel,
+    manifest_text,
+    shots_of,
+    unpacked,
+    unpacked_run,
+)
+
+if TYPE_CHECKING:
+    import h5py
+
+    from mitsim.reconstruct.factors import Factors
+
+LAYOUT = 1
+"""Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
+_PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
+"""Filters that every HDF5 library has; a checksum for each chunk. Higher levels of gzip take thrice the time for noise
+that does not get smaller."""
+
+
+def write_hdf5(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None = None) -> None:
+    """Write a run to one file, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        with shots of one shape.
+    calibration
+        that goes with it.
+
+    Raises
+    ------
+    MitsimError
+        for shots that differ in shape or channels, or a file that cannot be read or written.
+    """
+    import h5py
+
+    with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
+        file.attrs["mitsim_exchange"] = LAYOUT
+        file.attrs["mitsim_version"] = __version__
+        group = _begin(file, "run", run)
+        _write_shots(group, run)
+        ambient = run.manifest.ambient_frame
+        named = {} if ambient is None else {"ambient": ambient.file}
+        for name, source in {**named, "truth": TRUTH}.items():
+            if source in run.names:
+                _write_frame(group.create_group(name), *run.read(source))
+        if calibration is not None:
+            group = _begin(file, "calibration", calibration)
+            for name in FACTORS:
+                _write_frame(group.create_group(Path(name).stem), *calibration.read(name))
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeFile:
+    """An HDF5 file of :func:`write_hdf5`, open for reading; frames are read when they are asked for.
+
+    Attributes
+    ----------
+    run
+        the capture's folder, as it was.
+    calibration
+        the calibration's, where the file holds one.
+    """
+
+    run: Packed[RunManifest]
+    calibration: Packed[CalibrationManifest] | None
+
+    @property
+    def shots(self) -> Capture:
+        """The capture, its frames left in the file."""
+        return Capture(self.run.manifest, None, _Lazily(self.run))
+
+    @property
+    def factors(self) -> Factors | None:
+        """The calibration's factors, where the file holds them."""
+        if self.calibration is None:
+            return None
+        from mitsim.reconstruct.factors import factors_of
+
+        return factors_of(self.calibration.manifest, self.calibration.read, str(self.calibration.place))
+
+
+@contextmanager
+def open_hdf5(path: Path | str) -> Iterator[ExchangeFile]:
+    """The file ``path`` of :func:`write_hdf5`, while the context lasts.
+
+    MitsimError for a file that is missing or damaged, is none of these, or leads to other files.
+    """
+    import h5py
+
+    path = Path(path)
+    check_plain(path)
+    with _told(path):
+        file = h5py.File(path, "r")
+    with file:
+        with _told(path):
+            layout = file.attrs.get("mitsim_exchange")
+            if layout is None or not 1 <= int(layout) <= LAYOUT:
+                raise MitsimError(
+                    f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
+                )
+            run = _run(file, path)
+            calibration = _calibration(file, path) if "calibration" in file else None
+        yield ExchangeFile(run, calibration)
+
+
+class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
+    """Files of a folder by name, read at every look."""
+
+    def __init__(self, packed: Packed[RunManifest]) -> None:
+        self._packed = packed
+
+    def __getitem__(self, name: str) -> tuple[Channels, Metadata]:
+        if name not in self._packed.names:
+            raise KeyError(name)
+        return self._packed.read(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys(self._packed.names))
+
+    def __len__(self) -> int:
+        return len(dict.fromkeys(self._packed.names))
+
+
+def _begin(file: h5py.File, name: str, packed: Packed[Any]) -> h5py.Group:
+    group = file.create_group(name, track_order=True)
+    # Of bytes with their length: manifests outgrow an attribute, and an HDF5 text ends at its first zero.
+    text = np.frombuffer(manifest_text(packed.manifest, packed.text).encode(), dtype=np.uint8)
+    group.create_dataset("manifest", data=text, **_PACKED)
+    return group
+
+
+def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
+    captures = run.manifest.patterns.captures
+    stacks = group.create_group("shots", track_order=True)
+    metadata = []
+    for index, (_, channels, known) in enumerate(shots_of(run)):
+        for name, values in channels.items():
+            if index == 0:
+                shape = len(captures), *values.shape
+                stacks.create_dataset(name, shape, values.dtype, chunks=(1, *values.shape), **_PACKED)
+            stacks[name][index] = values
+        metadata.append(json.dumps(dict(known)))
+    group.create_dataset("metadata", data=np.array(metadata, dtype=object), dtype=_text())
+    group.create_dataset("pattern", data=np.array([(shot.row, shot.column, shot.sign) for shot in captures], np.int32))
+    group["pattern"].attrs["columns"] = "column of P_L from 0, column of P_R from 0, sign"
+    for name, matrix in zip(("P_L", "P_R"), run.manifest.patterns.matrices, strict=True):
+        group.create_dataset(name, data=matrix, **_PACKED)
+
+
+def _write_frame(group: h5py.Group, channels: Channels, metadata: Metadata) -> None:
+    for name, values in channels.items():
+        group.create_dataset(name, data=values, **_PACKED)
+    group.create_dataset("metadata", data=np.array([json.dumps(dict(metadata))], dtype=object), dtype=_text())
+
+
+def _text() -> Any:
+    import h5py
+
+    return h5py.string_dtype("utf-8")
+
+
+def _run(file: h5py.File, path: Path) -> Packed[RunManifest]:
+    group = _group(file, "run", path)
+    text = _manifest(group, path)
+    manifest = unpacked_run(text, path)
+    captures, ambient = manifest.patterns.captures, manifest.ambient_frame
+    stacks = _group(group, "shots", path)
+    channels = {name: _dataset(stacks, name, path) for name in stacks}
+    shapes = {values.shape for values in channels.values()}
+    if "DN" not in channels or len(shapes) != 1 or next(iter(shapes))[0] != len(captures):
+        raise MitsimError(
+            f"{path}: /run/shots holds arrays of shapes {sorted(shapes)}; one shape of {len(captures)} x rows x "
+            "columns, DN among them, is needed"
+        )
+    metadata = _dataset(group, "metadata", path)
+    index = {shot.file: number for number, shot in enumerate(captures)}
+    others = ({ambient.file: "ambient"} if ambient else {}) | ({TRUTH: "truth"} if "truth" in group else {})
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        """Channels and metadata of the file ``name``."""
+        with _told(path):
+            if name in others:
+                return _frame(_group(group, others[name], path), path)
+            number = index[name]
+            frame = {
+                key: checked_channel(values[number], f"/run/shots/{key}", path) for key, values in channels.items()
+            }
+            return frame, _metadata(metadata, number, path)
+
+    return Packed(manifest, text, (*(shot.file for shot in captures), *others), read, path)
+
+
+def _calibration(file: h5py.File, path: Path) -> Packed[CalibrationManifest]:
+    group = _group(file, "calibration", path)
+    text = _manifest(group, path)
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        """Channels and metadata of the file ``name``."""
+        with _told(path):
+            return _frame(_group(group, Path(name).stem, path), path)
+
+    return Packed(unpacked(text, CalibrationManifest, path), text, FACTORS, read, path)
+
+
+def _manifest(group: h5py.Group, path: Path) -> str:
+    return str(np.asarray(_dataset(group, "manifest", path)[()], dtype=np.uint8).tobytes().decode("utf-8"))
+
+
+def _frame(group: h5py.Group, path: Path) -> tuple[Channels, Metadata]:
+    names = [name for name in group if name != "metadata"]
+    arrays = {name: _dataset(group, name, path) for name in names}
+    channels = {name: checked_channel(array[()], f"{group.name}/{name}", path) for name, array in arrays.items()}
+    return channels, _metadata(_dataset(group, "metadata", path), 0, path)
+
+
+def _metadata(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
+    known = parse_json(texts[number].decode("utf-8"))
+    if not isinstance(known, dict) or not all(isinstance(value, (str, int, float)) for value in known.values()):
+        raise MitsimError(f"{path}: metadata of a frame is no object of texts and numbers; export it again")
+    return known
+
+
+def _group(parent: h5py.Group, name: str, path: Path) -> h5py.Group:
+    import h5py
+
+    return _inside(parent, name, h5py.Group, path)
+
+
+def _dataset(parent: h5py.Group, name: str, path: Path) -> h5py.Dataset:
+    import h5py
+
+    dataset = _inside(parent, name, h5py.Dataset, path)
+    if dataset.is_virtual or dataset.external:
+        raise MitsimError(f"{path}: {dataset.name} lies in another file; export it again")
+    if max(dataset.shape[1:], default=0) > MOST_SIDE:
+        raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}; at most {MOST_SIDE} a side are allowed")
+    return dataset
+
+
+def _inside(parent: h5py.Group, name: str, kind: Callable[..., Any], path: Path) -> Any:
+    """What stands under ``name`` in the file itself, of that ``kind``."""
+    import h5py
+
+    link = parent.get(name, getlink=True) if name in parent else None
+    if not isinstance(link, h5py.HardLink):
+        reason = "is missing" if link is None else "is a link"
+        raise MitsimError(f"{path}: {parent.name.rstrip('/')}/{name} {reason}; export it again")
+    item = parent[name]
+    if not isinstance(item, kind):  # type: ignore[arg-type]
+        raise MitsimError(f"{path}: {item.name} is a {type(item).__name__.lower()}; export it again")
+    return item
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """What h5py finds wrong with a file, in one line."""
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        reason = " ".join(str(error).split())
+        raise MitsimError(f"{path}: damaged, or no HDF5 file ({reason}); write or copy it again") from error

@@ -1,0 +1,86 @@
+"""A file that `mitsim export` wrote in; the RUN and CAL folders that it was made of out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mitsim.core.errors import ArgumentError
+from mitsim.core.manifests import CalibrationManifest, RunManifest
+from mitsim.core.output import whole_folder
+from mitsim.exchange.packed import Packed
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """What an exchanged file holds.
+
+    Attributes
+    ----------
+    run, calibration
+        content of the folders, where the file has them.
+    left_out
+        parts of a run that the file does not hold.
+    """
+
+    run: Packed[RunManifest] | None
+    calibration: Packed[CalibrationManifest] | None
+    left_out: tuple[str, ...] = ()
+
+
+@contextmanager
+def _hdf5(path: Path) -> Iterator[Loaded]:
+    from mitsim.exchange.hdf5 import open_hdf5
+
+    with open_hdf5(path) as file:
+        yield Loaded(file.run, file.calibration)
+
+
+READERS: dict[str, Callable[[Path], Any]] = {".h5": _hdf5, ".hdf5": _hdf5}
+"""What opens a file, by the end of its name."""
+
+_CALLED = {"output": "run", "calibration_output": "calibration"}
+"""What the folder of an argument is, in messages."""
+
+
+def import_file(source: Path, output: Path | None, calibration_output: Path | None = None) -> dict[str, Any]:
+    """Write the folders that a file of `mitsim export` holds, each whole or not at all.
+
+    Parameters
+    ----------
+    source
+        the file.
+    output
+        RUN folder to make; None: only the calibration is wanted.
+    calibration_output
+        CAL folder to make; None: the file's calibration, if it has one, is not wanted.
+
+    Returns
+    -------
+    dict
+        `frames`, `output`, `calibration_output`, `holds`, `left_out`: what the command line prints.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is none or is damaged, a part that it does not hold, or a place that holds something.
+    """
+    with READERS[source.suffix.lower()](source) as loaded:
+        wanted = {"output": (output, loaded.run), "calibration_output": (calibration_output, loaded.calibration)}
+        for argument, (place, held) in wanted.items():
+            if place is not None and held is None:
+                raise ArgumentError(argument, f"{place}: {source} holds no {_CALLED[argument]}; leave this out")
+        with ExitStack() as stack:
+            folders = [(stack.enter_context(whole_folder(place)), held) for place, held in wanted.values() if place]
+            for folder, held in folders:
+                held.fill(folder)
+    return {
+        "frames": None if loaded.run is None else len(loaded.run.manifest.patterns.captures),
+        "output": None if output is None else str(output),
+        "calibration_output": None if calibration_output is None else str(calibration_output),
+        "holds": [name for name, (_, held) in zip(("run", "calibration"), wanted.values(), strict=True) if held],
+        "left_out": list(loaded.left_out),
+    }

@@ -1,0 +1,200 @@
+"""A RUN or CAL folder in, its manifest and files by name out; or the other way, from wherever they were kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from mitsim.core.errors import MitsimError, cut
+from mitsim.core.framefile import Channel, Channels, Metadata, checksum, read_frame, verify, write_frame
+from mitsim.core.jsonfile import MOST_BYTES, json_text, parse_json
+from mitsim.core.manifests import (
+    MANIFEST,
+    SIDES,
+    CalibrationManifest,
+    RunManifest,
+    ShotFile,
+    checked_manifest,
+    read_manifest,
+    write_manifest,
+)
+from mitsim.core.output import LOCK, whole_folder
+from mitsim.core.plainfile import read_text
+from mitsim.core.recorders import TRUTH
+from mitsim.core.runs import load_run
+
+Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
+Reader = Callable[[str], tuple[Channels, Metadata]]
+"""Channels and metadata of a file, by its name."""
+FACTORS = tuple(f"{name}.exr" for name in SIDES)
+"""Names of a CAL folder's files: the left factor's and the right one's."""
+_OWN = frozenset((".", "..", MANIFEST, LOCK, TRUTH))
+"""Names that no frame may have."""
+MOST_SIDE = 16384
+"""Pixels a side of the largest frame that is read, as of OpenEXR files."""
+
+
+@dataclass(frozen=True, eq=False)
+class Packed(Generic[Manifest]):
+    """A folder's content, its files read when they are asked for.
+
+    Attributes
+    ----------
+    manifest
+        of the folder.
+    text
+        of its `manifest.json`, letter by letter; empty where only the model is known.
+    names
+        of its files.
+    read
+        channels, (rows, columns) each, and metadata of a file, by its name.
+    place
+        folder or file that it was found in, for messages.
+    """
+
+    manifest: Manifest
+    text: str
+    names: tuple[str, ...]
+    read: Reader
+    place: Path
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the ``folder``, new or empty, whole or not at all; returns it. MitsimError where that cannot be
+        written, or a file cannot be read."""
+        with whole_folder(folder) as place:
+            self.fill(place)
+        return Path(folder)
+
+    def fill(self, folder: Path) -> None:
+        """Write all files into a ``folder`` that this process holds (:func:`mitsim.core.output.whole_folder`).
+
+        The manifest is written letter by letter, but for checksums of files whose bytes are others now: OpenEXR of
+        another version, or channels that the exchange left out.
+        """
+        for name in dict.fromkeys(self.names):
+            write_frame(folder / name, *self.read(name))
+        stated = self.manifest.checksums
+        sums = {name: checksum(folder / name) for name in stated if name in self.names}
+        if sums == stated and self.text:
+            (folder / MANIFEST).write_text(self.text, encoding="utf-8")
+        else:
+            write_manifest(folder, self.manifest.model_copy(update={"checksums": sums}))
+
+
+def packed_run(folder: Path) -> Packed[RunManifest]:
+    """The RUN ``folder``. MitsimError when it is not a complete one."""
+    shots = load_run(folder)
+    return Packed(shots.manifest, _text_of(folder), shots.files, shots.read, folder)
+
+
+def packed_calibration(folder: Path) -> Packed[CalibrationManifest]:
+    """The CAL ``folder``. MitsimError when it is not a complete one."""
+    manifest = read_manifest(folder, CalibrationManifest)
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        """Channels and metadata of the file ``name``."""
+        verify(folder, name, manifest.checksums, "calibrate again")
+        return read_frame(folder / name)
+
+    for name in FACTORS:
+        if "factor" not in read(name)[0]:
+            raise MitsimError(f"{folder / name}: channels are {', '.join(read(name)[0])}; factor is needed")
+    return Packed(manifest, _text_of(folder), FACTORS, read, folder)
+
+
+def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Metadata]]:
+    """Every shot of a ``run`` with its channels, (rows, columns) each, and metadata, read one at a time.
+
+    MitsimError for a shot without DN, or of another shape or other channels than the first: elsewhere one array holds
+    them all.
+    """
+    first: Mapping[str, tuple[object, ...]] | None = None
+    for shot in run.manifest.patterns.captures:
+        channels, metadata = run.read(shot.file)
+        kinds = {name: (values.dtype.name, *values.shape) for name, values in sorted(channels.items())}
+        first = first or kinds
+        if "DN" not in kinds or kinds != first:
+            raise MitsimError(
+                f"{run.place / shot.file}: holds {_told(kinds)}, but the first frame {_told(first)}; frames of one "
+                "shape with the same channels, DN among them, can be exchanged"
+            )
+        yield shot, channels, metadata
+
+
+def unpacked(text: str, model: type[Manifest], place: Path) -> Manifest:
+    """The manifest in the ``text`` that an exchanged file holds.
+
+    Parameters
+    ----------
+    text
+        of a `manifest.json`.
+    model
+        of the manifest.
+    place
+        the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when it is not JSON, or breaks a rule of its format.
+    """
+    try:
+        if len(text) > MOST_BYTES:
+            raise ValueError(f"it has {len(text)} letters; at most {MOST_BYTES} are allowed")
+        data = parse_json(text)
+    except ValueError as error:
+        raise MitsimError(f"{place}: its manifest is not valid JSON ({error}); export it again") from error
+    return checked_manifest(data, model, place)
+
+
+def unpacked_run(text: str, place: Path) -> RunManifest:
+    """The manifest of a run in the ``text`` that an exchanged file holds, found at ``place``; with names of frames that
+    a folder can have. MitsimError as for :func:`unpacked`."""
+    manifest = unpacked(text, RunManifest, place)
+    ambient = manifest.ambient_frame
+    for name in (*(shot.file for shot in manifest.patterns.captures), *([ambient.file] if ambient else [])):
+        if name in _OWN or not name.isprintable():
+            raise MitsimError(f"{place}: a frame is called {cut(name)!r}; give it a name of its own")
+    return manifest
+
+
+def manifest_text(manifest: RunManifest | CalibrationManifest, text: str) -> str:
+    """The ``text`` of a manifest's file, or, where there is none, that of the ``manifest``."""
+    return text or json_text(manifest)
+
+
+def checked_channel(values: object, name: str, place: Path) -> Channel:
+    """An array of an exchanged file as a channel of a frame.
+
+    Parameters
+    ----------
+    values
+        (rows, columns) float32 or uint32.
+    name
+        of the channel, for messages.
+    place
+        the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for another type or shape.
+    """
+    array = np.asarray(values)
+    if array.dtype not in (np.float32, np.uint32) or array.ndim != 2 or not 0 < max(array.shape) <= MOST_SIDE:
+        raise MitsimError(
+            f"{place}: {name} is {array.dtype} of shape {array.shape}; float32 or uint32 of rows x columns is needed"
+        )
+    return np.ascontiguousarray(array)
+
+
+def _text_of(folder: Path) -> str:
+    return read_text(folder / MANIFEST, MOST_BYTES)
+
+
+def _told(kinds: Mapping[str, tuple[object, ...]]) -> str:
+    return ", ".join(f"{name} ({' '.join(map(str, kind))})" for name, kind in kinds.items())

@@ -1,0 +1,160 @@
+"""A run in one HDF5 file: folders come back to the byte, frames are read one at a time, and no file leads astray."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import read_frame, write_frame
+from mitsim.exchange import packed
+from mitsim.exchange.export import export_run
+from mitsim.exchange.hdf5 import open_hdf5
+from mitsim.exchange.load import import_file
+from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Made:
+    return made(tmp_path, ambient=True)
+
+
+def exported(bench: Made, tmp_path: Path) -> Path:
+    export_run(bench.run, "hdf5", tmp_path / "all.h5", bench.calibration)
+    return tmp_path / "all.h5"
+
+
+@pytest.mark.parametrize("case", ["dots", "signed", "real output", "ambient"])
+def test_folders_come_back_to_the_byte(case: str, tmp_path: Path) -> None:
+    """Frames, truth, ambient frame, metadata and manifests. (Planted: metadata of frames left out; the manifest written
+    from its model, which puts `null` where a field is not stated.)"""
+    bench = made(tmp_path, signed=case == "signed", ambient=case == "ambient", real_output=case == "real output")
+    # As other programs write it: what comes back is the file, not what its model says.
+    manifest = json.loads((bench.calibration / "manifest.json").read_text())
+    (bench.calibration / "manifest.json").write_text(json.dumps({key: manifest[key] for key in sorted(manifest)}))
+    result = import_file(exported(bench, tmp_path), tmp_path / "run 2", tmp_path / "cal 2")
+    assert bytes_of(tmp_path / "run 2") == bytes_of(bench.run)
+    assert bytes_of(tmp_path / "cal 2") == bytes_of(bench.calibration)
+    assert result["holds"] == ["run", "calibration"] and result["left_out"] == []
+
+
+def test_the_layout_is_that_of_the_documentation(bench: Made, tmp_path: Path) -> None:
+    shots = ms.load_run(bench.run)
+    with h5py.File(exported(bench, tmp_path), "r") as file:
+        assert file.attrs["mitsim_exchange"] == 1
+        assert file["run/shots/DN"].shape == (6, ROWS, COLUMNS) and file["run/shots/DN"].chunks == (1, ROWS, COLUMNS)
+        assert np.array_equal(file["run/shots/DN"], shots.dn)
+        assert np.array_equal(file["run/P_R"], shots.patterns[1]) and file["run/P_L"].shape == (SCENE[0], 2)
+        assert file["run/pattern"][4].tolist() == [1, 1, 0]
+        assert json.loads(file["run/metadata"][4])["index"] == 4
+        assert np.array_equal(file["run/truth/reflectance"], bench.scene.astype(np.float32))
+        assert file["calibration/right/factor"].shape == (COLUMNS, SCENE[1])
+        assert file["run/manifest"][()].tobytes().decode() == (bench.run / "manifest.json").read_text()
+
+
+def test_an_open_file_is_a_capture_and_factors_without_a_folder(bench: Made, tmp_path: Path) -> None:
+    """The image is that of the folders, bit for bit; a copy saved from it is the folder."""
+    image = ms.reconstruct(ms.load_run(bench.run), ms.load_calibration(bench.calibration))
+    with open_hdf5(exported(bench, tmp_path)) as file:
+        again = ms.reconstruct(file.shots, file.factors)
+        assert file.shots.fingerprint == ms.load_run(bench.run).fingerprint
+        file.shots.save(tmp_path / "saved")
+    assert np.array_equal(again.image, image.image) and again.lam == image.lam
+    assert bytes_of(tmp_path / "saved") == bytes_of(bench.run)
+
+
+def test_a_shot_is_read_without_the_others(bench: Made, tmp_path: Path) -> None:
+    """(Planted: the stack fetched as a whole.)"""
+    path = exported(bench, tmp_path)
+    with h5py.File(path, "r") as file:
+        place, size = file["run/shots/DN"].id.get_chunk_info(3)[2:4]
+    damaged = bytearray(path.read_bytes())
+    damaged[place + size // 2] ^= 0xFF
+    path.write_bytes(damaged)
+    with open_hdf5(path) as file:
+        names = [shot.file for shot in file.run.manifest.patterns.captures]
+        for index in (0, 1, 2, 4, 5):
+            assert np.array_equal(file.run.read(names[index])[0]["DN"], read_frame(bench.run / names[index])[0]["DN"])
+        with pytest.raises(MitsimError, match="damaged"):
+            file.run.read(names[3])
+
+
+def test_a_damaged_file_leaves_no_folder(bench: Made, tmp_path: Path) -> None:
+    """Not the calibration's either, which was whole. (Planted: each folder finished before the next.)"""
+    path = exported(bench, tmp_path)
+    with h5py.File(path, "r") as file:
+        place, size = file["run/shots/electrons"].id.get_chunk_info(5)[2:4]
+    damaged = bytearray(path.read_bytes())
+    damaged[place + size // 2] ^= 0xFF
+    path.write_bytes(damaged)
+    with pytest.raises(MitsimError, match="damaged"):
+        import_file(path, tmp_path / "run 2", tmp_path / "cal 2")
+    assert not (tmp_path / "run 2").exists() and not (tmp_path / "cal 2").exists()
+
+
+def edit(path: Path, what: str) -> None:
+    with h5py.File(path, "a") as file:
+        if what == "another program's":
+            del file.attrs["mitsim_exchange"]
+        elif what == "newer":
+            file.attrs["mitsim_exchange"] = 2
+        elif what == "an outside link":
+            del file["run/truth"]
+            file["run/truth"] = h5py.ExternalLink("/etc/passwd", "/")
+        elif what == "fewer shots":
+            few = file["run/shots/DN"][:5]
+            del file["run/shots/DN"]
+            file["run/shots/DN"] = few
+        else:
+            text = file["run/manifest"][()].tobytes().replace(b'"frame_00002.exr"', b'"manifest.json"  ')
+            del file["run/manifest"]
+            file["run/manifest"] = np.frombuffer(text, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("another program's", "no HDF5 file of `mitsim export`"),
+        ("newer", "mitsim_exchange is 2"),
+        ("an outside link", "/run/truth is a link"),
+        ("fewer shots", "6 x rows x columns"),
+        ("a frame for a manifest", "a frame is called 'manifest.json'"),
+    ],
+)
+def test_a_file_that_is_no_run_is_refused(bench: Made, tmp_path: Path, what: str, words: str) -> None:
+    path = exported(bench, tmp_path)
+    edit(path, what)
+    with pytest.raises(MitsimError, match=words):
+        import_file(path, tmp_path / "run 2")
+    assert not (tmp_path / "run 2").exists()
+
+
+def test_what_is_no_hdf5_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_bytes(b"not this")
+    with pytest.raises(MitsimError, match="no HDF5 file"):
+        import_file(tmp_path / "a.h5", tmp_path / "run 2")
+    with pytest.raises(MitsimError, match="cannot be read"):
+        import_file(tmp_path / "b.h5", tmp_path / "run 2")
+
+
+def test_frames_that_differ_in_shape_are_refused_and_no_file_is_left(bench: Made, tmp_path: Path) -> None:
+    manifest = json.loads((bench.run / "manifest.json").read_text())
+    (bench.run / "manifest.json").write_text(json.dumps({**manifest, "checksums": {}}))
+    write_frame(bench.run / "frame_00003.exr", {"DN": np.ones((3, 4), np.uint32)}, {})
+    with pytest.raises(MitsimError, match=r"frame_00003.exr: holds DN \(uint32 3 4\)"):
+        exported(bench, tmp_path)
+    assert not (tmp_path / "all.h5").exists() and not list(tmp_path.glob(".*"))
+
+
+def test_checksums_follow_the_bytes_that_were_written(bench: Made, tmp_path: Path) -> None:
+    """Where OpenEXR writes otherwise the folder is still one that can be read."""
+    run = packed.packed_run(bench.run)
+    other = packed.Packed(run.manifest, run.text, run.names, lambda name: (run.read(name)[0], {}), run.place)
+    shots = ms.load_run(other.save(tmp_path / "run 2"))
+    assert np.array_equal(shots.dn, ms.load_run(bench.run).dn)
+    assert shots.manifest.checksums != run.manifest.checksums
