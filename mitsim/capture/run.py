@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -34,6 +33,7 @@ from mitsim.core.recorders import AMBIENT, Recorder, RunMemory, claimed, frame_n
 from mitsim.core.runs import Capture
 from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import ExpectedFrames
+from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.rig.recipe import load_recipe
 
@@ -250,18 +250,7 @@ def _record_ambient(recorder: Recorder, ambient: AmbientFrame, exposer: Exposer)
 
 def digital_scale(bench: Bench, exposure_s: float) -> DigitalScale:
     """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
-    sensor = bench.sensor
-    full = sensor.full_well_dn
-    largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
-    return DigitalScale(
-        exposure_s=exposure_s,
-        black_level_dn=sensor.superpixel_black_level_dn,
-        gain_dn_per_e=sensor.gain_dn_per_e,
-        dark_current_e_per_s=sensor.superpixel_dark_current_e_per_s,
-        read_noise_e=sensor.superpixel_reading_noise_e,
-        step_dn=0.0 if sensor.largest_dn is None else 1.0,
-        saturation_dn=None if math.isinf(min(full, largest)) else float(min(np.floor(full), largest)),
-    )
+    return digital_of(bench.sensor, exposure_s)
 
 
 def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from mitsim.cli.options import Json, Quiet, Variant
+from mitsim.cli.options import Json, Projector, Quiet, Seed, Variant
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 
 app = typer.Typer()
 
@@ -18,11 +18,12 @@ app = typer.Typer()
 @app.command("export")
 def export(
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
-    format: Annotated[str, typer.Option(help="hdf5", metavar="FORMAT")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="file to make", metavar="FILE")],
+    format: Annotated[str, typer.Option(help="hdf5, mat, flatcam or png", metavar="FORMAT")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="file to make; of png, a folder", metavar="FILE")],
     calibration: Annotated[
         Path | None, typer.Option(help="folder of `mitsim calibrate` that goes with it", metavar="CAL")
     ] = None,
+    projector: Projector = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
@@ -31,7 +32,7 @@ def export(
     """Write a run in a format that other programs read."""
     from mitsim.exchange.export import export_run
 
-    payload = export_run(run, format, output, calibration, overwrite)
+    payload = export_run(run, format, output, calibration, overwrite, projector)
     with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
     lines = [f"{payload['frames']} frames{with_it} as {format}: {payload['output']}", *payload["notes"]]
     return finish(as_json, payload, lines, ())
@@ -39,23 +40,73 @@ def export(
 
 @app.command("import")
 def import_(
-    source: Annotated[Path, typer.Argument(help="file of `mitsim export`", metavar="FILE")],
+    source: Annotated[
+        Path, typer.Argument(help="file of `mitsim export`, or frames: a folder of them, or one file", metavar="SOURCE")
+    ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")] = None,
     calibration_output: Annotated[
         Path | None, typer.Option(help="folder to make of the file's calibration", metavar="CAL")
     ] = None,
+    patterns: Annotated[
+        str | None, typer.Option(help="of frames: the family, or patterns.json of export", metavar="NAME|FILE")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="of frames: camera electronics, name or TOML file", metavar="NAME|FILE")
+    ] = None,
+    exposure: Annotated[float | None, typer.Option(help="of frames: seconds of each", metavar="SECONDS")] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="of frames: calibration of the same camera, for its identity", metavar="CAL")
+    ] = None,
+    projector_pixels: Annotated[
+        int | None, typer.Option(help="of frames: projector pixels a side, without a calibration", metavar="N")
+    ] = None,
+    black_level: Annotated[
+        float | None, typer.Option(help="of frames: number of a pixel without charge; the camera's if not given")
+    ] = None,
+    ambient_frame: Annotated[
+        Path | None, typer.Option(help="frame, or folder of frames, with the projector off", metavar="PATH")
+    ] = None,
+    ambient_shots: Annotated[
+        int | None, typer.Option(help="shots that a single such frame is the mean of", metavar="N")
+    ] = None,
+    shape: Annotated[
+        str | None, typer.Option(help="of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
+    ] = None,
+    bits: Annotated[int | None, typer.Option(help="of a number in such a file", metavar="N")] = None,
+    byte_order: Annotated[str, typer.Option(help="of such a file: little or big")] = "little",
+    channel: Annotated[
+        str | None, typer.Option(help="plane of a colour sensor, as FlatCam names it", metavar="r|gb|gr|b")
+    ] = None,
+    seed: Seed = 0,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """Make a run folder of a file that `mitsim export` wrote."""
+    """Make a run folder of a real camera's frames, or of a file that `mitsim export` wrote."""
     from mitsim.exchange.load import READERS, import_file
 
     if output is None and calibration_output is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
-    if source.suffix.lower() not in READERS:
-        raise MitsimError(f"{source}: is no file that is read; give one that ends in {', '.join(READERS)}")
-    payload = import_file(source, output, calibration_output)
+    payload: dict[str, Any]
+    of_frames = patterns, camera, exposure
+    if source.suffix.lower() in READERS:
+        if any(value is not None for value in (*of_frames, calibration, shape, ambient_frame, black_level)):
+            raise MitsimError(f"{source}: says itself what its frames are; leave the options of frames out")
+        payload = import_file(source, output, calibration_output, channel)
+    else:
+        from mitsim.exchange.frames import Raw
+        from mitsim.exchange.real import RealCapture, import_frames
+
+        if output is None or calibration_output is not None:
+            raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
+        for name, value in zip(("patterns", "camera", "exposure"), of_frames, strict=True):
+            if value is None:
+                raise ArgumentError(name, "is not given, and frames do not say it; give it")
+        raw = None if shape is None else Raw.of(shape, bits, byte_order)
+        if patterns is None or camera is None or exposure is None:
+            raise AssertionError  # refused above
+        more = calibration, projector_pixels, black_level, ambient_frame, ambient_shots, raw, channel, seed
+        payload = import_frames(source, output, RealCapture(patterns, camera, exposure, *more))
     lines = []
     if payload["output"]:
         lines.append(f"{payload['frames']} frames: {payload['output']}")
@@ -64,5 +115,5 @@ def import_(
     elif "calibration" in payload["holds"]:
         lines.append("The file holds a calibration too; give --calibration-output to have it")
     if payload["left_out"]:
-        lines.append(f"Not in the file, and left out: {', '.join(payload['left_out'])}")
-    return finish(as_json, payload, lines, ())
+        lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
+    return finish(as_json, payload, lines, payload["warnings"])

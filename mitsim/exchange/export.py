@@ -31,24 +31,50 @@ class Format:
     calibration
         whether a calibration is needed, or may be given.
     write
-        from the place, the run and the calibration to what is said about them.
+        from the place, the run, the calibration and a projector's name to what is said about them.
     """
 
     what: str
     kind: Literal["file", "folder"]
     calibration: Literal["needed", "optional", "none"]
-    write: Callable[[Path, Run, Calibration | None], Written]
+    write: Callable[[Path, Run, Calibration | None, str | None], Written]
 
 
-def _hdf5(path: Path, run: Run, calibration: Calibration | None) -> Written:
+def _hdf5(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
     from mitsim.exchange.hdf5 import write_hdf5
 
     write_hdf5(path, run, calibration)
     return ()
 
 
+def _mat(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
+    from mitsim.exchange.matlab import ELECTRONS, write_matlab
+
+    write_matlab(path, run, calibration)
+    without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
+    return (*without, f"Left out: {ELECTRONS}")
+
+
+def _flatcam(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
+    from mitsim.exchange.flatcam import write_flatcam
+    from mitsim.exchange.matlab import ELECTRONS
+
+    if calibration is not None:  # what export_run has seen to
+        write_flatcam(path, run, calibration)
+    return (f"Left out: {ELECTRONS}",)
+
+
+def _png(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
+    from mitsim.exchange.pngs import write_pngs
+
+    return write_pngs(path, run, projector)
+
+
 FORMATS: dict[str, Format] = {
     "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", _hdf5),
+    "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", _mat),
+    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", _flatcam),
+    "png": Format("frames as pictures, patterns for a real projector", "folder", "none", _png),
 }
 """Formats by the name that `--format` takes."""
 
@@ -59,6 +85,7 @@ def export_run(
     output: Path | str,
     calibration: Path | str | None = None,
     overwrite: bool = False,
+    projector: str | None = None,
 ) -> dict[str, Any]:
     """Write a run in a format that other programs read.
 
@@ -74,6 +101,8 @@ def export_run(
         CAL folder that goes with it.
     overwrite
         whether a file may be replaced.
+    projector
+        name or TOML file whose raster pictures are drawn for, of `png` alone; None: the run's own.
 
     Returns
     -------
@@ -89,6 +118,8 @@ def export_run(
     if format not in FORMATS:
         raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
     chosen = FORMATS[format]
+    if projector is not None and format != "png":
+        raise ArgumentError("projector", f"{projector}: {format} draws no pictures for one; leave it out")
     if calibration is None and chosen.calibration == "needed":
         raise ArgumentError("calibration", f"is not given, and {format} is of its factors; give a folder of it")
     if calibration is not None and chosen.calibration == "none":
@@ -98,7 +129,7 @@ def export_run(
     place = Path(output)
     if chosen.kind == "file":
         prepare_output(place, overwrite, "file")
-    notes = chosen.write(place, shots, factors)
+    notes = chosen.write(place, shots, factors, projector)
     return {
         "format": format,
         "frames": len(shots.manifest.patterns.captures),

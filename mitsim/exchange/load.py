@@ -32,21 +32,37 @@ class Loaded:
 
 
 @contextmanager
-def _hdf5(path: Path) -> Iterator[Loaded]:
+def _hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
     from mitsim.exchange.hdf5 import open_hdf5
 
+    if channel is not None:
+        raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
     with open_hdf5(path) as file:
         yield Loaded(file.run, file.calibration)
 
 
-READERS: dict[str, Callable[[Path], Any]] = {".h5": _hdf5, ".hdf5": _hdf5}
+@contextmanager
+def _matlab(path: Path, channel: str | None) -> Iterator[Loaded]:
+    from mitsim.exchange.flatcam import flatcam_calibration, read_flatcam
+    from mitsim.exchange.matlab import ELECTRONS, names_in, read_matlab
+
+    if channel is not None:
+        yield Loaded(None, flatcam_calibration(path, channel))
+    else:
+        run, calibration = (read_flatcam if "meas" in names_in(path) else read_matlab)(path)
+        yield Loaded(run, calibration, (ELECTRONS,))
+
+
+READERS: dict[str, Callable[[Path, str | None], Any]] = {".h5": _hdf5, ".hdf5": _hdf5, ".mat": _matlab}
 """What opens a file, by the end of its name."""
 
 _CALLED = {"output": "run", "calibration_output": "calibration"}
 """What the folder of an argument is, in messages."""
 
 
-def import_file(source: Path, output: Path | None, calibration_output: Path | None = None) -> dict[str, Any]:
+def import_file(
+    source: Path, output: Path | None, calibration_output: Path | None = None, channel: str | None = None
+) -> dict[str, Any]:
     """Write the folders that a file of `mitsim export` holds, each whole or not at all.
 
     Parameters
@@ -57,18 +73,20 @@ def import_file(source: Path, output: Path | None, calibration_output: Path | No
         RUN folder to make; None: only the calibration is wanted.
     calibration_output
         CAL folder to make; None: the file's calibration, if it has one, is not wanted.
+    channel
+        plane of a real FlatCam's calibration that is taken.
 
     Returns
     -------
     dict
-        `frames`, `output`, `calibration_output`, `holds`, `left_out`: what the command line prints.
+        `frames`, `output`, `calibration_output`, `holds`, `left_out`, `warnings`: what the command line prints.
 
     Raises
     ------
     MitsimError
         for a file that is none or is damaged, a part that it does not hold, or a place that holds something.
     """
-    with READERS[source.suffix.lower()](source) as loaded:
+    with READERS[source.suffix.lower()](source, channel) as loaded:
         wanted = {"output": (output, loaded.run), "calibration_output": (calibration_output, loaded.calibration)}
         for argument, (place, held) in wanted.items():
             if place is not None and held is None:
@@ -83,4 +101,7 @@ def import_file(source: Path, output: Path | None, calibration_output: Path | No
         "calibration_output": None if calibration_output is None else str(calibration_output),
         "holds": [name for name, (_, held) in zip(("run", "calibration"), wanted.values(), strict=True) if held],
         "left_out": list(loaded.left_out),
+        "warnings": []
+        if calibration_output is None or not loaded.calibration
+        else [*loaded.calibration.manifest.warnings],
     }

@@ -1,0 +1,376 @@
+"""A run in one MATLAB file with the variables of the paper's public script: folders in, the file out, and back.
+
+`phi_left` (P o X) `phi_right`' = `data_coded` - `measBg` in digital numbers, for each pattern P = PL(:, i) PR(:, j)'
+(Zheng & Asif, arXiv 2111.12862, section III-B). Files are of version 5, which SciPy, GNU Octave and every MATLAB read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import Channel, Channels, Metadata
+from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
+from mitsim.core.output import whole_file
+from mitsim.core.plainfile import check_plain
+from mitsim.core.recorders import TRUTH
+from mitsim.exchange.packed import FACTORS, Packed, checked_channel, manifest_text, shots_of, unpacked, unpacked_run
+
+Variables = Mapping[str, Any]
+LARGEST_VARIABLE = (1 << 31) - 1
+"""Bytes of an array in a file of version 5."""
+_TEXTS = {"run_manifest": "run", "calibration_manifest": "calibration"}
+"""Variables that hold manifests."""
+ELECTRONS = "expected electrons of the frames"
+"""What such a file does not hold of a simulated run."""
+
+
+def write_matlab(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> None:
+    """Write a run with the paper's variables, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        of whole shots, or of signed pairs.
+    calibration
+        that goes with it; without one `phi_left` and `phi_right` are left out.
+
+    Raises
+    ------
+    MitsimError
+        for a run that mixes whole shots and pairs, or is larger than such a file may be.
+    """
+    variables = _frames(run)
+    variables["PL"], variables["PR"] = run.manifest.patterns.matrices
+    if calibration is not None:
+        scale = dn_per_rate(run.manifest.digital)
+        for side, factor in factors_in_dn(calibration, scale).items():
+            variables[f"phi_{side}"] = factor
+    write_variables(path, {**variables, **of_folders(run, calibration)})
+
+
+def read_matlab(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
+    """Run and calibration in the file ``path`` of :func:`write_matlab`.
+
+    MitsimError for a file that is none, or is damaged.
+    """
+    variables = read_variables(path)
+    manifest = unpacked_run(text_in(variables, "run_manifest", path), path)
+    return _run(variables, manifest, path), calibration_in(variables, manifest.digital, path)
+
+
+def of_folders(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
+    """Variables of every MATLAB file: manifests, truth and ambient frame.
+
+    Parameters
+    ----------
+    run, calibration
+        that are exported.
+    """
+    variables: dict[str, Any] = {"run_manifest": manifest_text(run.manifest, run.text)}
+    if calibration is not None:
+        variables["calibration_manifest"] = manifest_text(calibration.manifest, calibration.text)
+    ambient = run.manifest.ambient_frame
+    if ambient is not None:
+        variables["ambient"] = run.read(ambient.file)[0]["DN"]
+    if TRUTH in run.names:
+        variables["truth"] = run.read(TRUTH)[0]["reflectance"]
+        variables["truth_board_reflectance"] = float(run.read(TRUTH)[1].get("board_reflectance", math.nan))
+        if "standard_error" in run.read(TRUTH)[0]:
+            variables["truth_standard_error"] = run.read(TRUTH)[0]["standard_error"]
+    return variables
+
+
+def dn_per_rate(digital: Digital) -> float:
+    """Digital numbers of a photoelectron a second, in frames that are read as ``digital`` says."""
+    return digital.gain_dn_per_e * digital.exposure_s
+
+
+def factors_in_dn(calibration: Packed[CalibrationManifest], scale: float) -> dict[str, FloatArray]:
+    """Both factors [sqrt(DN)] by side, (pixels, n).
+
+    Parameters
+    ----------
+    calibration
+        with factors [sqrt(electrons / s)].
+    scale
+        as of :func:`dn_per_rate`.
+    """
+    return {
+        side: calibration.read(name)[0]["factor"].astype(np.float64) * math.sqrt(scale)
+        for side, name in zip(SIDES, FACTORS, strict=True)
+    }
+
+
+def write_variables(path: Path, variables: Variables) -> None:
+    """Write ``variables`` to a MATLAB file at ``path``, whole or not at all.
+
+    MitsimError for an array that is larger than such files hold.
+    """
+    from scipy.io import savemat
+
+    for name, values in variables.items():
+        if getattr(values, "nbytes", 0) > LARGEST_VARIABLE:
+            raise MitsimError(
+                f"{path}: {name} takes {values.nbytes / 2**30:.3g} GiB, and MATLAB files of version 5 hold 2; "
+                "use the format hdf5"
+            )
+    # A descriptor: given a name, savemat puts .mat behind it.
+    with whole_file(path) as part, part.open("wb") as file:
+        savemat(file, dict(variables), do_compression=True, long_field_names=True)
+
+
+def names_in(path: Path) -> frozenset[str]:
+    """Names of the variables in the MATLAB file ``path``; MitsimError as for :func:`read_variables`."""
+    from scipy.io import whosmat
+
+    return frozenset(name for name, *_ in _looked_into(path, whosmat))
+
+
+def read_variables(path: Path) -> dict[str, Any]:
+    """The variables of the MATLAB file ``path``.
+
+    MitsimError for a file that is missing, damaged or of version 7.3.
+    """
+    from scipy.io import loadmat
+
+    return dict(_looked_into(path, loadmat))
+
+
+def _looked_into(path: Path, look: Callable[..., Any]) -> Any:
+    check_plain(path)
+    try:
+        with open(path, "rb") as file:
+            return look(file)
+    except NotImplementedError:
+        raise MitsimError(f"{path}: is of version 7.3; save it in MATLAB with -v7") from None
+    except Exception as error:  # SciPy's reader raises of all kinds
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
+
+
+def text_in(variables: Variables, name: str, path: Path) -> str:
+    """A text of a file.
+
+    Parameters
+    ----------
+    variables
+        of the file.
+    name
+        of the one that is wanted.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        where there is none.
+    """
+    value = np.asarray(variables.get(name))
+    if value.dtype.kind != "U" or value.size != 1:
+        raise MitsimError(
+            f"{path}: has no text {name}, so it is not of `mitsim export`; it holds "
+            f"{', '.join(key for key in variables if not key.startswith('__'))}"
+        )
+    return str(value.item())
+
+
+def array_in(variables: Variables, name: str, shape: tuple[int, ...], path: Path) -> npt.NDArray[Any]:
+    """An array of a file.
+
+    Parameters
+    ----------
+    variables
+        of the file.
+    name, shape
+        of the one that is wanted; MATLAB drops axes of length 1 at the end.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        where it is missing, or not of real numbers in that shape.
+    """
+    array = np.asarray(variables.get(name))
+    if array.dtype.kind not in "uif" or array.size != math.prod(shape):
+        told = f"is {array.dtype} of shape {array.shape}" if name in variables else "is missing"
+        raise MitsimError(f"{path}: {name} {told}; numbers of shape {shape} are needed")
+    return array.reshape(shape, order="F")
+
+
+def matrix_in(variables: Variables, name: str, path: Path) -> FloatArray:
+    """A matrix of a file, of any size.
+
+    Parameters
+    ----------
+    variables
+        of the file.
+    name
+        of the one that is wanted.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        where it is missing, or no matrix of real numbers.
+    """
+    matrix = np.asarray(variables.get(name))
+    if matrix.ndim != 2 or matrix.dtype.kind not in "uif":
+        raise MitsimError(
+            f"{path}: {name} is {'no matrix of numbers' if name in variables else 'missing'}; write it again"
+        )
+    return matrix.astype(np.float64)
+
+
+def calibration_in(variables: Variables, digital: Digital, path: Path) -> Packed[CalibrationManifest] | None:
+    """The calibration in a file; None where it holds none.
+
+    Parameters
+    ----------
+    variables
+        of the file.
+    digital
+        of the run in the file, whose unit `phi_left` and `phi_right` have.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for factors that are none.
+    """
+    if "calibration_manifest" not in variables:
+        return None
+    text = text_in(variables, "calibration_manifest", path)
+    manifest = unpacked(text, CalibrationManifest, path)
+    metadata: Metadata = {"unit": "sqrt(e-/s)"}
+    if manifest.board_reflectance is not None:
+        metadata = {**metadata, "reflectance": manifest.board_reflectance}
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        """Channels and metadata of the file ``name``."""
+        variable = f"phi_{Path(name).stem}"
+        factor = matrix_in(variables, variable, path) / math.sqrt(dn_per_rate(digital))
+        # Rounding in double precision is far below half of the last digit in single: the number is the first one.
+        return {"factor": checked_channel(factor.astype(np.float32), variable, path)}, metadata
+
+    return Packed(manifest, text, FACTORS, read, path)
+
+
+def _frames(run: Packed[RunManifest]) -> dict[str, Any]:
+    """`data_coded`, `measBg` and, of signed pairs, `data_negative`: (rows, columns, K, K') each, or (rows, columns)."""
+    manifest = run.manifest
+    signs = {abs(shot.sign) for shot in manifest.patterns.captures}
+    if len(signs) != 1:
+        raise MitsimError(f"{run.place}: mixes whole shots and signed pairs; use the format hdf5")
+    signed = signs == {1}
+    left, right = manifest.patterns.matrices
+    stacks: dict[int, FloatArray] = {}
+    for shot, channels, _ in shots_of(run):
+        dn = channels["DN"]
+        if not stacks:
+            kind = dn.dtype.name
+            shape = *dn.shape, left.shape[1], right.shape[1]
+            stacks = {sign: np.empty(shape, order="F") for sign in ((-1, 1) if signed else (0,))}
+        stacks[shot.sign][:, :, shot.row, shot.column] = dn
+    if not signed:
+        return {"data_coded": stacks[0], "dn_class": kind, "measBg": _background(run, stacks[0].shape[:2])}
+    difference = stacks[1] - stacks[-1]
+    if not np.array_equal(difference + stacks[-1], stacks[1]):
+        raise MitsimError(f"{run.place}: differences of its pairs have more digits than a double; use the format hdf5")
+    none = np.zeros(difference.shape[:2])
+    return {"data_coded": difference, "data_negative": stacks[-1], "dn_class": kind, "measBg": none}
+
+
+def _background(run: Packed[RunManifest], shape: tuple[int, ...]) -> FloatArray:
+    """(rows, columns) digital numbers of a frame without the projector's light."""
+    ambient, digital = run.manifest.ambient_frame, run.manifest.digital
+    if ambient is not None:
+        return run.read(ambient.file)[0]["DN"].astype(np.float64)
+    return np.full(shape, digital.black_level_dn + digital.dark_current_e_per_s * dn_per_rate(digital))
+
+
+def _run(variables: Variables, manifest: RunManifest, path: Path) -> Packed[RunManifest]:
+    """The run whose frames are `data_coded`."""
+    left, right = manifest.patterns.matrices
+    found = np.asarray(variables.get("data_coded"))
+    if found.ndim < 2:
+        raise MitsimError(f"{path}: data_coded is missing; export it again")
+    shape = *found.shape[:2], left.shape[1], right.shape[1]
+    data = array_in(variables, "data_coded", shape, path)
+    if any(shot.sign for shot in manifest.patterns.captures):
+        negative = array_in(variables, "data_negative", shape, path)
+        stacks = {1: data + negative, -1: negative}
+    else:
+        stacks = {0: data}
+
+    def frame(shot: ShotFile) -> npt.NDArray[Any]:
+        """The frame of a ``shot``, (rows, columns)."""
+        return np.asarray(stacks[shot.sign][:, :, shot.row, shot.column])
+
+    return run_in(variables, manifest, frame, path)
+
+
+def run_in(variables: Variables, manifest: RunManifest, frame: Any, path: Path) -> Packed[RunManifest]:
+    """A run in a MATLAB file.
+
+    Parameters
+    ----------
+    variables
+        of the file.
+    manifest
+        of the run.
+    frame
+        from a shot to its digital numbers, (rows, columns).
+    path
+        of the file, for messages.
+    """
+    captures, ambient = manifest.patterns.captures, manifest.ambient_frame
+    shots = {shot.file: shot for shot in captures}
+    kind = np.float32 if text_in(variables, "dn_class", path) == "float32" else np.uint32
+
+    def single(variable: str) -> Channel:
+        """The image called ``variable``, (rows, columns) float32."""
+        return checked_channel(matrix_in(variables, variable, path).astype(np.float32), variable, path)
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        """Channels and metadata of the file ``name``."""
+        if name in shots:
+            shot = shots[name]
+            return {"DN": _digital(frame(shot), kind, name, path)}, {
+                "row": shot.row,
+                "column": shot.column,
+                "sign": shot.sign,
+                "exposure_s": manifest.digital.exposure_s,
+            }
+        if ambient is not None and name == ambient.file:
+            known: Metadata = {"shots": ambient.shots, "exposure_s": manifest.digital.exposure_s}
+            return {"DN": single("ambient")}, known
+        channels = {"reflectance": single("truth")}
+        if "truth_standard_error" in variables:
+            channels["standard_error"] = single("truth_standard_error")
+        board = float(np.asarray(variables.get("truth_board_reflectance", math.nan)).item())
+        return channels, {} if math.isnan(board) else {"board_reflectance": board}
+
+    names = (*shots, *([ambient.file] if ambient else ()), *((TRUTH,) if "truth" in variables else ()))
+    return Packed(manifest, text_in(variables, "run_manifest", path), names, read, path)
+
+
+def _digital(values: npt.NDArray[Any], kind: Any, name: str, path: Path) -> Channel:
+    """Digital numbers (rows, columns) as a frame holds them, exactly."""
+    with np.errstate(invalid="ignore"):
+        digital = np.asarray(values).astype(kind)
+    if not np.array_equal(digital.astype(np.float64), values):
+        raise MitsimError(f"{path}: {name} has numbers that are no {np.dtype(kind).name}; export it again")
+    return checked_channel(digital, name, path)

@@ -1,0 +1,206 @@
+"""MATLAB files: the paper's and FlatCam's variables mean what they say, SciPy and Octave read them, and back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+
+import mitsim as ms
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import read_frame
+from mitsim.exchange import matlab
+from mitsim.exchange.export import export_run
+from mitsim.exchange.load import import_file
+from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
+
+CASES = ["dots", "signed", "real output", "ambient"]
+
+
+def bench_of(case: str, tmp_path: Path) -> Made:
+    return made(tmp_path, signed=case == "signed", ambient=case == "ambient", real_output=case == "real output")
+
+
+@pytest.mark.parametrize("format", ["mat", "flatcam"])
+@pytest.mark.parametrize("case", CASES)
+def test_folders_come_back_without_the_expected_electrons(format: str, case: str, tmp_path: Path) -> None:
+    """Digital numbers, ambient frame, truth, factors and manifests to the bit, and so the image. (Planted: rows of the
+    pattern's index for columns; the negative half not added again; factors divided by the scale, not by its root.)"""
+    bench = bench_of(case, tmp_path)
+    export_run(bench.run, format, tmp_path / "all.mat", bench.calibration)
+    result = import_file(tmp_path / "all.mat", tmp_path / "run 2", tmp_path / "cal 2")
+    assert result["left_out"] == [matlab.ELECTRONS]
+    first, again = ms.load_run(bench.run), ms.load_run(tmp_path / "run 2")
+    assert again.dn.dtype == first.dn.dtype and np.array_equal(again.dn, first.dn)
+    assert np.array_equal(again.truth, first.truth) and again.truth_board == first.truth_board
+    assert np.array_equal(again.truth_standard_error, first.truth_standard_error)
+    assert (again.ambient is None) == (first.ambient is None)
+    if first.ambient and again.ambient:
+        assert np.array_equal(again.ambient.rate, first.ambient.rate)
+    assert again.manifest.model_copy(update={"checksums": {}}) == first.manifest.model_copy(update={"checksums": {}})
+    assert bytes_of(tmp_path / "cal 2") == bytes_of(bench.calibration)
+    images = [
+        ms.reconstruct(shots, ms.load_calibration(folder)).image
+        for shots, folder in ((first, bench.calibration), (again, tmp_path / "cal 2"))
+    ]
+    assert np.array_equal(*images) and first.fingerprint == again.fingerprint
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_papers_variables_are_its_model(case: str, tmp_path: Path) -> None:
+    """phi_left (P o X) phi_right' = data_coded - measBg for every pattern, but for the noise, a few digital numbers."""
+    bench = bench_of(case, tmp_path)
+    export_run(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
+    held = loadmat(tmp_path / "all.mat")
+    left, right = held["PL"], held["PR"]
+    assert held["data_coded"].shape == (ROWS, COLUMNS, left.shape[1], right.shape[1])
+    for i in range(left.shape[1]):
+        for j in range(right.shape[1]):
+            lit = np.outer(left[:, i], right[:, j]) * bench.scene
+            found = held["data_coded"][:, :, i, j] - held["measBg"]
+            expected = held["phi_left"] @ lit @ held["phi_right"].T
+            # Shot and read noise of some 1e4 electrons: 40 DN at most; a wrong scale, sign or order is hundreds.
+            assert np.abs(found - expected).mean() < 0.05 * np.abs(expected).mean() + 30
+
+
+def test_flatcams_variables_are_its_model(tmp_path: Path) -> None:
+    """A plane of a frame, less its rows' and columns' means, is P1 X Q1' less noise, plane by plane as its loader takes
+    them. (Planted: gb and gr changed places; factors with their means.)"""
+    bench = made(tmp_path)
+    export_run(bench.run, "flatcam", tmp_path / "all.mat", bench.calibration)
+    held = loadmat(tmp_path / "all.mat")
+    assert held["cSize"].tolist() == [[ROWS / 2, COLUMNS / 2]] and held["angle"].item() == 0
+    lit = np.outer(held["PL"][:, 1], held["PR"][:, 2]) * bench.scene
+    frame = held["meas"][:, :, 5]
+    for name, plane in {
+        "r": frame[1::2, 1::2],
+        "gb": frame[0::2, 1::2],
+        "gr": frame[1::2, 0::2],
+        "b": frame[0::2, 0::2],
+    }.items():
+        left, right = held[f"P1{name}"], held[f"Q1{name}"]
+        assert left.shape == (ROWS / 2, SCENE[0]) and right.shape == (COLUMNS / 2, SCENE[1])
+        centred = plane - plane.mean(0) - plane.mean(1, keepdims=True) + plane.mean()
+        expected = left @ lit @ right.T
+        # What is left is noise, which other planes and factors with their means do not explain.
+        assert np.linalg.norm(centred - expected) < 0.5 * np.linalg.norm(centred)
+        assert np.abs(np.corrcoef(centred.ravel(), expected.ravel())[0, 1]) > 0.9
+
+
+def test_background_is_black_level_and_dark_current_or_the_ambient_frame(tmp_path: Path) -> None:
+    export_run(made(tmp_path / "a").run, "mat", tmp_path / "a.mat")
+    held = loadmat(tmp_path / "a.mat")
+    dark = DIGITAL.black_level_dn + DIGITAL.dark_current_e_per_s * DIGITAL.exposure_s * DIGITAL.gain_dn_per_e
+    assert np.array_equal(held["measBg"], np.full((ROWS, COLUMNS), dark)) and "phi_left" not in held
+    bench = made(tmp_path / "b", ambient=True)
+    export_run(bench.run, "mat", tmp_path / "b.mat")
+    assert np.array_equal(loadmat(tmp_path / "b.mat")["measBg"], read_frame(bench.run / "ambient.exr")[0]["DN"])
+
+
+OCTAVE = """
+a = load('all.mat');
+P = a.PL(:,2) * a.PR(:,3)';
+X = double(a.truth);
+found = a.data_coded(:,:,2,3) - a.measBg;
+expected = a.phi_left * (P .* X) * a.phi_right';
+printf('%.17g %.17g %d %d\\n', sum(found(:)), sum(expected(:)), size(a.data_coded, 1), size(a.data_coded, 4));
+m = a.run_manifest;
+printf('%s\\n', class(m));
+save('-v7', 'again.mat', '-struct', 'a');
+"""
+
+
+@pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed")
+@pytest.mark.parametrize("case", ["signed", "ambient"])
+def test_octave_reads_what_is_written_and_writes_what_is_read(case: str, tmp_path: Path) -> None:
+    bench = bench_of(case, tmp_path)
+    export_run(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
+    script = (
+        OCTAVE
+        if case == "ambient"
+        else OCTAVE.replace("(:,2)", "(:,1)").replace("(:,3)", "(:,2)").replace("2,3", "1,2")
+    )
+    done = subprocess.run(
+        ["octave-cli", "--quiet", "--norc", "--eval", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()[:2]
+    found, expected, rows, last = (float(number) for number in first.split())
+    held = loadmat(tmp_path / "all.mat")
+    index = (1, 2) if case == "ambient" else (0, 1)
+    assert found == pytest.approx(np.sum(held["data_coded"][:, :, index[0], index[1]] - held["measBg"]), rel=1e-12)
+    lit = np.outer(held["PL"][:, index[0]], held["PR"][:, index[1]]) * held["truth"].astype(np.float64)
+    model = np.sum(held["phi_left"] @ lit @ held["phi_right"].T)
+    assert expected == pytest.approx(model, rel=1e-9)
+    assert (rows, last) == (ROWS, held["PR"].shape[1])
+    assert second == "char"
+    import_file(tmp_path / "again.mat", tmp_path / "run 2", tmp_path / "cal 2")
+    assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, ms.load_run(bench.run).dn)
+    assert bytes_of(tmp_path / "cal 2") == bytes_of(bench.calibration)
+
+
+def test_files_that_are_none_are_refused_and_no_folder_is_left(tmp_path: Path) -> None:
+    bench = made(tmp_path)
+    export_run(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
+    held = {name: value for name, value in loadmat(tmp_path / "all.mat").items() if not name.startswith("__")}
+
+    def changed(words: str, **values: object) -> None:
+        savemat(tmp_path / "other.mat", {name: v for name, v in {**held, **values}.items() if v is not None})
+        with pytest.raises(MitsimError, match=words):
+            import_file(tmp_path / "other.mat", tmp_path / "run 2", tmp_path / "cal 2")
+        assert not (tmp_path / "run 2").exists() and not (tmp_path / "cal 2").exists()
+
+    changed("has no text run_manifest", run_manifest=None)
+    changed("numbers of shape", data_coded=held["data_coded"][:, :, :1])
+    changed("data_coded is missing", data_coded=None)
+    changed("no uint32", data_coded=held["data_coded"] + 0.5)
+    changed("phi_left is no matrix", phi_left="none")
+    changed("phi_right is missing", phi_right=None)
+    changed("truth is no matrix", truth="none")
+    changed("not valid JSON", run_manifest="{")
+    (tmp_path / "text.mat").write_text("phi_left")
+    with pytest.raises(MitsimError, match="no MATLAB file"):
+        import_file(tmp_path / "text.mat", tmp_path / "run 2")
+
+
+def test_a_run_larger_than_such_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matlab, "LARGEST_VARIABLE", 1000)
+    with pytest.raises(MitsimError, match=r"data_coded takes .* hdf5"):
+        export_run(made(tmp_path).run, "mat", tmp_path / "all.mat")
+    assert not (tmp_path / "all.mat").exists()
+
+
+def test_flatcam_needs_a_calibration(tmp_path: Path) -> None:
+    with pytest.raises(MitsimError, match="calibration is not given"):
+        export_run(made(tmp_path).run, "flatcam", tmp_path / "all.mat")
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["status"] == "complete"
+
+
+@pytest.mark.parametrize("angle", [0.0, -0.4])
+def test_a_plane_of_a_real_flatcams_calibration(angle: float, tmp_path: Path) -> None:
+    """Its factors are of frames without means; frames that must be turned are told. (Planted: P1 and Q1 changed places;
+    factors that are not said to be centred.)"""
+    rng = np.random.default_rng(5)
+    sides = {
+        f"{stem}{name}": rng.normal(size=size)
+        for stem, size in (("P1", (50, 16)), ("Q1", (62, 18)))
+        for name in ("r", "gb", "gr", "b")
+    }
+    savemat(tmp_path / "calib.mat", {**sides, "cSize": [[50.0, 62.0]], "angle": angle})
+    result = import_file(tmp_path / "calib.mat", None, tmp_path / "cal", "gr")
+    factors = ms.load_calibration(tmp_path / "cal")
+    assert np.array_equal(factors.left, sides["P1gr"].astype(np.float32)) and factors.right.shape == (62, 18)
+    assert factors.manifest.centre and factors.manifest.board_reflectance is None
+    assert result["holds"] == ["calibration"] and result["output"] is None
+    assert [*factors.warnings] == result["warnings"] and bool(result["warnings"]) == bool(angle)
+    for channel, place, words in (("green", "cal 2", "use r, gb, gr, b"), ("r", None, "holds no run")):
+        with pytest.raises(MitsimError, match=words):
+            import_file(
+                tmp_path / "calib.mat", None if place else tmp_path / "run", place and tmp_path / place, channel
+            )

@@ -1,0 +1,276 @@
+"""Frames of a real camera: read as they were written, put under the right pattern, or refused in a line.
+
+The frames are numpy's, of a camera and a scene of which nothing is square; what a file's reader may do to numbers
+(scale, invert, swap bytes) is tried on numbers that would show it.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+import mitsim as ms
+from mitsim.core.errors import MitsimError
+from mitsim.exchange.export import export_run
+from mitsim.exchange.frames import Raw, frame_files, frames_in
+from mitsim.exchange.real import LEFT_OUT, RealCapture, import_frames
+from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made
+
+ELECTRONICS = f"""
+name = "bench 3"
+pixel_pitch_um = 5.0
+full_well_e = 100000.0
+read_noise_e = {DIGITAL.read_noise_e}
+dark_current_e_per_s = {DIGITAL.dark_current_e_per_s}
+quantum_efficiency = 0.5
+gain_dn_per_e = {DIGITAL.gain_dn_per_e}
+black_level_dn = {DIGITAL.black_level_dn}
+bits = 16
+source = "made up"
+"""
+
+
+def known(bench: Made, patterns: str = "dots:2x3", **more: object) -> RealCapture:
+    camera = bench.run.parent / "camera.toml"
+    camera.write_text(ELECTRONICS)
+    return RealCapture(patterns, str(camera), DIGITAL.exposure_s, **{"calibration": bench.calibration, **more})
+
+
+def written(folder: Path, kind: str, frames: np.ndarray) -> RealCapture | None:
+    """Frames as a real camera's program writes them: shot 10 comes after shot 9."""
+    folder.mkdir()
+    for index, frame in enumerate(frames):
+        stem = folder / f"shot {index + 5}"
+        if kind == "raw":
+            frame.astype(">u2").tofile(f"{stem}.raw")
+        elif kind == "npy":
+            np.save(f"{stem}.npy", frame)
+        elif kind == "big-endian tiff":
+            values = Image.frombytes("I;16B", frame.shape[::-1], frame.astype(">u2").tobytes())
+            values.save(f"{stem}.tif")
+        else:
+            Image.fromarray(frame.astype(np.uint16)).save(f"{stem}.{kind}")
+
+
+@pytest.mark.parametrize("kind", ["png", "tif", "big-endian tiff", "npy", "raw"])
+def test_frames_give_the_image_of_the_run_that_they_are_of(kind: str, tmp_path: Path) -> None:
+    """To the bit. (Planted: files in the order of the alphabet; bytes of a number changed places.)"""
+    bench = made(tmp_path)
+    shots = ms.load_run(bench.run)
+    written(tmp_path / "frames", kind, shots.dn)
+    raw = Raw.of(f"{ROWS}x{COLUMNS}", 16, "big") if kind == "raw" else None
+    result = import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, raw=raw))
+    again, factors = ms.load_run(tmp_path / "run 2"), ms.load_calibration(bench.calibration)
+    assert result["left_out"] == list(LEFT_OUT) and result["shape"] == [ROWS, COLUMNS] and result["frames"] == 6
+    assert np.array_equal(again.dn, shots.dn) and again.dn.dtype == np.uint32
+    assert again.truth is None and again.electrons is None and again.plan is None
+    assert all(len(value) == 64 for value in again.manifest.checksums.values()) and len(again.manifest.checksums) == 6
+    assert again.manifest.digital == shots.manifest.digital.model_copy(
+        update={"step_dn": 1.0, "saturation_dn": float(np.floor(1e5 * DIGITAL.gain_dn_per_e + DIGITAL.black_level_dn))}
+    )
+    assert np.array_equal(ms.reconstruct(again, factors).image, ms.reconstruct(shots, factors).image)
+
+
+def test_signed_pairs_come_as_they_are_shown(tmp_path: Path) -> None:
+    """The positive half first, as patterns are drawn; the order of the files decides."""
+    bench = made(tmp_path, signed=True)
+    shots = ms.load_run(bench.run)
+    swapped = shots.dn[np.array([1, 0, 3, 2, 5, 4, 7, 6])]  # the run has the negative half first
+    written(tmp_path / "frames", "npy", swapped)
+    import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, "hadamard:2"))
+    images = [
+        ms.reconstruct(ms.load_run(run), ms.load_calibration(bench.calibration)).image
+        for run in (bench.run, tmp_path / "run 2")
+    ]
+    assert np.array_equal(*images)
+
+
+def test_frames_with_the_projector_off_are_taken_off(tmp_path: Path) -> None:
+    bench = made(tmp_path, ambient=True)
+    shots = ms.load_run(bench.run)
+    written(tmp_path / "frames", "png", shots.dn)
+    rng = np.random.default_rng(3)
+    dark = rng.integers(100, 900, (4, ROWS, COLUMNS))
+    written(tmp_path / "dark", "png", dark)
+    import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, ambient=tmp_path / "dark"))
+    again = ms.load_run(tmp_path / "run 2")
+    assert again.ambient is not None and again.ambient.shots == 4
+    assert np.array_equal(again.read("ambient.exr")[0]["DN"], dark.mean(axis=0).astype(np.float32))
+
+
+def test_pictures_and_frames_of_a_run_are_read_again(tmp_path: Path) -> None:
+    """export --format png, then import: the same numbers under the same patterns, and the same ambient frame."""
+    bench = made(tmp_path, ambient=True)
+    projector = tmp_path / "projector.toml"
+    projector.write_text('name = "p"\neffective_wavelength_nm = 550.0\ncolumns = 96\nrows = 54\n')
+    export_run(bench.run, "png", tmp_path / "out", projector=str(projector))
+    out, shots = tmp_path / "out", ms.load_run(bench.run)
+    more = {"ambient": out / "ambient.npy", "ambient_shots": 5}
+    import_frames(out / "frames", tmp_path / "run 2", known(bench, str(out / "patterns.json"), **more))
+    again = ms.load_run(tmp_path / "run 2")
+    assert np.array_equal(again.dn, shots.dn) and again.ambient is not None and shots.ambient is not None
+    assert np.array_equal(again.ambient.rate, shots.ambient.rate) and again.ambient.shots == 5
+    assert again.manifest.patterns.captures == shots.manifest.patterns.captures
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_pictures_show_each_pattern_in_the_middle_of_the_projector(signed: bool, tmp_path: Path) -> None:
+    """Cells of 5 x 5 pixels: 54 rows hold 10 of them, 96 columns 14 and more. (Planted: rows and columns changed
+    places; the negative half shown for the positive.)"""
+    bench = made(tmp_path, signed=signed)
+    projector = tmp_path / "projector.toml"
+    projector.write_text('name = "p"\neffective_wavelength_nm = 550.0\ncolumns = 96\nrows = 54\n')
+    export_run(bench.run, "png", tmp_path / "out", projector=str(projector))
+    described = json.loads((tmp_path / "out" / "patterns.json").read_text())
+    assert described["projector"] == {"rows": 54, "columns": 96, "cell": 5, "first_row": 2, "first_column": 13}
+    left, right = (np.array(described[name]) for name in ("P_L", "P_R"))
+    assert (len(left), len(right)) == SCENE and len(described["shots"]) == (8 if signed else 6)
+    for shot in described["shots"]:
+        with Image.open(tmp_path / "out" / shot["pattern"]) as picture:
+            values = np.array(picture)
+        pattern = np.outer(left[:, shot["row"]], right[:, shot["column"]])
+        light = (1 + shot["sign"] * pattern) / 2 if signed else pattern
+        expected = np.zeros((54, 96))
+        for row in range(SCENE[0]):
+            for column in range(SCENE[1]):
+                expected[2 + 5 * row : 7 + 5 * row, 13 + 5 * column : 18 + 5 * column] = 255 * light[row, column]
+        assert np.array_equal(values, expected)
+    with Image.open(tmp_path / "out" / "patterns" / "white.png") as picture:
+        assert np.array(picture).sum() == 255 * 25 * SCENE[0] * SCENE[1]
+
+
+def test_a_plane_of_a_colour_sensor_is_cut_as_flatcams_loader_does(tmp_path: Path) -> None:
+    """Of a calibration of 40 x 52 pixels and a mosaic of 84 x 110: one row and one column more on every side."""
+    bench = made(tmp_path)
+    mosaic = np.arange(84 * 110).reshape(84, 110)
+    written(tmp_path / "frames", "png", np.stack([mosaic] * 6))
+    for channel, corner in {"r": (1, 1), "gb": (0, 1), "gr": (1, 0), "b": (0, 0)}.items():
+        import_frames(tmp_path / "frames", tmp_path / channel, known(bench, channel=channel))
+        plane = mosaic[corner[0] :: 2, corner[1] :: 2]
+        assert plane.shape == (42, 55)
+        assert np.array_equal(ms.load_run(tmp_path / channel).dn[0], plane[1:41, 1:53])
+
+
+def test_the_black_level_that_is_stated_is_taken(tmp_path: Path) -> None:
+    bench = made(tmp_path)
+    written(tmp_path / "frames", "png", ms.load_run(bench.run).dn)
+    import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, black_level_dn=151.5))
+    assert ms.load_run(tmp_path / "run 2").manifest.digital.black_level_dn == 151.5
+
+
+def refused(words: str, tmp_path: Path, source: Path, about: RealCapture) -> None:
+    with pytest.raises(MitsimError, match=words):
+        import_frames(source, tmp_path / "run 2", about)
+    assert not (tmp_path / "run 2").exists()
+
+
+def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> None:
+    bench = made(tmp_path)
+    dn = ms.load_run(bench.run).dn
+    source = tmp_path / "frames"
+    written(source, "png", dn)
+    refused("holds 6 frames, but patterns 'dots:2' take 4", tmp_path, source, known(bench, "dots:2"))
+    refused("dots:99", tmp_path, source, known(bench, "dots:99"))
+    refused("projector-pixels", tmp_path, source, known(bench, calibration=None))
+    refused("the calibration has 10 x 14", tmp_path, source, known(bench, n=12))
+    refused("black_level_dn: got -1", tmp_path, source, known(bench, black_level_dn=-1.0))
+    refused("holds no file that ends in", tmp_path, bench.calibration, known(bench))
+    refused("use r, gb, gr, b", tmp_path, source, known(bench, channel="green"))
+    written(tmp_path / "small", "png", dn[:, :, 1:])
+    refused("is 40x51, but the calibration's frames are 40x52", tmp_path, tmp_path / "small", known(bench))
+    written(tmp_path / "fractions", "npy", dn + 0.5)
+    refused("holds fractions", tmp_path, tmp_path / "fractions", known(bench))
+    written(tmp_path / "below", "npy", dn.astype(int) - 10000)
+    refused("has the number -", tmp_path, tmp_path / "below", known(bench))
+    twelve = tmp_path / "twelve.toml"
+    twelve.write_text(ELECTRONICS.replace("bits = 16", "bits = 12"))
+    scaled = RealCapture("dots:2x3", str(twelve), 0.1, bench.calibration)
+    written(tmp_path / "scaled", "npy", dn * 16)
+    refused("they were scaled", tmp_path, tmp_path / "scaled", scaled)
+    written(tmp_path / "eight", "npy", (dn >> 8).astype(np.uint8))
+    refused("holds numbers of 8 bits, but camera bench 3 counts to 4095", tmp_path, tmp_path / "eight", scaled)
+
+
+def save(path: Path, kind: str) -> None:
+    ramp = np.arange(200, dtype=np.uint8).reshape(10, 20)
+    if kind == "colour":
+        Image.fromarray(np.stack([ramp] * 3, -1)).save(path)
+    elif kind == "palette":
+        Image.fromarray(ramp).convert("P").save(path)
+    elif kind == "one bit":
+        Image.fromarray(ramp > 99).save(path)
+    elif kind == "white is zero":
+        tifffile.imwrite(path, ramp, photometric="miniswhite")
+    elif kind == "cut short":
+        Image.fromarray(np.random.default_rng(1).permutation(ramp.ravel()).reshape(10, 20)).save(path)
+        path.write_bytes(path.read_bytes()[:150])
+    elif kind == "pickle":
+        np.save(path, np.array([{}], dtype=object), allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "words"),
+    [
+        ("a.png", "colour", "no grey PNG"),
+        ("a.png", "palette", "no grey PNG"),
+        ("a.png", "one bit", "no grey PNG"),
+        ("a.png", "cut short", "damaged"),
+        ("a.tif", "colour", "no grey TIFF"),
+        ("a.tif", "one bit", "no grey TIFF"),
+        ("a.tif", "white is zero", "no grey TIFF"),
+        ("a.npy", "pickle", "damaged"),
+    ],
+)
+def test_files_whose_numbers_would_change_are_refused(name: str, kind: str, words: str, tmp_path: Path) -> None:
+    save(tmp_path / name, kind)
+    with pytest.raises(MitsimError, match=words):
+        list(frames_in(tmp_path / name, None))
+
+
+def test_numbers_of_every_depth_are_read_as_they_are(tmp_path: Path) -> None:
+    ramp = np.arange(200).reshape(10, 20)
+    for kind, scale in ((np.uint8, 1), (np.uint16, 300)):
+        for name in ("a.png", "a.tif"):
+            Image.fromarray((ramp * scale).astype(kind)).save(tmp_path / name)
+            (frame,) = frames_in(tmp_path / name, None)
+            assert np.array_equal(frame, ramp * scale) and frame.dtype == kind
+    stack = [Image.fromarray((ramp * scale).astype(np.uint16)) for scale in (1, 2, 3)]
+    stack[0].save(tmp_path / "b.tif", save_all=True, append_images=stack[1:])
+    assert [frame[9, 19] for frame in frames_in(tmp_path / "b.tif", None)] == [199, 398, 597]
+    np.save(tmp_path / "b.npy", np.stack([ramp, ramp * 2]))
+    assert [frame[9, 19] for frame in frames_in(tmp_path / "b.npy", None)] == [199, 398]
+
+
+@pytest.mark.parametrize(
+    ("shape", "bits", "order", "words"),
+    [
+        ("10", 16, "little", "give ROWSxCOLUMNS"),
+        ("0x20", 16, "little", "give ROWSxCOLUMNS"),
+        ("10x20", None, "little", "give the bits"),
+        ("10x20", 33, "little", "give the bits"),
+        ("10x20", 12, "middle", "use little or big"),
+        ("20x20", 12, "little", "400 bytes, but 20x20 numbers of 12 bits take 800"),
+        ("10x20", 7, "little", "400 bytes, but 10x20 numbers of 7 bits take 200"),
+        ("10x20", 12, "big", "beyond 12 bits"),
+    ],
+)
+def test_a_file_without_a_header_is_read_as_is_said_or_refused(
+    shape: str, bits: int | None, order: str, words: str, tmp_path: Path
+) -> None:
+    numbers = np.arange(200, dtype="<u2").reshape(10, 20)
+    numbers.tofile(tmp_path / "a.raw")
+    (frame,) = frames_in(tmp_path / "a.raw", Raw.of("10x20", 12, "little"))
+    assert np.array_equal(frame, numbers)
+    with pytest.raises(MitsimError, match=words):
+        list(frames_in(tmp_path / "a.raw", Raw.of(shape, bits, order)))
+
+
+def test_files_are_ordered_by_their_numbers(tmp_path: Path) -> None:
+    for name in ("f10.png", "f9.png", "f1.png", "notes.txt", ".f2.png"):
+        (tmp_path / name).touch()
+    assert [path.name for path in frame_files(tmp_path)] == ["f1.png", "f9.png", "f10.png"]
