@@ -18,7 +18,7 @@ app = typer.Typer()
 @app.command("export")
 def export(
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
-    format: Annotated[str, typer.Option(help="hdf5, mat, flatcam or png", metavar="FORMAT")],
+    format: Annotated[str, typer.Option(help="hdf5, mat, flatcam, deepinv, torch or png", metavar="FORMAT")],
     output: Annotated[Path, typer.Option("-o", "--output", help="file to make; of png, a folder", metavar="FILE")],
     calibration: Annotated[
         Path | None, typer.Option(help="folder of `mitsim calibrate` that goes with it", metavar="CAL")

@@ -70,10 +70,27 @@ def _png(path: Path, run: Run, calibration: Calibration | None, projector: str |
     return write_pngs(path, run, projector)
 
 
+def _torch(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
+    from mitsim.exchange.tensors import write_tensors
+
+    write_tensors(path, run, calibration)
+    return ()
+
+
+def _deepinv(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
+    from mitsim.exchange.tensors import extra, write_tensors
+
+    extra("deepinv")
+    write_tensors(path, run, calibration)
+    return (f"Read it by mitsim.exchange.tensors.load_physics({str(path)!r})",)
+
+
 FORMATS: dict[str, Format] = {
     "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", _hdf5),
     "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", _mat),
     "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", _flatcam),
+    "deepinv": Format("tensors of a deepinv physics", "file", "needed", _deepinv),
+    "torch": Format("tensors for torch.load", "file", "optional", _torch),
     "png": Format("frames as pictures, patterns for a real projector", "folder", "none", _png),
 }
 """Formats by the name that `--format` takes."""

@@ -180,7 +180,7 @@ class _Fit:
         if known.calibration is None:
             if known.n is None:
                 raise ArgumentError(
-                    "calibration", "is not given; give it, or projector_pixels, so that patterns are known"
+                    "calibration", "is not given, and patterns need its projector; give it, or --projector-pixels"
                 )
             return cls(None, None, (known.n, known.n))
         calibration: Packed[CalibrationManifest] = packed_calibration(known.calibration)

@@ -1,0 +1,145 @@
+"""Runs and factors in, tensors out: a file for PyTorch, a data set of folders, and a physics for deepinv.
+
+PyTorch and deepinv are extras (`pip install mitsim[torch]`, `mitsim[deepinv]`), imported when they are used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest
+from mitsim.core.output import whole_file
+from mitsim.core.recorders import TRUTH
+from mitsim.core.runs import Capture, load_run
+from mitsim.exchange.packed import FACTORS, Packed
+
+if TYPE_CHECKING:
+    from mitsim.reconstruct.factors import Factors
+
+Tensor = Any
+"""A torch.Tensor."""
+
+
+def extra(name: str) -> Any:
+    """The module ``name`` of an extra of the same name. MitsimError where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MitsimError(f"{name} is not installed ({error}); type: pip install 'mitsim[{name}]'") from error
+
+
+def write_tensors(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> None:
+    """Write a run as a file of tensors that `torch.load` reads with `weights_only`, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        that is exported.
+    calibration
+        that goes with it.
+
+    Raises
+    ------
+    MitsimError
+        where PyTorch is not installed, or a frame cannot be read.
+    """
+    torch = extra("torch")
+    shots = Capture(run.manifest, None, {name: run.read(name) for name in dict.fromkeys(run.names)})
+    arrays = {"y": measured(shots), **dict(zip(("P_L", "P_R"), shots.patterns, strict=True))}
+    if shots.truth is not None:
+        arrays["x"] = shots.truth[None]
+    if calibration is not None:
+        factors = {side: calibration.read(name)[0]["factor"] for side, name in zip(SIDES, FACTORS, strict=True)}
+        arrays.update({side: np.asarray(factor, np.float64) for side, factor in factors.items()})
+    with whole_file(path) as part:
+        torch.save({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, part)
+
+
+def measured(shots: Capture) -> FloatArray:
+    """(K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j): differences of
+    signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read."""
+    columns = shots.patterns[1].shape[1]
+    frames = {each.row * columns + each.column: each.frame for each in shots.measured()}
+    return np.stack([frames[index] for index in sorted(frames)])
+
+
+class RunDataset:
+    """RUN folders as a map-style data set of PyTorch: item -> (x, y), read when it is asked for.
+
+    x is the truth, (1, n, n') relative to the board, y what was measured, (K K', rows, columns) electrons a second;
+    both of single precision.
+    """
+
+    def __init__(self, folders: Sequence[Path | str]) -> None:
+        """The data set of ``folders``. MitsimError where PyTorch is missing, or one is no complete run with a truth."""
+        self._torch = extra("torch")
+        self.runs = [load_run(folder) for folder in folders]
+        for shots in self.runs:
+            if TRUTH not in shots.files:
+                raise MitsimError(f"{shots.name}: has no {TRUTH}, so it cannot teach; leave it out")
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        shots = load_run(self.runs[index].folder or Path())  # anew, so that no item stays in memory
+        if shots.truth is None:
+            raise MitsimError(f"{shots.name}: has no {TRUTH}")
+        pair = shots.truth[None].astype(np.float32), measured(shots).astype(np.float32)
+        return self._torch.from_numpy(pair[0]), self._torch.from_numpy(pair[1])
+
+
+def physics(factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> Any:
+    """The model of a camera under patterns as a `deepinv.physics.LinearPhysics`, with its exact adjoint.
+
+    ``factors`` are of the camera; ``patterns`` are P_L (n, K) and P_R (n', K'), as `Capture.patterns`. It takes x
+    (batch, 1, n, n') to y (batch, K K', rows, columns) [electrons / s], on x's device and of its precision. MitsimError
+    where deepinv is not installed, or patterns do not fit.
+    """
+    return _physics(*factors.sides, *patterns)
+
+
+def load_physics(path: Path | str) -> tuple[Any, Mapping[str, Tensor]]:
+    """The physics in the file ``path`` of `mitsim export --format deepinv`, and its tensors: `y`, and `x` where the
+    truth is known. MitsimError where deepinv is not installed, or the file is none."""
+    torch = extra("torch")
+    try:
+        tensors = torch.load(path, weights_only=True)
+        sides = [tensors[name].numpy() for name in (*SIDES, "P_L", "P_R")]
+    except Exception as error:  # torch.load raises of all kinds
+        raise MitsimError(f"{path}: no file of `mitsim export --format deepinv` ({error}); export it again") from error
+    return _physics(*sides), tensors
+
+
+def _physics(left: FloatArray, right: FloatArray, p_left: FloatArray, p_right: FloatArray) -> Any:
+    torch, linear = extra("torch"), extra("deepinv").physics.LinearPhysics
+    for name, side, pattern in (("P_L", left, p_left), ("P_R", right, p_right)):
+        if len(pattern) != side.shape[1]:
+            raise MitsimError(f"{name} has {len(pattern)} projector pixels, but the factor {side.shape[1]}")
+    # (K, m, n) stacks Phi diag(p_i): frame (i, j) is lefts[i] X rights[j]^T.
+    lefts, rights = (
+        torch.from_numpy(np.ascontiguousarray(side[None] * pattern.T[:, None, :]))
+        for side, pattern in ((left, p_left), (right, p_right))
+    )
+    count, shape = (len(lefts), len(rights)), (len(left), len(right))
+
+    def forward(x: Tensor, **_: Any) -> Tensor:
+        """A x."""
+        half = lefts.to(x) @ x
+        return (half[:, :, None] @ rights.to(x).transpose(1, 2)).reshape(len(x), -1, *shape)
+
+    def adjoint(y: Tensor, **_: Any) -> Tensor:
+        """A^T y."""
+        gathered = (y.reshape(len(y), *count, *shape) @ rights.to(y)).sum(2)
+        return (lefts.to(y).transpose(1, 2) @ gathered).sum(1, keepdim=True)
+
+    return linear(A=forward, A_adjoint=adjoint, img_size=(1, left.shape[1], right.shape[1]))

@@ -1,0 +1,65 @@
+"""export and import on the command line: keys, sentences, statuses; the image of a run that went out and came back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.framefile import read_frame
+from tests.system.refusals import mentions
+
+EXPORTED = {"format", "frames", "calibration", "notes", "output"}
+IMPORTED = {"frames", "output", "calibration_output", "holds", "left_out", "warnings"}
+
+
+def image(call: Callable[..., Any], run: Path, calibration: Path, to: Path) -> np.ndarray:
+    assert call("reconstruct", run, "--calibration", calibration, "-o", to).code in (0, 1)
+    return read_frame(to / "image.exr")[0]["reflectance"]
+
+
+@pytest.mark.parametrize(("format", "name"), [("hdf5", "all.h5"), ("mat", "all.mat"), ("flatcam", "all.mat")])
+def test_out_and_back(call: Callable[..., Any], lab: Any, tmp_path: Path, format: str, name: str) -> None:
+    out = call("export", lab.run, "--format", format, "--calibration", lab.calibration, "-o", tmp_path / name, "--json")
+    assert out.code == 0 and out.payload.keys() == EXPORTED and out.payload["frames"] == 16
+    back = call("import", tmp_path / name, "-o", tmp_path / "run", "--calibration-output", tmp_path / "cal", "--json")
+    assert back.code == 0 and back.payload.keys() == IMPORTED and back.payload["holds"] == ["run", "calibration"]
+    again = image(call, tmp_path / "run", tmp_path / "cal", tmp_path / "b")
+    assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))
+
+
+def test_pictures_and_frames_again(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """By the line that export prints, with the names put in."""
+    out = call("export", lab.run, "--format", "png", "-o", tmp_path / "out", "--projector", "mp_cl1", "--json")
+    assert out.code == 0, out.err
+    line = out.payload["notes"][0].split("mitsim ")[1]
+    names = {"NAME": lab.camera, "CAL": lab.calibration, "RUN": tmp_path / "run"}
+    back = call(*(names.get(word, word) for word in line.split()), "--json")
+    assert back.code == 0 and back.payload.keys() == {*IMPORTED, "shape"} and back.payload["shape"] == [64, 64]
+    assert "truth" in back.payload["left_out"]
+    again = image(call, tmp_path / "run", lab.calibration, tmp_path / "b")
+    assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))
+
+
+def test_refusals(refused: Callable[..., str], lab: Any) -> None:
+    mentions(
+        refused("export", lab.run, "--format", "xml", "-o", "new"),
+        "--format 'xml'",
+        "hdf5, mat, flatcam, deepinv, torch, png",
+    )
+    mentions(refused("export", lab.run, "--format", "flatcam", "-o", "new"), "--calibration is not given")
+    mentions(refused("export", lab.calibration, "--format", "hdf5", "-o", "new"), "holds a calibration")
+    mentions(refused("export", lab.run, "--format", "hdf5", "-o", "new", "--projector", "mp_cl1"), "--projector")
+    frames = "import", lab.run.parent
+    mentions(refused(*frames), "give -o RUN")
+    mentions(refused(*frames, "-o", "new"), "--patterns is not given")
+    given = "--patterns", "dots:4", "--camera", lab.camera
+    mentions(refused(*frames, "-o", "new", *given), "--exposure is not given")
+    mentions(refused(*frames, "-o", "new", *given, "--exposure", 0), "--exposure 0")
+    mentions(refused(*frames, "-o", "new", *given, "--exposure", 1), "--calibration is not given", "--projector-pixels")
+    mentions(refused(*frames, "-o", "new", *given, "--exposure", 1, "--shape", "3"), "--shape '3'")
+    mentions(refused("import", "none.h5", "-o", "new"), "none.h5", "cannot be read")
+    mentions(refused("import", "none.h5", "-o", "new", "--exposure", 1), "leave the options of frames out")
