@@ -33,7 +33,7 @@ from mitsim.transport.coordinates import rows_columns, x_y
 from mitsim.transport.histogram import Deposits, Sightings
 from mitsim.transport.panes import refracted_way
 from mitsim.transport.passage import Passage
-from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta
+from mitsim.transport.paths import FollowingTracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import panchromatic, stratified, streams
@@ -55,7 +55,7 @@ class Paths:
     emitters: tuple[mi.Emitter, ...] = ()
 
 
-class FromCameraTracer(Tracer):
+class FromCameraTracer(FollowingTracer):
     """From-camera light of a scene, at points of the sensor."""
 
     def __init__(
@@ -116,7 +116,7 @@ class CameraWalk(Walk):
         seed, sample, lane
             of the random numbers, and of every path.
         """
-        super().__init__(tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection)
+        super().__init__(tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection, tracer.orders)
         cell, row, column = tracer.points.of(lane, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
         self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
@@ -231,6 +231,7 @@ class CameraWalk(Walk):
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
         # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
         share = dr.select(ds.delta, 1, self._share(ds.pdf, pdf)) if self.paths.interreflection else 1
+        active &= self._wanted(self.surfaces)
         self._keep_seen("ambient", active, self._radiance(value * light * passed) * share, self._lamps())
 
     def _emitter_hit(self, si: mi.SurfaceInteraction3f) -> None:
@@ -243,7 +244,8 @@ class CameraWalk(Walk):
         unconnected = self.by_delta | self.behind_glass
         pdf = emitter.pdf_direction(before, ds, lamp & ~unconnected)
         share = dr.select(unconnected, 1, self._share(self.came_pdf, pdf))
-        self._keep_seen("ambient", lamp, self._radiance(emitter.eval(si, lamp)) * share, self._lamps())
+        light = self._radiance(emitter.eval(si, lamp)) * share
+        self._keep_seen("ambient", lamp & self._wanted(self.surfaces - 1), light, self._lamps())
 
     def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a projector's lens that the path has run into.
@@ -276,6 +278,9 @@ class CameraWalk(Walk):
         self._end_some(going, self.mirrored, passing, first)
         self.mirrored &= delta | passing
         self.surfaces = dr.select(delta | passing, self.surfaces, self.surfaces + 1)
+        # What a path runs into has been turned once less than what it is connected to.
+        runs_into_light = bool(self.paths.emitters) or self.tracer.projector.aperture > 0
+        self.active &= self._goes_on(self.surfaces - (1 if runs_into_light else 0))
         self.travelled += si.t
         self.since = dr.select(passing, self.since + si.t, 0)
         self.behind_glass = passing & (self.behind_glass | is_delta(sample))
@@ -301,6 +306,7 @@ class CameraWalk(Walk):
 
     def _keep_of_projector(self, active: mi.Bool, value: mi.Float, pixel: mi.UInt32, surfaces: mi.UInt32) -> None:
         """``surfaces``: those on the light's way that are no mirrors."""
+        active &= self._wanted(surfaces)
         self._keep_seen("direct", active & (surfaces == 1), value * self.part, pixel)
         if self.paths.interreflection:
             self._keep_seen("indirect", active & (surfaces > 1), value * self.part, pixel)

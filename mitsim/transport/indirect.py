@@ -27,14 +27,14 @@ import numpy.typing as npt
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import DIRECT, Deposits
 from mitsim.transport.ledger import Ledger
-from mitsim.transport.paths import Tracer, Walk, camera_part, is_delta, launches
+from mitsim.transport.paths import FollowingTracer, Walk, camera_part, is_delta, launches
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
 from mitsim.transport.repeats import Turns, by_pixel
 from mitsim.transport.sampling import generator, panchromatic, stratified, streams
 
 
-class IndirectTracer(Tracer):
+class IndirectTracer(FollowingTracer):
     """Indirect light of a projector, and its caustics, at points of the sensor."""
 
     def __init__(
@@ -125,7 +125,7 @@ class IndirectWalk(Walk):
         seed, sample, lane
             of the random numbers; the lane tells pixel and anchor.
         """
-        super().__init__(tracer.receiver.passage, tracer.mirrors, tracer.interreflection)
+        super().__init__(tracer.receiver.passage, tracer.mirrors, tracer.interreflection, tracer.orders)
         self.tracer = tracer
         weight = self._place(sample, lane)
         self._begin(seed)
@@ -174,8 +174,13 @@ class IndirectWalk(Walk):
 
     def _connect(self, si: mi.SurfaceInteraction3f) -> None:
         """Light that this surface sends to the sensor."""
+        self._take(si, self._way(si))
+
+    def _way(self, si: mi.SurfaceInteraction3f) -> Way:
+        """To the sensor, for light that is kept."""
         # Light that has met nothing but what it passes is the direct tracer's.
-        self._take(si, self.tracer.receiver.way(si, self.sensor, self.active & ~self.straight))
+        active = self.active & ~self.straight & self._wanted(self.scattered + 1)
+        return self.tracer.receiver.way(si, self.sensor, active)
 
     def _take(self, si: mi.SurfaceInteraction3f, way: Way) -> None:
         """Keep the light that a surface sends by a ``way``."""
@@ -200,5 +205,6 @@ class IndirectWalk(Walk):
         self.strength *= value * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
         self._end_some(going, (self.scattered == 0) & delta, passing, first)
         self.scattered += dr.select(delta | passing, mi.UInt32(0), mi.UInt32(1))
+        self.active &= self._goes_on(self.scattered + 1)
         self.straight &= passing
         self.ray = self._onward(si, onward, passing)

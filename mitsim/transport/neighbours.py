@@ -180,7 +180,7 @@ class _Block(IndirectWalk):
         self.active &= si.is_valid()
         self.shared = self.active & (self.scattered == 1)
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
-        self.way = self.tracer.receiver.way(si, self.sensor, self.active & ~self.straight)
+        self.way = self._way(si)
         self._take(si, replace(self.way, open=self.way.open & ~self.shared))
         self.follows = self.shared & self._diffuse(si)
         self.shading = mi.Normal3f(si.sh_frame.n)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from copy import copy
 from types import MappingProxyType
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
 from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits, Sightings
 from mitsim.transport.passage import Passage
+
+if TYPE_CHECKING:
+    from typing import Self
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 """Kinds of light by their names in a walk."""
@@ -33,6 +37,8 @@ _LONGEST = 0.999
 In a closed room of reflectance rho the light of a path grows by rho / chance a reflection, and its second moment is
 finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the light at reflectance 0.99, 79 % at 0.999.
 """
+ANY = 2**31
+"""More surfaces than any path meets; one more fits 32 bits."""
 _LEAST_CHANCE = 1e-6
 """Strength is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
@@ -141,6 +147,23 @@ class Tracer(ABC):
         return found
 
 
+class FollowingTracer(Tracer):
+    """Light that is followed over any number of surfaces, or of some orders alone.
+
+    The *order* of light is the number of surfaces that have turned it and are no mirrors: 1 for what a projector lights
+    and the sensor sees, 0 for a lamp that is seen.
+    """
+
+    orders: tuple[int, int] | None = None
+
+    def of_orders(self, fewest: int, most: int) -> Self:
+        """The same paths, whose light is kept of the orders ``fewest`` to ``most``, and which end where no more can
+        come; one kernel serves all of them."""
+        again = copy(self)
+        again.orders = fewest, most
+        return again
+
+
 class Walk(ABC):
     """The paths of one launch, a lane each: the first surface apart, and all others in a loop of one kernel.
 
@@ -159,7 +182,9 @@ class Walk(ABC):
     rng: mi.PCG32
     anchor: tuple[mi.UInt32, mi.UInt32]
 
-    def __init__(self, passage: Passage, mirrors: bool, interreflection: bool) -> None:
+    def __init__(
+        self, passage: Passage, mirrors: bool, interreflection: bool, orders: tuple[int, int] | None = None
+    ) -> None:
         """Paths before their first surface.
 
         Parameters
@@ -168,10 +193,13 @@ class Walk(ABC):
             the scene, and what light passes in it.
         mirrors, interreflection
             paths over delta reflections and transmissions, and over other surfaces.
+        orders
+            of :class:`FollowingTracer`; None: all.
         """
         self.passage, self.scene, self.straight = passage, passage.scene, mi.Bool(True)
         self.mirrors, self.interreflection = mirrors, interreflection
         self.kept = {kind: Sightings.none() for kind in KINDS}
+        self._orders = [dr.opaque(mi.UInt32, order) for order in orders or ()]
 
     @abstractmethod
     def vertex(self, first: bool) -> None:
@@ -180,6 +208,17 @@ class Walk(ABC):
     def _keep(self, kind: str, seen: Sightings) -> None:
         """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
         self.kept[kind] = self.kept[kind].joined_by(seen, self.rng)
+
+    def _wanted(self, order: mi.UInt32) -> mi.Bool:
+        """Whether light of an ``order`` is kept."""
+        if not self._orders:
+            return mi.Bool(True)
+        fewest, most = self._orders
+        return (order >= fewest) & (order <= most)
+
+    def _goes_on(self, least: mi.UInt32) -> mi.Bool:
+        """Whether a path may bring light that is kept, of which the ``least`` order is to come."""
+        return least <= self._orders[1] if self._orders else mi.Bool(True)
 
     def _sampled(
         self, si: mi.SurfaceInteraction3f, mode: mi.TransportMode, chosen: mi.Point2f | None = None

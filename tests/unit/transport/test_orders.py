@@ -1,0 +1,89 @@
+"""Light by its order, the surfaces that turned it: closed forms in a sphere, and sums that are the whole.
+
+Gates on Monte Carlo means are seven standard errors of eight independent seeds: five sigma of the t distribution.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.transport.cells import aligned_grid
+from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
+from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.neighbours import NeighbourTracer
+from mitsim.transport.paths import ANY, FollowingTracer
+from tests.unit.transport.closed_forms import mean, seen
+from tests.unit.transport.test_indirect import CORNER, MATT, MIRROR, SPHERE
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, SEEDS, SIGMAS, RHO = 16, 8, 7.0, 0.5
+LAMP = """<emitter type="point"><point name="position" x="20" y="0" z="100"/>
+    <spectrum name="intensity" value="1e5"/></emitter>"""
+
+
+@pytest.mark.parametrize("kind", [IndirectTracer, NeighbourTracer])
+def test_each_reflection_in_a_sphere_keeps_the_albedo(
+    shared_scene: Callable[..., Path], kind: type[IndirectTracer]
+) -> None:
+    """Light of order k is even in a diffuse sphere: E_k = Phi rho^k / (pi A) for k >= 2, Phi being the projector's."""
+    bench = open_bench(shared_scene(f"orders_{kind.__name__}", extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
+    all_orders = kind(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, False, True)
+    second = np.pi * 111000 * 0.3**2 * RHO**2 / np.pi / (4 * np.pi * 1000**2) * seen(bench.geometry.tan_half_fov)
+    for (fewest, most), part in {(2, 2): 1.0, (3, 3): RHO, (3, ANY): RHO / (1 - RHO)}.items():
+        tracer = all_orders.of_orders(fewest, most)
+        total, error = mean(np.array([tracer.trace(seed, 0, 128).value.sum() / 128 for seed in range(SEEDS)]))
+        assert SIGMAS * error < 0.4 * part * second, "a count that is off by one halves the light"
+        assert abs(total - part * second) < SIGMAS * error, (fewest, most)
+    assert not all_orders.of_orders(1, 1).trace(0, 0, 4).value.any(), "direct light is another tracer's"
+
+
+@pytest.fixture(scope="module")
+def hall(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    """A sheet, a shiny wall, a mirror and a lamp before a lens."""
+    return open_bench(shared_scene("hall", extra=CORNER + MIRROR.replace("-40", "60") + LAMP), variant)
+
+
+def tracers(bench: Bench) -> dict[str, FollowingTracer]:
+    """Of both sides."""
+    loaded, optics = bench.loaded, replace(bench.projector_optics, aperture=5.0)
+    parts = loaded.scene, loaded.camera, bench.projector_optics
+    grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
+    paths = Paths(mirrors=True, interreflection=True, emitters=loaded.lamps)
+    return {
+        "projector": IndirectTracer(*parts, True, True),
+        "neighbours": NeighbourTracer(*parts, False, True),
+        "camera": FromCameraTracer(*parts, grid, paths),
+        "lens": FromCameraTracer(loaded.scene, loaded.camera, optics, grid, paths),
+    }
+
+
+@pytest.mark.parametrize("name", ["projector", "neighbours", pytest.param("camera", marks=pytest.mark.slow), "lens"])
+def test_orders_add_up_to_all_light(hall: Bench, name: str) -> None:
+    """Path by path, so pixel by pixel to the rounding: direct light in mirrors, indirect light, that of lamps.
+
+    (Planted: a path that ends one surface early, or before it runs into a lamp or the lens; an order counted twice;
+    mirrors counted as surfaces only on one side.)
+    """
+    tracer = tracers(hall)[name]
+    parts = {order: tracer.of_orders(order, order).trace(1, 0, 16) for order in (0, 1, 2, 3)}
+    parts[4] = tracer.of_orders(4, ANY).trace(1, 0, 16)
+    every = tracer.trace(1, 0, 16)
+    for kind in (DIRECT, INDIRECT, AMBIENT):
+        whole = by_path(every, kind, name)
+        summed = sum(by_path(each, kind, name) for each in parts.values())
+        np.testing.assert_allclose(summed, whole, rtol=1e-4, atol=1e-6 * whole.max())
+    assert {*parts[0].kind} <= {AMBIENT} and {*parts[1].kind} <= {DIRECT, AMBIENT} and INDIRECT in parts[2].kind
+    assert all(light.value.any() for order, light in parts.items() if order > 1)
+
+
+def by_path(light: Deposits, kind: int, side: str) -> np.ndarray:
+    """Light of a ``kind`` by where its paths start: pixels of the projector, or cells of the camera's view."""
+    kept = light.where(light.kind == kind)
+    if side in ("projector", "neighbours"):
+        return np.bincount(kept.pixel, kept.value, N * N)
+    return np.histogram2d(kept.row, kept.column, 2 * [np.linspace(-0.4, 0.4, 41)], weights=kept.value)[0]
