@@ -371,6 +371,16 @@ def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, fl
     return light, bound
 
 
+def samples_of(simulation: Simulation, rounds: float = 1.0) -> dict[str, int]:
+    """Samples of a group, by the name of what is traced: so many times those that the plan of a ``simulation``
+    predicted, in ``rounds``."""
+    wanted = {}
+    for name, stage in simulation.tracers().items():
+        samples = max(rounds * stage.predicted, 1.0)
+        wanted[name] = math.ceil(even(samples) if name in EVEN else samples)
+    return wanted
+
+
 def _some(lighting: Lighting, count: int) -> Lighting:
     """So many shots of a ``lighting``, evenly spread."""
     shots = len(lighting.weights)
@@ -408,11 +418,7 @@ class _Group:
 
     def sample(self, rounds: float) -> None:
         """Trace until this many times the samples that the plan predicted are done."""
-        wanted = {}
-        for name, stage in self.simulation.tracers().items():
-            samples = max(rounds * stage.predicted, 1.0)
-            wanted[name] = math.ceil(even(samples) if name in EVEN else samples)
-        self.trace(wanted)
+        self.trace(samples_of(self.simulation, rounds))
 
     def trace(self, wanted: Mapping[str, int]) -> None:
         """Trace until so many samples as are ``wanted`` of each stage by its name are done.

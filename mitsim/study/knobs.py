@@ -16,11 +16,14 @@ from mitsim.capture.evidence import COUNTED, Evidence, Part, Settings
 from mitsim.capture.light import Light, Sampling, Target, trace_light
 from mitsim.capture.plan import Plan, SceneFacts, decide
 from mitsim.capture.simulation import Simulation
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.rig.patterns import PatternFamily
+
+_FEW_SHOTS = 8
+"""Shots whose frames tell what changes all of them: they differ by a few percent."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,11 @@ class Stand:
     def evidence(self) -> Evidence:
         """Of the pilot."""
         return self.look.evidence
+
+    @cached_property
+    def few_shots(self) -> Labels:
+        """Numbers of some shots, evenly spread."""
+        return np.unique(np.linspace(0, len(self.family.shots) - 1, _FEW_SHOTS).astype(np.int64))
 
     def plan(self, accuracy: float) -> Plan:
         """What the evidence calls for at an ``accuracy``."""

@@ -6,7 +6,8 @@ is cheap is repeated:
 1. the *judge*, one factored answer of its own seed with every effect of the scene and, where time allows, more anchors,
    layers and cells than the plans, that all errors are measured against (:mod:`.judge`);
 2. a whole run of `mitsim capture` at the default accuracy, from opening the scene to the last file (:mod:`.runs`);
-3. each effect, the anchors, layers, cells and the projector's lines left out in turn (:mod:`.parts`);
+3. each effect, the anchors, layers, cells and the projector's lines left out in turn (:mod:`.parts`), and light over
+   two, three, four and more surfaces where the plan follows it (:mod:`.orders`);
 4. whole runs at other accuracies, and the reference on one frame, extrapolated to all;
 5. repeats of all but the reference.
 
@@ -24,6 +25,7 @@ from mitsim.core.job import Job
 from mitsim.study import plots
 from mitsim.study.accuracy.findings import AccuracyFindings, Row
 from mitsim.study.accuracy.judge import Judge
+from mitsim.study.accuracy.orders import PARENT, Orders
 from mitsim.study.accuracy.parts import Parts
 from mitsim.study.accuracy.runs import Runs
 from mitsim.study.knobs import Stand
@@ -35,8 +37,8 @@ QUOTED = 1e-3
 """The default accuracy."""
 BUDGET_S = 100.0
 """Seconds of the whole study on a quiet machine: with starting, opening and figures below two minutes."""
-_JUDGE_PART, _FRONT_PART, _PARTS_PART = 0.12, 0.6, 0.6
-"""Of what is left, what the judge, one whole run, and one look at all parts may take."""
+_JUDGE_PART, _FRONT_PART, _PARTS_PART, _ORDERS_PART = 0.12, 0.6, 0.6, 0.4
+"""Of what is left, what the judge, one whole run, one look at all parts, and one at light by surfaces may take."""
 _SHORTEST_LOOK_S = 1.0
 """Shorter looks tell more of kernels than of the machine's pace."""
 
@@ -65,18 +67,20 @@ def measure(bench: Bench, request: Request, job: Job) -> AccuracyFindings:
     runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
     job.progress("parts", 0.4)
     parts.measure(budget, _PARTS_PART)
+    orders = Orders(stand, judge, parts)
+    orders.measure(budget, _ORDERS_PART)
     job.progress("whole runs", 0.6)
     runs.measure(ACCURACIES, budget, _FRONT_PART)
     job.progress("reference", 0.7)
     reference = list(judge.reference(budget))
     job.progress("repeats", 0.8)
-    budget.repeat([*runs.timed, *parts.timed])
+    budget.repeat([*runs.timed, *parts.timed, *orders.timed])
     rows = _fronted(runs.rows)
     quoted = next(row for row in rows if QUOTED in row.accuracies)
     slow = reference[-1] if reference else None
     return AccuracyFindings(
         rows=(*rows, *reference, *([slow.reaching(quoted.error)] if slow else [])),
-        effects=parts.costs,
+        effects=tuple(each for part in parts.costs for each in (part, *(orders.costs if part.name == PARENT else ()))),
         parts_accuracy=parts.accuracy,
         judge=judge.facts,
         sensor_noise=judge.sensor_noise,

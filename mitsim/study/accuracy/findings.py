@@ -78,7 +78,7 @@ class PartCost:
     Attributes
     ----------
     name
-        an effect, ``anchors``, ``layers``, ``cells``, ``followed-anchors``, or ``lines`` of the projector.
+        an effect, ``anchors``, ``layers``, ``cells``, ``followed-anchors``, ``lines`` of the projector, or surfaces.
     error_if_off, error_bound
         what leaving it out changes in the frames, relative, by the pilot's looks (``lines``: by the judge's light); at
         most, at 95 %.
@@ -86,6 +86,8 @@ class PartCost:
         seconds of transport and optics of all frames; None where that was not timed.
     in_plan
         whether the plan at the quoted accuracy has it.
+    of
+        the part that it is a share of; "" for one by itself.
     """
 
     name: str
@@ -94,6 +96,12 @@ class PartCost:
     with_it: Spread | None
     without: Spread | None
     in_plan: bool
+    of: str = ""
+
+    @property
+    def label(self) -> str:
+        """Its name among all."""
+        return f"{self.of}: {self.name}" if self.of else self.name
 
     @property
     def extra(self) -> Extra | None:
@@ -126,6 +134,7 @@ class PartCost:
             "within_noise": None if extra is None else extra.within_noise,
             "repeats": self.repeats,
             "in_plan": self.in_plan,
+            "of": self.of,
         }
 
 
@@ -153,7 +162,7 @@ class AccuracyFindings:
     rows
         whole runs, then the reference.
     effects, parts_accuracy
-        parts, and the accuracy whose samples they were timed with.
+        parts, shares of one after it, and the accuracy whose samples they were timed with.
     judge
         what errors are held against.
     sensor_noise
@@ -196,7 +205,8 @@ class AccuracyFindings:
     def lines(self) -> list[str]:
         """For people."""
         parts = [
-            f"{part.name:<18} error without it {part.error_if_off:.1e}, time {part.cost}"
+            f"{part.label:<27} error without it {part.error_if_off:.1e} (at 95 % below {part.error_bound:.1e}), "
+            f"time {part.cost}"
             f"{'' if part.in_plan else f'; not in the plan at {self.quoted:g}'}"
             for part in self.effects
         ]

@@ -7,8 +7,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from mitsim.capture.bench import Bench
 from mitsim.capture.choice import predicted
 from mitsim.capture.effects import present
@@ -25,8 +23,6 @@ _LONGEST_S = 3.5
 """Seconds of light with all parts in: a dozen parts are then timed once in less than the study has."""
 _ACCURACIES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1)
 """Whose samples are tried, the default first."""
-_FEW_SHOTS = 8
-"""Shots whose frames tell what the lines change: they differ by a few percent."""
 _LINES = "lines"
 _NUMBERS = {"followed-anchors": "followed_anchors"}
 """Parts that the pilot calls otherwise."""
@@ -49,15 +45,20 @@ class Parts:
     ----------
     stand, judge
         scene and family, and light that needs no tracing to be formed otherwise.
+
+    Attributes
+    ----------
+    full, accuracy, seconds
+        the plan with all parts in, the accuracy whose samples it has, and the seconds that these are predicted to take.
     """
 
     def __init__(self, stand: Stand, judge: Judge) -> None:
         self._stand, self._judge = stand, judge
         self._plan = stand.plan(stand.accuracy)
         full = _filled(self._plan.settings, stand.finest(self._plan).settings)
-        self.accuracy, self._seconds, settings = _sampled(stand, full)
-        self._full = replace(self._plan, settings=settings)
-        self._whole = self._timed(Trial("parts", "all", stand.bench, self._full, at_once))
+        self.accuracy, self.seconds, settings = _sampled(stand, full)
+        self.full = replace(self._plan, settings=settings)
+        self._whole = self._timed(Trial("parts", "all", stand.bench, self.full, at_once))
         self._left = sorted(self._parts(settings), key=lambda part: -part.error.value)
 
     def measure(self, budget: Budget, share: float) -> None:
@@ -71,7 +72,7 @@ class Parts:
         kept = max(budget.left, 0.0) * (1 - share)
         for name, timed in (("all", self._whole), *((part.name, part.timed) for part in self._left)):
             # The rehearsal that compiles kernels takes about as long as the work.
-            predicted_s = 2 * (self._whole.spread.most if self._whole.seconds else budget.slower * self._seconds)
+            predicted_s = 2 * (self._whole.spread.most if self._whole.seconds else budget.slower * self.seconds)
             if budget.allows(f"time of {name}", predicted_s, kept=kept):
                 timed.seconds.append(timed.again())
 
@@ -100,15 +101,15 @@ class Parts:
         for name, less in without(settings, frozenset(present(stand.bench))):
             known = _NUMBERS.get(name, name)
             part = Part(known, 1) if known in evidence.ladders else Part(known)
-            yield self._without(name, evidence.error(part), stand.bench, replace(self._full, settings=less))
+            yield self._without(name, evidence.error(part), stand.bench, replace(self.full, settings=less))
         if len(stand.bench.spectrum.weights) > 1:
             mono = one_line(stand.bench)
             light = self._judge.light
             seen = replace(light, simulation=Simulation(mono, light.simulation.settings))
-            shots = np.unique(np.linspace(0, len(stand.family.shots) - 1, _FEW_SHOTS).astype(int))
+            shots = stand.few_shots
             frames, _ = stacked(seen.frames(stand.family.lighting.shots(shots), self._judge.facts.seed))
             error = relative_error(frames, self._judge.frames[shots])
-            yield self._without(_LINES, Estimate(error, error), mono, self._full)
+            yield self._without(_LINES, Estimate(error, error), mono, self.full)
 
     def _without(self, name: str, error: Estimate, bench: Bench, plan: Plan) -> _Left:
         trial = Trial("parts", f"no {name}", bench, plan, at_once)

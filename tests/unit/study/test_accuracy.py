@@ -96,6 +96,7 @@ def test_parts_say_what_they_buy_and_never_cost_less_than_nothing(study: Accurac
     assert study.effects[0].name == "diffraction" and study.effects[0].error_if_off > 0.02
     assert found["interreflection"].error_if_off == pytest.approx(0, abs=1e-9), "one flat sheet lights the camera alone"
     assert found["diffraction"].in_plan
+    assert not any(part.of for part in study.effects), "no surface is lit by another"
     for part in study.effects:
         assert part.error_if_off <= part.error_bound and part.repeats == ROUNDS
         block = part.payload()
@@ -160,11 +161,14 @@ def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: P
     keys = {"estimator", "setting", "seconds", "least_s", "most_s", "repeats", "error", "mc_error", "knob", "on_front"}
     assert all(keys <= row.keys() and row["extrapolated"] is bool(row["by"]) for row in kept["rows"])
     keys = {"name", "error_if_off", "error_bound", "seconds", "least_s", "most_s", "within_noise", "repeats", "in_plan"}
+    keys |= {"of"}
     assert kept["effects"] and all(keys == effect.keys() for effect in kept["effects"])
     assert {"mc_error", "systematic_error", "seconds", "seed"} <= kept["judge"].keys() and kept["took"] > 0
     assert result.payload().keys() >= kept.keys() - {"kind", "seed", "versions"}
     text = "\n".join(result.lines())
-    assert "diffraction        error without it" in text and "judge's own error" in text and str(folder) in text
+    assert (
+        "diffraction                 error without it" in text and "judge's own error" in text and str(folder) in text
+    )
     assert "extrapolated: one of 4 frames" in text and "mitsim study solver" in text
 
 

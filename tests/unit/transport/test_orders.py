@@ -22,8 +22,7 @@ from tests.unit.transport.test_indirect import CORNER, MATT, MIRROR, SPHERE
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SEEDS, SIGMAS, RHO = 16, 8, 7.0, 0.5
-LAMP = """<emitter type="point"><point name="position" x="20" y="0" z="100"/>
-    <spectrum name="intensity" value="1e5"/></emitter>"""
+SKY = '<emitter type="constant"><spectrum name="radiance" value="20"/></emitter>'
 
 
 @pytest.mark.parametrize("kind", [IndirectTracer, NeighbourTracer])
@@ -44,13 +43,13 @@ def test_each_reflection_in_a_sphere_keeps_the_albedo(
 
 @pytest.fixture(scope="module")
 def hall(shared_scene: Callable[..., Path], variant: str) -> Bench:
-    """A sheet, a shiny wall, a mirror and a lamp before a lens."""
-    return open_bench(shared_scene("hall", extra=CORNER + MIRROR.replace("-40", "60") + LAMP), variant)
+    """A sheet, a shiny wall, a mirror, and a sky; before a lens of 30 mm where one is asked for."""
+    return open_bench(shared_scene("hall", extra=CORNER + MIRROR.replace("-40", "60") + SKY), variant)
 
 
 def tracers(bench: Bench) -> dict[str, FollowingTracer]:
     """Of both sides."""
-    loaded, optics = bench.loaded, replace(bench.projector_optics, aperture=5.0)
+    loaded, optics = bench.loaded, replace(bench.projector_optics, aperture=30.0)
     parts = loaded.scene, loaded.camera, bench.projector_optics
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
     paths = Paths(mirrors=True, interreflection=True, emitters=loaded.lamps)
@@ -66,8 +65,8 @@ def tracers(bench: Bench) -> dict[str, FollowingTracer]:
 def test_orders_add_up_to_all_light(hall: Bench, name: str) -> None:
     """Path by path, so pixel by pixel to the rounding: direct light in mirrors, indirect light, that of lamps.
 
-    (Planted: a path that ends one surface early, or before it runs into a lamp or the lens; an order counted twice;
-    mirrors counted as surfaces only on one side.)
+    (Planted: a path that ends before it runs into the sky; an order that is kept with the one before; light to the sky
+    that is kept of any order; second points of neighbours likewise.)
     """
     tracer = tracers(hall)[name]
     parts = {order: tracer.of_orders(order, order).trace(1, 0, 16) for order in (0, 1, 2, 3)}
@@ -77,8 +76,26 @@ def test_orders_add_up_to_all_light(hall: Bench, name: str) -> None:
         whole = by_path(every, kind, name)
         summed = sum(by_path(each, kind, name) for each in parts.values())
         np.testing.assert_allclose(summed, whole, rtol=1e-4, atol=1e-6 * whole.max())
-    assert {*parts[0].kind} <= {AMBIENT} and {*parts[1].kind} <= {DIRECT, AMBIENT} and INDIRECT in parts[2].kind
-    assert all(light.value.any() for order, light in parts.items() if order > 1)
+    assert {*parts[0].kind} <= {AMBIENT} and {*parts[1].kind} <= {DIRECT, AMBIENT}
+    for order in (2, 3, 4):
+        assert INDIRECT in parts[order].kind and DIRECT not in parts[order].kind
+
+
+def test_the_sky_is_seen_or_lights_the_sheet_once(shared_scene: Callable[..., Path]) -> None:
+    """Around a sheet of albedo 0.5, |x|, |y| < 64 mm at 400 mm: all sky of radiance 20 is order 0, all sheet order 1.
+
+    Paths find the sky by connections and by running into it, which share the light of the sheet. (Planted: what is run
+    into counted as one surface more; the sky's share of connections left out.)
+    """
+    bench = open_bench(shared_scene("sky", extra=SKY))
+    tracer = tracers(bench)["camera"]
+    sheet, stop = seen(64 / 400), seen(bench.geometry.tan_half_fov)
+    for order, expected in enumerate((20 * (stop - sheet), 10 * sheet)):
+        found = [tracer.of_orders(order, order).trace(seed, 0, 64) for seed in range(SEEDS)]
+        total, error = mean(np.array([light.value.sum() / 64 for light in found]))
+        assert SIGMAS * error < 0.1 * expected
+        assert abs(total - expected) < SIGMAS * error
+    assert not tracer.of_orders(2, ANY).trace(0, 0, 64).value.any()
 
 
 def by_path(light: Deposits, kind: int, side: str) -> np.ndarray:
