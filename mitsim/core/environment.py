@@ -11,6 +11,7 @@ from types import ModuleType
 
 from mitsim.core import llvm
 from mitsim.core.errors import MitsimError
+from mitsim.core.worker import held_back
 
 DEFAULT_VARIANT = "llvm_ad_mono"
 """One panchromatic reflectance, as the factored estimator has it; the others cost time and change nothing else."""
@@ -59,9 +60,15 @@ def load_variant(name: str) -> ModuleType:
 
     Setting a variant is Mitsuba's own process-wide state; nothing in mitsim does so except by this call.
     Raises MitsimError for an unknown variant, a Mitsuba that cannot be imported, a missing LLVM, or a missing GPU.
+    Control-C counts once Mitsuba is there.
     """
     if name.startswith("llvm_"):
         llvm.select_llvm()
+    with held_back():
+        return _loaded(name)
+
+
+def _loaded(name: str) -> ModuleType:
     try:
         import mitsuba
     except ImportError as error:

@@ -13,8 +13,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NoReturn
 
@@ -97,6 +97,20 @@ def advise(text: str) -> None:
     """Note what to do, ``text`` without a full stop, should the running command be cut short; empty for nothing."""
     if _advice is not None:
         _advice[:] = text.encode()[:_LONGEST_ADVICE].ljust(_LONGEST_ADVICE, b"\0")
+
+
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Signals that stop this process wait until the block ends: native code that is being imported turns what they
+    raise into errors of its own. Threads that begin in it leave them to the main one for good."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def stopped() -> bool:

@@ -36,7 +36,7 @@ STUBBORN = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + WAIT
 def start(work: str) -> subprocess.Popen[str]:
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     command, pipe = [sys.executable, "-c", PROGRAM.format(work=work)], subprocess.PIPE
-    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=buffered)
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=buffered)
 
 
 def started(work: str) -> tuple[subprocess.Popen[str], int]:
@@ -287,3 +287,53 @@ def test_a_little_more_comes_to_the_check_of_memory(tmp_path: Path) -> None:
     space = worker._SPACE_BYTES + worker._SPACE_BYTES_PER_PROCESSOR * workers()
     done = limited(int(space / 1024) + 1, "capture", "photograph", "--patterns", "uniform", "-o", str(tmp_path / "run"))
     assert done.returncode == 2 and "of memory; allowed are" in done.stderr, done.stderr
+
+
+HELD = """
+from mitsim.core.worker import held_back
+try:
+    with held_back():
+        print(os.getpid(), flush=True)
+        sys.stdin.readline()
+        time.sleep(0.2)
+        print("imported", flush=True)
+    print("not reached")
+except KeyboardInterrupt:
+    end_stopped()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_what_holds_it_back(number: signal.Signals) -> None:
+    """As the import of Mitsuba does, in which an interrupt ended with a traceback. (Planted: nothing held back.)"""
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process, _ = started(HELD)
+    signal.signal(signal.SIGINT, before)
+    process.send_signal(number)
+    words = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    out, err = process.communicate("\n", timeout=20)
+    assert (out, err, process.returncode) == ("imported\n", f"mitsim: {words}\n", 128 + number)
+
+
+IMPORT = """
+from mitsim.core.environment import load_variant
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "mitsuba":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+try:
+    load_variant("llvm_ad_mono")
+    print("not reached")
+except KeyboardInterrupt:
+    print("mitsuba" in sys.modules, "drjit" in sys.modules)
+    end_stopped()
+"""
+
+
+def test_control_c_while_mitsuba_is_imported_waits_for_it() -> None:
+    """(Planted: nothing held back.)"""
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process = start(IMPORT)
+    signal.signal(signal.SIGINT, before)
+    assert (*process.communicate(), process.returncode) == ("True True\n", "mitsim: interrupted\n", 130)
