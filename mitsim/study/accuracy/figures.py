@@ -83,7 +83,7 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     Parameters
     ----------
     costs
-        of parts, those first that matter most.
+        of parts, those first that matter most; shares of one stand after it.
     accuracy
         whose samples they were timed with.
     """
@@ -99,7 +99,7 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     shortest = min(spans, default=0.01) / 10
     for place, part in zip(places, costs, strict=True):
         face = BLUE if part.in_plan else "white"
-        dot = {"color": BLUE, "mfc": face, "ms": 8, "zorder": 3}
+        dot = {"color": BLUE, "mfc": face, "ms": 6 if part.of else 8, "zorder": 3}
         if part.error_if_off > 0:
             errors.plot([floor, part.error_if_off], [place, place], color=LINK, lw=2, zorder=1)
             errors.plot([part.error_if_off, part.error_bound], [place, place], "|-", color=BLUE, lw=1, zorder=2)
@@ -120,7 +120,7 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
             seconds.plot([extra.median], [place], "o", **{**dot, "color": VERMILION, "mfc": VERMILION})
             _beside(seconds, extra.most, place, f"{extra.median:.2g} s")
     for axes, title in (
-        (errors, "error that is left without it, and what it is below at 95 %"),
+        (errors, "error that is left without it"),
         (seconds, "seconds that it takes"),
     ):
         axes.set_xscale("log")
@@ -134,9 +134,10 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     errors.set_ylim(-0.7, len(costs) - 0.3)
     label_axes(errors, "relative error of the frames [1]", "", grid="x")
     label_axes(seconds, f"wall time of light and frames at {accuracy:g} [s]", "", grid="x")
+    errors.plot([], [], "|-", color=BLUE, lw=1, label="below this at 95 %")
     if not all(part.in_plan for part in costs):
         errors.plot([], [], "o", color=BLUE, mfc="white", ms=8, label="left out by the plan")
-        figure.legend(fontsize=FONT - 1, frameon=False, loc="outside lower center")
+    figure.legend(fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=2)
     return figure
 
 
