@@ -285,7 +285,7 @@ def trace_light(
     followed = bool(simulation.indirect or simulation.from_camera)
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, labels, stream) for stream in streams]
-    rounds = _FIRST if _mostly_followed(simulation) else 1.0
+    rounds = first_round(simulation)
     while True:
         for group in groups:
             group.sample(rounds)
@@ -371,7 +371,12 @@ def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, fl
     return light, bound
 
 
-def samples_of(simulation: Simulation, rounds: float = 1.0) -> dict[str, int]:
+def first_round(simulation: Simulation) -> float:
+    """Times the samples that the plan of a ``simulation`` predicted with which sampling begins."""
+    return _FIRST if _mostly_followed(simulation) else 1.0
+
+
+def samples_of(simulation: Simulation, rounds: float) -> dict[str, int]:
     """Samples of a group, by the name of what is traced: so many times those that the plan of a ``simulation``
     predicted, in ``rounds``."""
     wanted = {}
