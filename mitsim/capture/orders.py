@@ -20,10 +20,20 @@ class OfOrders(Simulation):
     direct light, no glint."""
 
     def __init__(self, bench: Bench, settings: Settings, fewest: int, most: int) -> None:
+        """What is followed.
+
+        Parameters
+        ----------
+        bench, settings
+            as for :class:`Simulation`.
+        fewest, most
+            orders of the light that is kept.
+        """
         super().__init__(bench, settings)
         self._orders = fewest, most
 
     def tracers(self) -> dict[str, Stage]:
+        """Those that follow light, by the name of their stage."""
         found = {}
         for name, stage in super().tracers().items():
             if isinstance(stage.tracer, FollowingTracer):
@@ -31,4 +41,5 @@ class OfOrders(Simulation):
         return found
 
     def glint_frames(self, labels: Labels) -> ClassFrames | None:
+        """None, whatever the ``labels``: glint is not followed by any of these tracers."""
         return None
