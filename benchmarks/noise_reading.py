@@ -28,7 +28,6 @@ import numpy as np
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.rig.camera import CameraGeometry, centred_edges
-from mitsim.rig.mask import mls_mask
 from mitsim.study.exposures import CONVENTIONS, EQUAL_PEAK, EQUAL_TOTAL
 from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
 from mitsim.study.solver_cost import dots
@@ -59,7 +58,7 @@ class Case:
 def factor_at(distance: float) -> np.ndarray:
     """Phi (512, 128) of the paper's camera with its mask at ``distance`` [mm]."""
     camera = CameraGeometry.checked("the paper's camera", mask_distance=distance)
-    mask, scene = mls_mask(camera.mask, camera.mask_feature, camera.mask_order), centred_edges(N, WIDTH_MM / N)
+    mask, scene = camera.build_mask(), centred_edges(N, WIDTH_MM / N)
     profile = mask.terms[0][1]
     return scene_factor(profile, mask.feature_mm, camera.pixel_edges, scene, distance, camera.scene_distance)
 

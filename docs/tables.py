@@ -25,13 +25,14 @@ from mitsim.core.manifests import (
     ShotFile,
 )
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.profile import MaskProfile
 from mitsim.rig.projector import ProjectorModel
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.rig.sensor import SensorModel
 
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
-    *(CameraGeometry, SensorModel, ProjectorModel, SessionRecipe),
+    *(CameraGeometry, SensorModel, MaskProfile, ProjectorModel, SessionRecipe),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}

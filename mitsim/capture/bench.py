@@ -405,18 +405,20 @@ def open_bench(
     Raises
     ------
     MitsimError
-        for anything wrong with the files, or a camera file whose pixel pitch is not the scene's.
+        for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
+        scene's where the camera file has one.
     """
     path = locate(scene, "scenes", "scene.xml")
     defines = {name: _text(value) for name, value in parameters.items()}
     Outline(path, defines, SceneFiles(path, allow_outside_files))  # what it refuses needs no renderer
     sensor_path = locate(camera if camera is not None else "imx249", "calibration", ".toml")
     projector_path = locate(projector if projector is not None else "mp_cl1", "calibration", ".toml")
+    from mitsim.rig.profile import load_mask
     from mitsim.rig.projector import ProjectorModel
     from mitsim.rig.rig import Rig
     from mitsim.rig.sensor import load_sensor
 
-    sensor = load_sensor(sensor_path)
+    sensor, mask = load_sensor(sensor_path), load_mask(sensor_path)
     light = load_model(projector_path, ProjectorModel)
     # Only now, with all else checked: the renderer takes a second to import.
     mitsuba = load_variant(variant)
@@ -437,6 +439,13 @@ def open_bench(
             f"camera {sensor_path}: states no quantum_efficiency, so light makes no known number of electrons; "
             "give one, with its source"
         )
+    if mask is not None:
+        if "mask" in defines:
+            raise MitsimError(
+                f"camera {sensor_path}: has a table [mask], and the scene's mask was set to {defines['mask']!r} as "
+                "well; give one of the two"
+            )
+        loaded.camera.wear(mask.worn(loaded.camera.geometry, sensor_path.parent))
     rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
     return Bench(loaded, rig, variant, defines)
 

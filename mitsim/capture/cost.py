@@ -10,6 +10,7 @@ from mitsim.capture.prices import Numbers, entries
 from mitsim.core.resources import Cost
 from mitsim.optics.frames import PROBES, frames_in_memory
 from mitsim.rig.patterns import Lighting
+from mitsim.rig.plate import FEW
 
 _LANES_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
@@ -21,6 +22,8 @@ _ENTRY_BYTES = 45.0
 45 where matrices are large."""
 _DEPOSIT_BYTES = 500.0
 """A path's light while it is filed; measured."""
+_TERM_BYTES = 3 * 16.0
+"""A pixel and cell of a term of a mask of many: both sides in the shadow, stacked, and picked for a frame."""
 _EXPOSED = 6
 """Frames in double precision that each exposed frame takes as much as: its light, electrons, numbers and squares, and
 electrons and numbers of the chunk before, which is written meanwhile."""
@@ -94,7 +97,10 @@ def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
     filed = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
     paths = min(LANES_AT_ONCE, _paths(bench.n**2, settings))
     followed = bool(settings.effects & names(lambda effect: effect.followed))
-    return _LANES_BYTES + _FOLLOWED_BYTES * followed + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES
+    geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
+    terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
+    factors = _TERM_BYTES * terms * geometry.pixels * cells * len(settings.depths)
+    return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES
 
 
 def _paths(pixels: int, settings: Settings) -> float:

@@ -68,7 +68,7 @@ class Physics:
         return cls(
             geometry=bench.geometry,
             projector=bench.projector_optics,
-            spectrum=bench.spectrum,
+            spectrum=bench.spectrum if bench.geometry.diffracts else None,
             black_level=bench.projector.black_level,
             speckle=bench.projector.speckle_contrast,
             lamps=bench.loaded.lamps,
@@ -215,7 +215,14 @@ EFFECTS: Mapping[str, Effect] = _registry(
         followed=True,
         in_reference=True,
     ),
-    Effect("diffraction", {"spectrum": None}, note=_diffraction, first_look=True, in_shadow=True),
+    Effect(
+        "diffraction",
+        {"spectrum": None},
+        absent="the mask is no sum of two separable terms: its shadow is geometric",
+        note=_diffraction,
+        first_look=True,
+        in_shadow=True,
+    ),
     Effect("mask-thickness", {"geometry.mask_thickness": 0.0}, absent="the mask is thin", in_reference=True),
     Effect(
         "pixel-response",

@@ -199,6 +199,11 @@ class SceneFacts:
                 f"mask_thickness {geometry.mask_thickness} mm shifts the far face by "
                 f"{geometry.wall_shift_features:.1f} features at the field stop; the two-face model holds below 1"
             )
+        if not geometry.diffracts and (switches or {}).get("diffraction") is not False:
+            warnings.append(
+                f"diffraction is left out: it is worked out for masks of one or two separable terms, and this one "
+                f"({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is meant"
+            )
         longest = float(bench.spectrum.wavelengths_nm.max())
         if geometry.mask_feature * 1e6 < longest:
             warnings.append(

@@ -56,8 +56,8 @@ class Session:
 
     @property
     def centre(self) -> bool:
-        """Whether row and column means are taken out of every response, for a FlatCam mask."""
-        return self.bench.geometry.mask == "flatcam"
+        """Whether row and column means are taken out of every response, as for a FlatCam mask."""
+        return self.bench.geometry.centred
 
     @cached_property
     def signs(self) -> FloatArray:

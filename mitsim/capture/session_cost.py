@@ -51,7 +51,7 @@ def session_seconds(board: Bench, count: int, shots: int, settings: Settings) ->
         cells=cells,
         # Single lines that are mixed, or the half of all that is +1.
         lit=(1 if mixed else n / 2) / cells,
-        terms=float(len(board.spectrum.weights) * (2 if board.geometry.mask == "flatcam" else 1)),
+        terms=float(len(board.spectrum.weights) * board.geometry.mask_terms),
         shots=count,
         classes=n,
     )

@@ -11,15 +11,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.shadow import Directions
+from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.plate import FEW
 from mitsim.rig.projector import Spectrum
 
 IntArray = npt.NDArray[np.integer]
@@ -27,7 +29,7 @@ Entries = tuple[IntArray, FloatArray]
 """Distinct indices into (layers, rows, columns), and the light [W m^-2] at each."""
 _HELD = 8
 """Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
-_shadow = lru_cache(maxsize=24)(shadow_terms)
+_kept_shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 
 
@@ -180,6 +182,11 @@ class FrameOptics:
         layer, place = np.divmod(flat, self.shape[0] * self.shape[1])
         chosen = [np.flatnonzero(layer == index) for index in range(len(self._layers))]
         return [(place[inside], light[inside]) for inside in chosen]
+
+
+def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
+    """The shadow of ``geometry`` toward ``directions``; of masks of many terms, 100 MiB each, none is kept."""
+    return (shadow_terms if geometry.mask_terms > FEW else _kept_shadow)(geometry, *directions)
 
 
 class _Stack:

@@ -23,6 +23,7 @@ clear aperture of both faces, propagated from the exit face: diffraction inside 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations
 
@@ -36,6 +37,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.optics.profile import Steps, smooth_box_means
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
+from mitsim.rig.plate import FEW, Plate
 from mitsim.rig.projector import Spectrum
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -105,6 +107,7 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
     spectrum
         its lines one after the other; the terms of each are in the order of the module's formula.
     """
+    shadow = _of_fields(shadow)
     weights = _pair_weights(shadow.weights())
     means = _thick_means if shadow.thickness_mm else _thin_means
 
@@ -137,11 +140,23 @@ def wave_profiles(
     -------
     (weight, (cells,) profile) of each separable term, and the start and the step [mm] of the grid.
     """
+    shadow = _of_fields(shadow)
     waves = _prepare(shadow, wavelength_nm, np.array([low_mm]), np.array([high_mm]))
     start = _start(shadow, waves.step_mm, low_mm)
     rows = [profile for _, profile, _ in shadow.mask.terms]
     products = _products([waves.field(clear, start) for clear in shadow.clear(rows, tau)])
     return list(zip(_pair_weights(shadow.weights()), products, strict=True)), start, waves.step_mm
+
+
+def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
+    """The ``shadow`` with the mask whose values are the factors of a field; MitsimError for one of many terms."""
+    mask = shadow.mask.amplitude
+    if isinstance(mask, Plate) and mask.crosses is None:
+        raise MitsimError(
+            f"{mask.words}: its field is no sum of {FEW} separable terms, and diffraction is worked out for those "
+            "alone; use --effects=-diffraction for its geometric shadow"
+        )
+    return replace(shadow, mask=mask)
 
 
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:

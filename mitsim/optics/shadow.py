@@ -34,6 +34,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.profile import Steps
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import Mask
+from mitsim.rig.plate import Plate
 
 SeparableTerms = list[tuple[FloatArray, FloatArray]]
 _WIDE = 32
@@ -94,7 +95,7 @@ class ShadowGeometry:
         (row, column) of the mask's centre.
     """
 
-    mask: Mask
+    mask: Mask | Plate
     pixel_centres_mm: FloatArray
     active_mm: float
     distance_mm: float

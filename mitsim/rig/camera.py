@@ -11,23 +11,27 @@ import math
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError
-from mitsim.rig.mask import Mask, MaskKind, mls_mask
+from mitsim.rig.mask import CameraMask, Mask, mls_mask
+from mitsim.rig.plate import FEW, Plate, within
 
 
 class CameraGeometry(BaseModel):
     """Bare sensor under a coded mask; the defaults are the geometry of Zheng & Asif, section IV-A."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
+    )
 
     pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side (square sensor)")
     """More than the largest square sensors, 10 560; a frame of it has 2 GiB."""
     pixel_pitch: float = Field(0.01172, ge=1e-6, le=1e3, description="sensor pixel pitch [mm]")
     """A nanometre to a metre: shadows keep at least eight digits there (tests/hard/test_hard_shadows.py)."""
-    mask: MaskKind = Field("separable", description="mask construction")
+    mask: CameraMask = Field("separable", description="mask construction; plate: what a camera file's [mask] gives")
     mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
     """The orders of :func:`mitsim.rig.mask.mls_code`: 3 to 65 535 features a side."""
     mask_feature: float = Field(0.06, ge=1e-6, le=1e3, description="mask feature size [mm]")
@@ -53,6 +57,8 @@ class CameraGeometry(BaseModel):
         0.0, ge=0, le=1000, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
     )
     """1000 halves the response at 2 degrees, far less than any microlens."""
+    mask_plate: SkipJsonSchema[Plate | None] = Field(None, exclude=True)
+    """The mask ``plate``, which no scene states."""
 
     @model_validator(mode="after")
     def _mask_lies_before_the_scene(self) -> CameraGeometry:
@@ -63,6 +69,17 @@ class CameraGeometry(BaseModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _a_plate_is_there(self) -> CameraGeometry:
+        if (self.mask == "plate") != (self.mask_plate is not None):
+            raise ValueError("mask: got 'plate' without one; a camera file's table [mask] gives it, with --camera")
+        if self.mask_plate is not None and self.mask_thickness and self.mask_plate.crosses is None:
+            raise ValueError(
+                f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms "
+                f"({self.mask_plate.words}) is thin, so set 0"
+            )
+        return self
+
     @classmethod
     def checked(cls, where: str, **values: object) -> CameraGeometry:
         """Build from loose ``values``; a bad one raises MitsimError with one line that begins with ``where``."""
@@ -70,8 +87,10 @@ class CameraGeometry(BaseModel):
 
     @property
     def identity(self) -> dict[str, object]:
-        """What manifests say of it: all fields, but for an offset of 0, which calibrations of 0.4 do not know."""
-        return {name: value for name, value in self if value or not name.startswith("mask_offset")}
+        """What manifests say of it: all fields, but for an offset of 0 and no plate, which calibrations of 0.4 do not
+        know."""
+        known = {name: value for name, value in self if value or not name.startswith(("mask_offset", "mask_plate"))}
+        return known if self.mask_plate is None else {**known, "mask_plate": self.mask_plate.identity}
 
     @property
     def half_width(self) -> float:
@@ -103,9 +122,40 @@ class CameraGeometry(BaseModel):
         """Mask coordinates (row, column) of the mask's centre [mm]; (0, 0) on the axis."""
         return self.mask_offset_row, self.mask_offset_column
 
-    def build_mask(self) -> Mask:
-        """The mask that these numbers describe, in coordinates of its own centre."""
-        return mls_mask(self.mask, self.mask_feature, self.mask_order)
+    def build_mask(self) -> Mask | Plate:
+        """The mask that these numbers describe, in coordinates of its own centre; of a plate what can be seen."""
+        if self.mask != "plate":
+            return mls_mask(self.mask, self.mask_feature, self.mask_order)
+        if self.mask_plate is None:
+            raise MitsimError("mask: got 'plate' without one; give a camera file with a table [mask]")
+        seen = self.half_width + (self.mask_distance + self.mask_thickness) * self.tan_half_fov
+        return within(self.mask_plate, seen + self.pixel_pitch + max(map(abs, self.mask_offset)))
+
+    @property
+    def centred(self) -> bool:
+        """Whether a separable solver takes row and column means off this camera's frames, as for a FlatCam mask."""
+        mask = self.build_mask()
+        return mask.centred if isinstance(mask, Plate) else mask.kind == "flatcam"
+
+    @property
+    def diffracts(self) -> bool:
+        """Whether the field behind the mask is a sum of few enough separable terms for diffraction to be simulated."""
+        mask = self.build_mask().amplitude
+        return not isinstance(mask, Plate) or mask.crosses is not None
+
+    @property
+    def mask_words(self) -> str:
+        """The mask in words."""
+        return (
+            self.mask_plate.words
+            if self.mask == "plate" and self.mask_plate
+            else f"{self.mask}, order {self.mask_order}"
+        )
+
+    @property
+    def mask_terms(self) -> int:
+        """Separable terms of the mask."""
+        return len(self.build_mask().terms)
 
     def fresnel_number(self, wavelength_nm: float) -> float:
         """a^2 / (lambda d) of one mask feature at ``wavelength_nm``: well above 1, a geometric shadow is good."""

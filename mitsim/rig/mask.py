@@ -18,6 +18,8 @@ from mitsim.core.errors import MitsimError
 
 MaskKind = Literal["separable", "flatcam", "open"]
 """How a plate is made from a code; see :class:`Mask`."""
+CameraMask = Literal["separable", "flatcam", "open", "plate"]
+"""The mask of a camera: a :class:`Mask`, or a :class:`mitsim.rig.plate.Plate`."""
 Term = tuple[float, FloatArray, FloatArray]
 """Weight, row profile (N,) and column profile (N,) of a separable part of a transmission."""
 BoolArray = npt.NDArray[np.bool_]
@@ -78,6 +80,11 @@ class Mask(ByValue):
             return ((1.0, profile, profile),)
         signed = 2 * self.bits.astype(np.float64) - 1
         return ((0.5, ones, ones), (0.5, signed, signed))
+
+    @property
+    def amplitude(self) -> Mask:
+        """The mask whose values are the factors of a field: itself, as roots of 0 and 1 are 0 and 1."""
+        return self
 
     @property
     def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from mitsim.core.configuration import load_model
+from mitsim.core.configuration import read_toml, validated
 
 EXPOSURE_S = 1e-12, 1e6
 """Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""
@@ -276,8 +276,11 @@ class SensorModel(BaseModel):
 
 
 def load_sensor(path: Path | str) -> SensorModel:
-    """The sensor in the TOML file at ``path``. MitsimError names the file, field, value and rule."""
-    return load_model(path, SensorModel)
+    """The sensor in the TOML file at ``path``, whose table ``[mask]`` is another's
+    (:func:`mitsim.rig.profile.load_mask`). MitsimError names the file, field, value and rule."""
+    table = read_toml(path)
+    table.pop("mask", None)
+    return validated(SensorModel, table, f"file {path}")
 
 
 def paper_sensor(full_well_e: float, gain: float, dynamic_range_db: float) -> SensorModel:

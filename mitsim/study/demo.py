@@ -251,7 +251,7 @@ def _configuration(evidence: _Evidence) -> dict[str, object]:
         "projector": bench.projector.name,
         "parameters": ", ".join(f"{name} = {value}" for name, value in bench.defines.items()) or "the scene's own",
         "sensor": f"{geometry.pixels} x {geometry.pixels} pixels of {geometry.pixel_pitch * 1e3:g} um",
-        "mask": f"{geometry.mask}, order {geometry.mask_order}, {geometry.mask_feature * 1e3:g} um, "
+        "mask": f"{geometry.mask_words}, {geometry.mask_feature * 1e3:g} um, "
         f"{geometry.mask_distance:g} mm from the sensor",
         "scene plane": f"{geometry.scene_distance:g} mm, {bench.n} x {bench.n} projector pixels",
         f"exposure ({label(evidence.main)})": f"{evidence.shots.exposure_s:.3g} s a frame",

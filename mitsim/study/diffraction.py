@@ -31,7 +31,7 @@ from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solver import prepare
-from mitsim.rig.mask import MaskKind
+from mitsim.rig.mask import CameraMask
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.recipe import load_recipe
 from mitsim.study import plots
@@ -50,7 +50,7 @@ from mitsim.study.ideal import (
 from mitsim.study.knobs import reformed
 from mitsim.study.metrics import Quality, psnr
 
-MASKS: tuple[MaskKind, ...] = ("separable", "flatcam")
+MASKS: tuple[CameraMask, ...] = ("separable", "flatcam")
 ASSUMED, SEPARABLE, CALIBRATED = "geometric factors", "best separable factors", "calibrated factors"
 _PROFILE_MM = 0.7
 """Half of what is shown of a point's shadow: a dozen mask features, whose fringes can be told apart."""
@@ -218,7 +218,7 @@ class _Trials:
 
     def _rows(
         self,
-        case: tuple[str, MaskKind, str],
+        case: tuple[str, CameraMask, str],
         exposer: Exposer,
         family: PatternFamily,
         expected: ExpectedFrames,

@@ -22,7 +22,7 @@ from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.mask import MaskKind
+from mitsim.rig.mask import CameraMask
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.projector import Spectrum
 from mitsim.sensor.chain import electrons_from_irradiance
@@ -50,13 +50,13 @@ class IdealCamera:
     """The idealised camera of a ``bench``, with one mask in one light (``spectrum`` None: the geometric shadow)."""
 
     bench: Bench
-    mask: MaskKind
+    mask: CameraMask
     spectrum: Spectrum | None = None
 
     @property
     def centre(self) -> bool:
         """Whether a solver takes row and column means off its frames."""
-        return self.mask == "flatcam"
+        return self._geometry.centred
 
     @cached_property
     def terms(self) -> SeparableTerms:

@@ -39,7 +39,6 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.sides import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.rig.camera import CameraGeometry, centred_edges
-from mitsim.rig.mask import mls_mask
 from mitsim.study.metrics import relative_error
 
 Precision = Literal["float64", "float32 frames", "float32 products"]
@@ -118,7 +117,7 @@ def paper_factor() -> FloatArray:
     """Phi (512, 128) of the paper's camera and scene: both sides of its idealised model."""
     camera = CameraGeometry.checked("the paper's camera")
     scene = centred_edges(_SCENE_PIXELS, _SCENE_WIDTH / _SCENE_PIXELS)
-    mask = mls_mask(camera.mask, camera.mask_feature, camera.mask_order)
+    mask = camera.build_mask()
     return scene_factor(
         mask.terms[0][1], mask.feature_mm, camera.pixel_edges, scene, camera.mask_distance, camera.scene_distance
     )

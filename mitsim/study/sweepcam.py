@@ -122,7 +122,7 @@ def _consistent(factors: Places, bench: Bench, white: Callable[[float, float], F
     for place, (left, right) in factors.items():
         told = np.outer(left.sum(axis=1), factors[first][1].sum(axis=1))
         seen = Exposer(bench.rig, 1.0, 0).electrons(white(place, first))
-        if bench.geometry.mask == "flatcam":
+        if bench.geometry.centred:
             told, seen = centred(told), centred(seen)
         share = float(np.vdot(told, seen) / np.vdot(seen, seen))
         found[place] = left / share, right * share
@@ -216,7 +216,7 @@ class MovedMask:
     @property
     def _centre(self) -> bool:
         """Whether every frame and factor loses its means, which stacked ones must lose one by one."""
-        return self.lit.bench.geometry.mask == "flatcam"
+        return self.lit.bench.geometry.centred
 
     def _side(self, axis: int, place: float) -> FloatArray:
         factor = self.factors[place][axis]

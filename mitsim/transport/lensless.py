@@ -12,9 +12,10 @@ cos(theta) d omega written in t. A sample draws u inside its pixel's active squa
 face is open, evenly among all that the field stop shows from u (:mod:`mitsim.transport.openings`), which makes t. It
 traces the ray from u and returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T =
 tan(fov / 2) and p the part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole
-field stop three of four rays would end at a separable mask. The mask is a factor, not geometry: thin geometry suffers
-from Mitsuba's ray epsilon and blocks connections to delta lights. Diffraction is the factored estimator's: here light
-travels along rays.
+field stop three of four rays would end at a separable mask. Where a plate is not open in a few grids, the place is
+drawn from a rectangle that holds all that is open, and M(u + d t) is one more factor of the weight. The mask is a
+factor, not geometry: thin geometry suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
+Diffraction is the factored estimator's: here light travels along rays.
 
 The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks
 along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.
@@ -23,7 +24,7 @@ along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as
 parameter               unit      default     meaning
 ======================  ========  ==========  =================================================================
 ``pixel_pitch``         mm        0.01172     pixel pitch; the film's size gives the number of pixels (square)
-``mask``                -         separable   ``separable``, ``flatcam`` or ``open``
+``mask``                -         separable   ``separable``, ``flatcam`` or ``open``; a camera file may give others
 ``mask_order``          -         9           order of the maximum length sequence (2^order - 1 features a side)
 ``mask_feature``        mm        0.06        feature size
 ``mask_distance``       mm        2           sensor to mask (the face next to the sensor)
@@ -60,6 +61,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.plate import Plate
 from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.openings import Openings
 from mitsim.transport.registering import register_once
@@ -106,14 +108,24 @@ def _sensor_class() -> type:
             if list(self.film().crop_size()) != list(self.film().size()):
                 raise MitsimError(f"{PLUGIN}: the film is cropped; the whole sensor is simulated, remove the crop")
             _check_rigid(self.world_transform())
-            self.geometry = _geometry(props, self.film().size())
             self._points: tuple[int, int] | None = None
-            mask = self.geometry.build_mask()
-            self._openings, terms = Openings(mask), mask.terms
-            self._weights = [weight for weight, _, _ in terms]
-            self._rows = [mi.Float(rows.astype(np.float32)) for _, rows, _ in terms]
-            self._columns = [mi.Float(columns.astype(np.float32)) for _, _, columns in terms]
-            self._features = len(terms[0][1])
+            self.wear(_geometry(props, self.film().size()))
+
+        def wear(self, geometry: CameraGeometry) -> None:
+            """Take the camera of a ``geometry``, which has the mask of a camera file."""
+            self.geometry = geometry
+            mask = geometry.build_mask()
+            self._openings, self._feature = Openings(mask), mask.feature_mm
+            self._features = round(mask.extent_mm / mask.feature_mm)
+            self._weights, self._rows, self._columns, self._values = [], [], [], None
+            self._whole = isinstance(mask, Plate) and mask.grids is None
+            if isinstance(mask, Plate):
+                self._values = mi.Float(mask.values.astype(np.float32).ravel())
+                return
+            for weight, rows, columns in mask.terms:
+                self._weights.append(weight)
+                self._rows.append(mi.Float(rows.astype(np.float32)))
+                self._columns.append(mi.Float(columns.astype(np.float32)))
 
         def stratify(self, points: tuple[int, int] | None) -> None:
             """Draw u and t of a pixel's paths from Sobol points that are scrambled by (seed, paths a pixel) ``points``.
@@ -132,6 +144,8 @@ def _sensor_class() -> type:
             u = (1 - 2 * self._active(sample2)) * geometry.half_width
             t, weight = self._direction(u, sample3)
             squared = 1 + dr.squared_norm(t)
+            if self._whole:
+                weight *= self._transmission(u + geometry.mask_distance * t, active)
             if geometry.mask_thickness:
                 weight *= self._transmission(u + (geometry.mask_distance + geometry.mask_thickness) * t, active)
             if geometry.angular_exponent:
@@ -172,7 +186,7 @@ def _sensor_class() -> type:
         def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
             """Tan-angles t from sensor points u [mm] to open places of the mask, and the part of all that is open."""
             geometry = self.geometry
-            stop, side = geometry.tan_half_fov, geometry.mask_feature
+            stop, side = geometry.tan_half_fov, self._feature
             # What the field stop shows of the mask, in features from the mask's first corner.
             first = [
                 (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._features
@@ -187,11 +201,13 @@ def _sensor_class() -> type:
             """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""
             row, column = rows_columns(point.x, point.y)
             row_centre, column_centre = self.geometry.mask_offset
-            row = dr.floor((row - row_centre) / self.geometry.mask_feature + 0.5 * self._features)
-            column = dr.floor((column - column_centre) / self.geometry.mask_feature + 0.5 * self._features)
+            row = dr.floor((row - row_centre) / self._feature + 0.5 * self._features)
+            column = dr.floor((column - column_centre) / self._feature + 0.5 * self._features)
             inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)
             inside &= active
             row, column = mi.UInt32(dr.maximum(row, 0)), mi.UInt32(dr.maximum(column, 0))
+            if self._values is not None:
+                return dr.gather(mi.Float, self._values, row * self._features + column, inside)
             total = mi.Float(0)
             for weight, rows, columns in zip(self._weights, self._rows, self._columns, strict=True):
                 left = dr.gather(mi.Float, rows, row, inside)

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.rig.mask import BoolArray, Mask
+from mitsim.rig.plate import Plate
 
 
 class OpenAxis:
@@ -68,9 +69,9 @@ class _Seen:
 
 
 class Openings:
-    """The open places of a ``mask``."""
+    """The open places of a ``mask``; of a plate without grids of them, a rectangle that holds them."""
 
-    def __init__(self, mask: Mask) -> None:
+    def __init__(self, mask: Mask | Plate) -> None:
         self._grids = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
 
     def drawn(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:

@@ -157,7 +157,7 @@ class FineLight:
         list(ExpectedFrames([filed], Lighting(rows, timed), 0))
         seconds = (time.perf_counter() - started) / len(timed)
         cells = max(simulation.fine.bundle.cells)
-        lines = len(self.bench.spectrum.weights) * (2 if self.bench.geometry.mask == "flatcam" else 1)
+        lines = len(self.bench.spectrum.weights) * self.bench.geometry.mask_terms
         return Forming(
             pixels=self.bench.geometry.pixels,
             cells=cells,

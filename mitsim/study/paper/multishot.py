@@ -66,7 +66,7 @@ def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
         family = lit.bench.family(f"dots:{round(point['frames'] ** 0.5)}")
     else:
         family = PatternFamily(UNIFORM, np.ones((n, point["frames"]), np.int8), np.ones((n, 1), np.int8))
-    centre, sides = lit.bench.geometry.mask == "flatcam", _factors(studio, point, lit)[0.0]
+    centre, sides = lit.bench.geometry.centred, _factors(studio, point, lit)[0.0]
     frames = Unexposed(lit, model, family, sides, centre, seed if model == RENDERED else seed + 1)
     return {exposure: Image.of(frames, frames.seconds(exposure)) for exposure in EXPOSURES}
 

@@ -1,0 +1,193 @@
+"""Masks that a camera file draws: the separable mask's own frames, rays counted through any mask, and the reference.
+
+Rationale: a drawing of a mask that the code has by name is that mask, so its frames are, to the last bit; what a mask
+of many terms casts is told by asking its transmission at points, which knows nothing of terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import open_bench
+from mitsim.capture.effects import EFFECTS
+from mitsim.capture.plan import SceneFacts
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.mask import mls_mask
+from mitsim.rig.plate import Plate
+from mitsim.rig.projector import Spectrum
+
+LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))
+
+
+def drawn(kind: str, order: int) -> np.ndarray:
+    mask = mls_mask(kind, 0.06, order)
+    return sum(weight * np.outer(rows, columns) for weight, rows, columns in mask.terms)
+
+
+def camera_file(folder: Path, name: str, values: np.ndarray | None) -> Path:
+    """The default camera with a drawing ``values`` for a mask; as it is without one."""
+    path, text = folder / f"{name}.toml", shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    if values is not None:
+        np.save(folder / f"{name}.npy", values)
+        text += f'\n[mask]\nkind = "drawing"\nfeature_mm = 0.06\nfile = "{name}.npy"\n'
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_a_drawn_mask_casts_the_named_masks_frames(
+    kind: str, small_scene: Callable[..., Path], variant: str, tmp_path: Path
+) -> None:
+    """Both estimators, diffraction on. The separable mask's one term is its code: to the last bit. FlatCam's two come
+    out as two others of the same sum; of these the reference draws its places in another order. (Planted: grids'
+    columns for rows.)"""
+    scene = small_scene(mask=kind, mask_order=8)
+    named, plate, turned = (
+        open_bench(scene, variant, camera_file(tmp_path, name, drawing))
+        for name, drawing in (("named", None), ("plate", drawn(kind, 8)), ("turned", drawn(kind, 8)[::-1]))
+    )
+    assert plate.geometry.mask == "plate" and plate.geometry.centred == named.geometry.centred
+    own, other, expected = (bench.render("factored", accuracy=0.05).mean for bench in (plate, turned, named))
+    np.testing.assert_allclose(own, expected, rtol=0 if kind == "separable" else 1e-6)
+    assert np.linalg.norm(other - expected) > 0.05 * np.linalg.norm(expected)
+    if kind == "separable":
+        own, expected = (bench.render("reference", spp=16).mean for bench in (plate, named))
+        np.testing.assert_array_equal(own, expected)
+
+
+@pytest.mark.parametrize("spectrum", [None, LINES])
+@pytest.mark.parametrize("kind", ["separable", "flatcam", "open"])
+@pytest.mark.parametrize("thickness", [0.0, 0.1])
+def test_a_drawn_mask_casts_the_named_masks_shadow(kind: str, thickness: float, spectrum: Spectrum | None) -> None:
+    """(Planted: the column not divided by the pivot; fields of the transmission's root twice.)"""
+    rows, columns = Directions(np.linspace(-0.1, 0.12, 6), 0.003), Directions(np.linspace(-0.1, 0.1, 5), 0.003)
+    named = CameraGeometry(pixels=24, mask=kind, mask_order=6, mask_thickness=thickness)
+    plate = named.model_copy(update={"mask": "plate", "mask_plate": Plate(0.06, drawn(kind, 6), "it")})
+    expected, own = (shadow_terms(camera, rows, columns, 400.0, spectrum) for camera in (named, plate))
+    if kind != "flatcam":
+        for ours, theirs in zip(own, expected, strict=True):
+            assert all(np.array_equal(*pair) for pair in zip(ours, theirs, strict=True))
+    whole, same = (sum(np.einsum("ij,kl->ikjl", *term) for term in terms) for terms in (expected, own))
+    np.testing.assert_allclose(same, whole, rtol=0, atol=1e-10)
+    assert kind == "open" or whole.std() > 0.1
+
+
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_the_reference_draws_a_plates_places_as_the_named_masks(kind: str, variant: str) -> None:
+    """The separable mask's rays, one by one; of FlatCam's as many are open. A plate of many grids weighs each ray by
+    its place: the mean weight is its open part. (Planted: the place's transmission left out.)"""
+    import mitsuba as mi
+
+    named = CameraGeometry(pixels=32, mask=kind, mask_order=6)
+    plate = named.model_copy(update={"mask": "plate", "mask_plate": Plate(0.06, drawn(kind, 6), "it")})
+    rough = np.random.default_rng(8).random((63, 63))
+    random = plate.model_copy(update={"mask_plate": Plate(0.06, rough, "it")})
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": "mitsim_lensless", "film": film})
+    samples = np.random.default_rng(5).random((4, 100_000)).astype(np.float32)
+    seen = {}
+    for name, geometry in (("named", named), ("plate", plate), ("random", random)):
+        sensor.wear(geometry)
+        ray, weight = sensor.sample_ray(0.0, 0.5, mi.Point2f(*samples[:2]), mi.Point2f(*samples[2:]))
+        seen[name] = np.array(ray.d), np.array(weight).ravel()
+    if kind == "separable":
+        assert all(np.array_equal(*pair) for pair in zip(seen["plate"], seen["named"], strict=True))
+    np.testing.assert_allclose(seen["plate"][1].mean(), seen["named"][1].mean(), rtol=1e-3)
+    # 1e5 draws of a value with a relative deviation of 0.6: 0.002, five of them.
+    solid = np.mean((2 * plate.tan_half_fov) ** 2 * seen["random"][0][2] ** 4)
+    places = np.add.outer(
+        np.linspace(-1, 1, 2001) * plate.half_width, np.linspace(-1, 1, 2001) * 2 * plate.tan_half_fov
+    )
+    along = np.bincount(np.floor(places.ravel() / 0.06 + 63 / 2).astype(int), minlength=63) / places.size
+    visible = along @ rough @ along
+    assert seen["random"][1].mean() / solid == pytest.approx(visible, rel=0.01)
+
+
+@pytest.mark.parametrize("spectrum", [None, LINES])
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_grey_masks_dim_by_their_transmission(kind: str, spectrum: Spectrum | None) -> None:
+    """A field's factor is the root of it: 0.3 of the light behind the open part, diffracted or not. (Planted: the
+    transmission for the amplitude.)"""
+    at = Directions(np.linspace(-0.1, 0.1, 5), 0.003)
+    full, grey = (
+        CameraGeometry(pixels=16, mask="plate", mask_plate=Plate(0.06, part * drawn(kind, 6), "it"))
+        for part in (1.0, 0.3)
+    )
+    whole, dimmed = (
+        sum(np.einsum("ij,kl->ikjl", *t) for t in shadow_terms(c, at, at, 400.0, spectrum)) for c in (full, grey)
+    )
+    np.testing.assert_allclose(dimmed, 0.3 * whole, rtol=0, atol=1e-12)
+    assert whole.std() > 0.1
+
+
+def test_a_frame_equals_rays_counted_through_a_random_grey_mask() -> None:
+    """A point source: its rays to 40 x 40 points of each pixel, off the axis. (Planted: columns before rows; the part
+    beyond sight cut on one side; weights left out.)"""
+    values = np.random.default_rng(4).random((61, 61))
+    camera = CameraGeometry(
+        pixels=40, pixel_pitch=0.03, mask="plate", mask_plate=Plate(0.06, values, "it"), scene_distance=30.0,
+        mask_offset_row=0.131, mask_offset_column=-0.077,
+    )  # fmt: skip
+    assert camera.mask_terms < 61
+    fine = (np.arange(40 * 40) + 0.5) / 40 * 0.03 - camera.half_width
+    tau, offset = np.array([0.05, -0.08]), np.array(camera.mask_offset)
+    row, column = (fine * (1 - 2 / 30) + at * 2 - off for at, off in zip(tau, offset, strict=True))
+    index = [np.floor(s / 0.06 + 61 / 2).astype(int) for s in (row, column)]
+    counted = values[np.ix_(*index)].reshape(40, 40, 40, 40).mean(axis=(1, 3))
+    rows, columns = (Directions([at], 0.0) for at in tau)
+    frame = sum(left @ right.T for left, right in shadow_terms(camera, rows, columns, 30.0))
+    assert counted.std() > 0.1
+    # An edge is counted to half a point: 1/80 of a pixel, one edge a pixel along each side at most.
+    assert np.abs(frame - counted).max() < 0.025 and np.abs(frame - counted).mean() < 0.004
+
+
+def test_masks_of_many_terms_say_that_diffraction_is_left_out(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path
+) -> None:
+    random = np.random.default_rng(2).integers(0, 2, (63, 63))
+    bench = open_bench(small_scene(), variant, camera_file(tmp_path, "random", random))
+    assert any("diffraction is left out" in warning for warning in SceneFacts.of(bench).warnings)
+    assert not SceneFacts.of(bench, {"diffraction": False}).warnings
+    assert not EFFECTS["diffraction"].present(bench)
+    at = Directions([0.0], 0.0)
+    with pytest.raises(MitsimError, match=r"^drawing random.npy: .*--effects=-diffraction[^\n]*$"):
+        shadow_terms(bench.geometry, at, at, 400.0, LINES)
+
+
+def test_one_mask_is_stated_once(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
+    scene = small_scene()
+    scene.write_text(
+        scene.read_text().replace('"mask" value="separable"', '"mask" value="$mask"').replace(
+            "<integrator", '<default name="mask" value="open"/><integrator', 1
+        )
+    )  # fmt: skip
+    camera = camera_file(tmp_path, "own", drawn("separable", 6))
+    assert open_bench(scene, variant, camera).geometry.mask == "plate"
+    with pytest.raises(MitsimError, match=r"table \[mask\].*'flatcam'"):
+        open_bench(scene, variant, camera, mask="flatcam")
+
+
+@pytest.mark.slow
+def test_the_reference_sees_the_same_random_grey_mask(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path
+) -> None:
+    """Slope of the reference's frame on the factored one less its mean, 8 seeds of 128 samples a pixel: 1 to five
+    standard errors of their mean. (Planted: the place's transmission left out; rows for columns.)"""
+    values = np.random.default_rng(5).random((511, 511)) * (np.random.default_rng(6).random((511, 511)) < 0.4)
+    bench = open_bench(small_scene(), variant, camera_file(tmp_path, "grey", values))
+    factored = bench.render("factored", effects={"diffraction": False, "black-level": False}).mean
+    contrast = factored - factored.mean()
+    seeds = [bench.render("reference", spp=128, seed=seed).mean for seed in range(8)]
+    slopes = np.array([np.vdot(frame, contrast) / np.vdot(contrast, contrast) for frame in seeds])
+    error = slopes.std(ddof=1) / 8**0.5
+    assert error < 0.05 and abs(slopes.mean() - 1) < 5 * error
+    assert np.mean(seeds) == pytest.approx(factored.mean(), rel=0.02)
