@@ -28,6 +28,10 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import Frame
+from mitsim.optics.separable import best_term, centred
+from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, decibels
 from mitsim.rig.patterns import Lighting, hadamard_matrix
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
@@ -58,6 +62,24 @@ class Session:
     def centre(self) -> bool:
         """Whether row and column means are taken out of every response, as for a FlatCam mask."""
         return self.bench.geometry.centred
+
+    @cached_property
+    def mask_warnings(self) -> tuple[str, ...]:
+        """What the best separable camera leaves of this one's geometric shadow between projector pixels and sensor,
+        where a plate makes it much. Stripes, whose lines add up, show less of it."""
+        geometry = self.bench.geometry
+        if geometry.mask_plate is None:
+            return ()
+        rows, columns = (Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows)
+        terms = shadow_terms(geometry, rows, columns, geometry.scene_distance)
+        residual = best_term(centred(terms) if self.centre else terms).residual
+        if residual <= SEPARABLE_RESIDUAL:
+            return ()
+        return (
+            f"the mask ({geometry.mask_words}) is not separable: the best separable one leaves {residual:.1%} of its "
+            f"shadow, {-decibels(residual):.1f} dB below it, and images of these factors lack it; straighten the mask, "
+            "or take a separable one",
+        )
 
     @cached_property
     def signs(self) -> FloatArray:

@@ -311,11 +311,16 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
 
 
+def decibels(part: float) -> float:
+    """An rms ``part`` of a signal in dB, -20 for a tenth."""
+    return float(20 * np.log10(part))
+
+
 def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, int], figures: str) -> Status:
     if inseparable:
         return Status(
             Verdict.NOT_SEPARABLE,
-            f"Responses are not separable: {residual:.1%} of them is left over",
+            f"Responses are not separable: {residual:.1%} of them is left over ({decibels(residual):.1f} dB)",
             "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure",
             figures,
         )

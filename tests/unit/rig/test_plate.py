@@ -45,7 +45,7 @@ def test_the_one_term_of_a_drawn_mls_mask_is_its_code() -> None:
 
 def test_any_other_mask_is_its_singular_vectors_but_for_what_is_stated() -> None:
     """Singular values that fall by ten each: as many terms as the bound asks for, and the stated rest is the rest.
-    Rows and columns come up to nine times, as in a drawing of several pixels a feature. (Planted: weights of rows left out.)"""
+    Rows and columns come up to nine times, as in drawings of several pixels a feature. (Planted: no weights.)"""
     rng = np.random.default_rng(0)
     left, right = (np.linalg.qr(rng.normal(size=(20, 20)))[0] for _ in range(2))
     values = (left * 0.1 ** np.arange(20)) @ right
