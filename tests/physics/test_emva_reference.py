@@ -49,8 +49,8 @@ def test_the_reference_package_agrees_on_the_same_frames(
         full_well_e=20_000.0, read_noise_e=4.0, gain_dn_per_e=0.19, black_level_dn=60.0, bits=12, dsnu_pixel_e=3.0,
         dsnu_row_e=1.5, dsnu_column_e=2.0, prnu_pixel=0.01, prnu_row=0.003, prnu_column=0.004, linearity=bent,
     )  # fmt: skip
-    # Two steps are saturated: the package looks for the largest variance from the last step down, and stops at the
-    # first local one, so noise among more of them would end its search.
+    # Two steps are saturated: the package looks for the largest variance from the last step down, and stops at a local
+    # one, so noise among more of them would end its search.
     light = 20_800.0 * np.arange(1, STEPS + 1) / STEPS
     ladder = np.array([[frame(model, e, "ladder", i, side) for side in (0, 1)] for i, e in enumerate(light)])
     dark = np.array([frame(model, 0.0, "dark", side) for side in (0, 1)])

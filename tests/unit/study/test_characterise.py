@@ -38,7 +38,7 @@ def camera(name: str) -> SensorModel:
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_what_is_set_is_found_within_five_predicted_standard_errors(name: str) -> None:
-    """(Planted: gain 2 % off in the chain; 1/12 DN^2 left in the dark noise; response before the row split.)"""
+    """(Planted: gain 10 % off in the chain; nonuniformity set to twice its deviation.)"""
     done = characterise(camera(name), SMALL)
     assert not done.warnings
     rows = {row.name: row for row in done.rows}
@@ -57,7 +57,7 @@ def test_shipped_cameras_have_sources_and_are_found_as_their_files_say(name: str
 def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> None:
     """Twelve sessions of a nonuniform camera: each figure's deviations, as a chi-square of 12 (significance 1e-4 each).
 
-    (Planted: a pair's variance with the error of one frame's; specimens' own errors left out.)
+    (Planted: half the ladder's noise in the prediction.)
     """
     off = np.array(
         [
