@@ -155,9 +155,13 @@ def variant() -> str:
     return "llvm_ad_mono"
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def shipped_bench(variant: str) -> Callable[..., object]:
-    """Benches of the shipped scenes, each opened once: ``shipped_bench("photograph", mask="flatcam")``."""
+    """Benches of the shipped scenes, each opened once a module: ``shipped_bench("photograph", mask="flatcam")``.
+
+    No longer: kernels of Dr.Jit hold the surfaces of every scene that is open, so one that stays open makes those of
+    all later tests larger, and others than in a process that never had it: they would be compiled anew.
+    """
     from mitsim.capture.bench import open_bench
 
     @cache
