@@ -10,6 +10,8 @@ INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
 # Byte code is written also where the environment says not to: the suite starts some sixty programs, each of which would
 # compile all that it imports, for a second or more.
 test test-all robustness: export PYTHONDONTWRITEBYTECODE :=
+# One thread of BLAS in a test process: more would wait, busily, on the processors of the other test processes.
+test test-all robustness: export OMP_NUM_THREADS := 1
 
 # One test process a processor.
 PARALLEL := -n logical --maxprocesses 8 --dist worksteal
