@@ -77,7 +77,7 @@ def test_a_sheet_alone_hides_nothing(small_scene: Callable[..., Path]) -> None:
     assert occluded_pixels(Simulation(open_bench(small_scene(n=16)), Settings(depth=Z)), 1e-3, 0) == ()
 
 
-def frames(bench: Bench, settings: Settings, samples: int = 128) -> np.ndarray:
+def frames(bench: Bench, settings: Settings, samples: int = 32) -> np.ndarray:
     """(shots, pixels, pixels) of four shots, from the same points whatever the anchors."""
     lighting = parse_patterns("dots:3", N).lighting.shots([0, 4])
     made, light = Simulation(bench, settings), None
