@@ -16,11 +16,13 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer.main
 
 from tests.kept_plans import plans_kept
 from tests.system.interrupted import PATTERNS
@@ -43,6 +45,8 @@ source = "made for a test"
 """
 PROJECTOR = 'name = "test projector"\neffective_wavelength_nm = 562.0\n'
 MITSIM = Path(sys.executable).with_name("mitsim")
+_commands = cache(typer.main.get_command)
+"""Typer builds all commands anew whenever one is called, for longer than most refusals take."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,8 @@ def call(*arguments: object, cwd: Path | None = None) -> Outcome:
     sys.argv = ["mitsim", *map(str, arguments)]
     os.chdir(cwd or kept)
     try:
-        with _captured() as (out, err):
+        with _captured() as (out, err), pytest.MonkeyPatch.context() as patch:
+            patch.setattr(typer.main, "get_command", _commands)
             try:
                 cli.run()
                 code: object = None
