@@ -98,7 +98,7 @@ def both(bench: Bench, pixels: np.ndarray, samples: int) -> tuple[np.ndarray, np
     "name", [pytest.param(name, marks=LONGER if name in ("plate", "blend") else ()) for name in SCENES]
 )
 def test_aimed_rays_find_the_same_light(lit: Callable[[str], tuple[Bench, np.ndarray]], name: str) -> None:
-    aimed, even = both(*lit(SCENES[name]), 1024)
+    aimed, even = both(*lit(SCENES[name]), 512)
     error = np.hypot(aimed.std(axis=0, ddof=1), even.std(axis=0, ddof=1)) / np.sqrt(SEEDS)
     scale = even.mean()
     assert scale > 0 and np.median(error) < 0.02 * scale
@@ -118,7 +118,7 @@ def test_lobes_are_found_behind_what_lets_light_pass(
     bench, pixels = lit(plate(metal(1e-2)) + before)
     alone = lit(plate(metal(1e-2)))[0]
     found, expected = (
-        sharp_light(each.loaded.scene, each.loaded.camera, each.projector_optics, each.geometry, 3, 2**20 // N**2)
+        sharp_light(each.loaded.scene, each.loaded.camera, each.projector_optics, each.geometry, 3, 2**19 // N**2)
         for each in (bench, alone)
     )
     gate = 5 * np.hypot(found.error, part * expected.error)
@@ -152,7 +152,7 @@ def test_the_width_of_a_lobe_is_not_that_of_its_share(lit: Callable[..., tuple[B
     for bsdf in (metal(3e-3), varnish(3e-3)):
         bench, _ = lit(plate(bsdf))
         parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, bench.geometry
-        widths.append(sharp_light(*parts, 5, 2**20 // N**2).width)
+        widths.append(sharp_light(*parts, 5, 2**19 // N**2).width)
     assert widths[1] == pytest.approx(widths[0], rel=0.1)
 
 
