@@ -155,12 +155,12 @@ def test_anchors_of_followed_light_come_true(bench: Bench, evidence: Evidence) -
     every = frozenset(effects.present(bench)) - {"speckle"}
     base = Settings(depth=evidence.depth, subdivision=2, effects=every)
     light = np.linalg.norm(frames(bench, base))
-    judge = frames(bench, replace(base, followed_anchors=5), 64, 256)
-    actual = np.linalg.norm(frames(bench, base, 64, 256) - judge) / light
+    judge = frames(bench, replace(base, followed_anchors=5), 64, 96)
+    actual = np.linalg.norm(frames(bench, base, 64, 96) - judge) / light
     found = evidence.ladders["followed_anchors"]
     assert actual > 1e-3, "the scene has to call for it"
     assert promised(found[1].value, actual)
-    few = np.linalg.norm(frames(bench, replace(base, followed_anchors=2), 64, 256) - judge) / light
+    few = np.linalg.norm(frames(bench, replace(base, followed_anchors=2), 64, 96) - judge) / light
     assert few < actual / 2
 
 
@@ -267,11 +267,13 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 
 
-def test_the_pilot_is_reproducible(bench: Bench, evidence: Evidence) -> None:
-    again = measured(bench, seed=3)
+def test_the_pilot_is_reproducible(bench: Bench) -> None:
+    """Of few shots and at a loose accuracy: all parts of the pilot have their turn."""
+    lighting = parse_patterns("dots:2", N).lighting
+    one, again = (pilot.measure(bench, lighting, 0.1, 3) for _ in range(2))
     for name in ("depth", "layers", "effects", "ladders"):
-        assert getattr(again, name) == getattr(evidence, name)
-    assert np.array_equal(again.changes.products, evidence.changes.products)
+        assert getattr(again, name) == getattr(one, name)
+    assert np.array_equal(again.changes.products, one.changes.products)
 
 
 @pytest.mark.slow
