@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mitsim.core.configuration import read_toml, validated
@@ -154,9 +153,9 @@ class SensorModel(BaseModel):
         if self.linearity and not math.isfinite(self.full_well_e):
             raise ValueError("linearity is relative to the full well; give a finite full_well_e")
         if self.linearity:
-            part = np.arange(_LEVELS + 1) / _LEVELS
-            rises = sum(((k + 1) * c * part**k for k, c in enumerate(self.linearity, 1)), start=np.ones(_LEVELS + 1))
-            if not (np.isfinite(rises).all() and rises.min() > 0):
+            parts = [level / _LEVELS for level in range(_LEVELS + 1)]
+            rises = [1 + sum((k + 1) * c * part**k for k, c in enumerate(self.linearity, 1)) for part in parts]
+            if not all(0 < rise < math.inf for rise in rises):
                 raise ValueError(f"linearity {self.linearity} falls below the full well; more light must read as more")
         return self
 
