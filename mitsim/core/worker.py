@@ -31,7 +31,8 @@ _SPACE_BYTES = 0.7e9
 _SPACE_BYTES_PER_PROCESSOR = 85e6
 """What each processor adds, buffers and stacks of two OpenBLAS; measured."""
 _AGAIN_S = 0.01
-"""After which an interrupt that was dropped comes again: the callback that dropped it is over by then."""
+"""After which an interrupt that was dropped comes again, and again: the callback that dropped it is over by then, and one
+that comes just before Python waits for something would not wake it."""
 _LONGEST_ADVICE = 256
 """Bytes; chosen so that any sentence fits."""
 
@@ -167,6 +168,7 @@ def _stop(number: int, _: FrameType | None) -> None:
 
 
 def _again(_: int, __: FrameType | None) -> None:
+    signal.setitimer(signal.ITIMER_REAL, 0)
     raise KeyboardInterrupt
 
 
@@ -176,7 +178,7 @@ def _unraisable(lost: sys.UnraisableHookArgs) -> None:
     if not stopped():
         sys.__unraisablehook__(lost)
     elif lost.exc_type is KeyboardInterrupt:
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S, _AGAIN_S)
 
 
 def _end_with_parent(reading: int) -> None:
