@@ -57,7 +57,7 @@ class CameraGeometry(BaseModel):
         0.0, ge=0, le=1000, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
     )
     """1000 halves the response at 2 degrees, far less than any microlens."""
-    mask_plate: SkipJsonSchema[Plate | None] = Field(None, exclude=True)
+    mask_plate: SkipJsonSchema[Plate | None] = Field(None, exclude=True, description="mask of a camera file")
     """The mask ``plate``, which no scene states."""
 
     @model_validator(mode="after")
