@@ -171,7 +171,8 @@ def test_registering_needs_a_variant() -> None:
 
 
 def test_the_manual_lists_the_parameters_of_the_geometry() -> None:
-    """The table of the module's docstring: every field that a scene states but ``pixels`` (the film's), in order, with its default."""
+    """The table of the module's docstring: every field that a scene states but ``pixels`` (the film's), in order, with
+    its default."""
     from mitsim.rig.camera import CameraGeometry
     from mitsim.transport import lensless
 
