@@ -25,6 +25,7 @@ from mitsim.core.manifests import (
     ShotFile,
 )
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.framelist import DarkFile, FrameList, StripeFile
 from mitsim.rig.profile import MaskProfile
 from mitsim.rig.projector import ProjectorModel
 from mitsim.rig.recipe import SessionRecipe
@@ -34,6 +35,7 @@ FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
     *(CameraGeometry, SensorModel, MaskProfile, ProjectorModel, SessionRecipe),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
+    *(FrameList, StripeFile, DarkFile),
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 

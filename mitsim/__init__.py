@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mitsim.core.resources import Limits
     from mitsim.core.runs import Capture, load_run
     from mitsim.reconstruct.factors import Factors, load_calibration
+    from mitsim.reconstruct.measured import calibrate_frames
     from mitsim.reconstruct.reconstruction import reconstruct
     from mitsim.reconstruct.result import Reconstruction
     from mitsim.rig.recipe import load_recipe
@@ -40,6 +41,7 @@ _HOMES = {
     "load_run": "core.runs",
     "load_calibration": "reconstruct.factors",
     "load_recipe": "rig.recipe",
+    "calibrate_frames": "reconstruct.measured",
     "reconstruct": "reconstruct.reconstruction",
     "psnr": "study.metrics",
     "ssim": "study.metrics",
@@ -71,6 +73,7 @@ __all__ = [
     "Reconstruction",
     "Rendered",
     "Request",
+    "calibrate_frames",
     "load_calibration",
     "load_recipe",
     "load_run",

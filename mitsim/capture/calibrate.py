@@ -18,7 +18,7 @@ from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Exposure
 from mitsim.capture.run import digital_scale
-from mitsim.capture.session import SIDES, LitSession, Response, Session
+from mitsim.capture.session import LitSession, Response, Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
@@ -28,6 +28,7 @@ from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
+from mitsim.rig.patterns import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 NOISY, NOISE_FREE = "noisy", "noise_free"

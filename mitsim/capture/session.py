@@ -24,7 +24,6 @@ from mitsim.capture.request import Exposure
 from mitsim.capture.session_cost import session_cost, session_seconds
 from mitsim.capture.stripes import stripe_frames
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import Frame
@@ -32,12 +31,11 @@ from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, decibels
-from mitsim.rig.patterns import Lighting, hadamard_matrix
+from mitsim.rig.patterns import SIDES, Lighting, stripe_signs
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
 
 Result = TypeVar("Result")
-SIDES = ("horizontal", "vertical")
 _NUMBERS_AT_ONCE = 2**15
 """Numbers of frames that become a response at a time: so few stay in the cache. Whole frames of a sensor of 2048 pixels
 took ten times as long."""
@@ -84,13 +82,7 @@ class Session:
     @cached_property
     def signs(self) -> FloatArray:
         """(n, N) first n rows of the smallest Hadamard matrix that has them; column 0 is all +1."""
-        n = self.bench.n
-        for order in range(n, 2 * n + 1):  # with a power of two among them
-            try:
-                return hadamard_matrix(order)[:n].astype(np.float64)
-            except MitsimError:
-                continue
-        raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
+        return stripe_signs(self.bench.n).astype(np.float64)
 
     @property
     def pairs(self) -> bool:

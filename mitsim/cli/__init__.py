@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,6 +34,7 @@ from mitsim.cli.options import (
     Quiet,
     Resume,
     Scene,
+    SceneOrFrames,
     Seconds,
     Seed,
     Variant,
@@ -58,6 +60,10 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+_OF_FRAMES = {"frames", "output", "as_json", "quiet"}
+"""Options of `mitsim calibrate` that go with --frames."""
+_SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files"}
+"""Options that are not called like their parameter."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -247,8 +253,12 @@ def capture(
 
 @app.command()
 def calibrate(
-    scene: Scene,
+    context: typer.Context,
     output: Annotated[Path, typer.Option("-o", "--output", help="calibration folder to make", metavar="CAL")],
+    scene: SceneOrFrames = None,
+    frames: Annotated[
+        Path | None, typer.Option(help="folder with the frames of a real session, instead of a scene", metavar="DIR")
+    ] = None,
     accuracy: Accuracy = 1e-3,
     camera: Camera = None,
     projector: Projector = None,
@@ -263,7 +273,13 @@ def calibrate(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """Render a Hadamard session on a white board and estimate the camera's factors."""
+    """Render a Hadamard session on a white board, or read the frames of a real one, and estimate the camera's
+    factors."""
+    if frames is not None:
+        given = (name for name in context.params if _is_given(context, name))
+        return _calibrate_frames(frames, output, sorted({*given} - _OF_FRAMES), as_json, quiet)
+    if scene is None:
+        raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
     from mitsim.core.resources import memory_from_here, peak_memory
     from mitsim.rig.recipe import load_recipe
 
@@ -287,6 +303,56 @@ def calibrate(
         f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
         f"{condition:.2e}",
         f"memory {taken / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
+    ]
+    return finish(as_json, payload, lines, factors.warnings)
+
+
+def _is_given(context: typer.Context, name: str) -> bool:
+    """Whether the command line of a ``context`` names the parameter ``name``."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def _calibrate_frames(folder: Path, output: Path, others: Sequence[str], as_json: bool, quiet: bool) -> int:
+    """Factors from the frames of a real session, and how good they are.
+
+    Parameters
+    ----------
+    folder, output, as_json, quiet
+        as the options of `mitsim calibrate`.
+    others
+        options beside them, which frames leave no choice of.
+
+    Raises
+    ------
+    MitsimError
+        when there are such, and for frames that cannot be used.
+    """
+    if others:
+        name = _SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
+        raise MitsimError(f"--frames {folder}: frames and their list decide; leave out {name}")
+    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.rig.framelist import load_frames
+
+    session = load_frames(folder)  # refused before the estimator is imported
+    from mitsim.reconstruct.measured import calibrate_frames
+
+    held = memory_from_here()
+    with job_of(quiet or as_json) as job:
+        factors = calibrate_frames(session, output, job)
+    payload = {
+        **factors.manifest.result,
+        "memory_bytes": max(peak_memory() - held, 0.0),
+        "output": str(output),
+    }
+    residual, error, condition = (
+        math.inf if payload[name] is None else payload[name]
+        for name in ("separability_residual", "predicted_phi_error", "condition")
+    )
+    lines = [
+        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
+        f"separability residual {residual:.2%}, factor error {error:.1e} by its noise, condition {condition:.2e}",
+        *(f"not known: {text}" for text in payload["not_known"]),
     ]
     return finish(as_json, payload, lines, factors.warnings)
 

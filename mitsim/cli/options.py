@@ -24,6 +24,9 @@ _OPTIONS = {"lam": "lambda"}
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
 
 Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
+SceneOrFrames = Annotated[
+    str | None, typer.Argument(help="scene XML, or the name of a shipped scene; none with --frames", metavar="[SCENE]")
+]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress")]
 Variant = Annotated[

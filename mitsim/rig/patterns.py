@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,9 @@ from mitsim.rig.families import read_name
 
 PatternFactor = npt.NDArray[np.int8]
 """(n, K) of 0/1 or +-1: one side of K separable patterns."""
+Side = Literal["horizontal", "vertical"]
+SIDES: tuple[Side, Side] = ("horizontal", "vertical")
+"""Stripes of a calibration: h_i 1^T, and 1 h_i^T."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +157,22 @@ def hadamard_matrix(order: int) -> PatternFactor:
         above = next(o for o in range(order + 1, 4 * order + 5) if _construct(o) is not None)
         raise MitsimError(f"no Hadamard matrix of order {order} is available; use {below} or {above}")
     return (matrix * matrix[:, :1]).astype(np.int8)
+
+
+def stripe_signs(n: int) -> PatternFactor:
+    """(``n``, N) first rows of the smallest Hadamard matrix that has them; column 0 is all +1.
+
+    The +-1 patterns of a calibration's stripes. MitsimError where no order up to 2 n can be built.
+    """
+    return hadamard_matrix(stripe_count(n))[:n]
+
+
+def stripe_count(n: int) -> int:
+    """N, the stripe patterns of a side for ``n`` projector pixels; MitsimError as :func:`stripe_signs`."""
+    for order in range(n, 2 * n + 1):  # with a power of two among them
+        if _construct(order) is not None:
+            return order
+    raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
 
 
 def hadamard_orders(limit: int) -> list[int]:

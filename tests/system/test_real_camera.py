@@ -14,7 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.capture.exposer import Exposer
+from mitsim.core.arrays import FloatArray
 from mitsim.core.framefile import read_frame, write_frame
+from tests.real_session import RealSession, write_image
+from tests.system.refusals import mentions
 
 CAMERA = {"name": "bench 3"}
 DIGITAL = {"exposure_s": 0.02, "black_level_dn": 160, "gain_dn_per_e": 0.125, "dark_current_e_per_s": 4000}
@@ -138,3 +142,69 @@ def test_the_example_of_the_documentation(call: Callable[..., Any], tmp_path: Pa
     image = read_frame(run / "reconstruction" / "image.exr")[0]["reflectance"]
     # Numbers of 160 in float32 carry 1.5e-5 of rounding, which the factors magnify.
     assert np.allclose(image, truth, atol=0.02)
+
+
+# ---- a calibration from measured frames ------------------------------------------------------------------------------
+
+
+def test_frames_of_a_session_calibrate_as_the_session_did(
+    call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Written as PNG with no more than a camera tells, they give the same image of the same run, to the bit."""
+    frames, shoot = tmp_path / "frames", Exposer.digital
+    frames.mkdir()
+
+    def kept(self: Exposer, electrons: FloatArray, *names: str | int) -> Any:
+        numbers = shoot(self, electrons, *names)
+        write_image(frames / f"{names[1]}_{names[2]}.png", numbers)
+        return numbers
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Exposer, "digital", kept)
+        assert call("calibrate", *lab.rig, "-o", tmp_path / "simulated").code == 0
+    told = json.loads((tmp_path / "simulated" / "manifest.json").read_text())
+    listed = {name: told[name] for name in ("camera", "digital", "board_reflectance")}
+    (frames / "session.json").write_text(json.dumps({**listed, "n": 16, "signed_capture": "pair"}))
+    found = call("calibrate", "--frames", frames, "-o", tmp_path / "measured", "--json").payload
+    assert (found["frames"], found["n"], found["phi_error"]) == (64, 16, None)
+    assert found["predicted_phi_error"] == pytest.approx(told["result"]["phi_error"], rel=0.3)
+    for name in ("left", "right"):
+        ours, theirs = (read_frame(tmp_path / cal / f"{name}.exr")[0]["factor"] for cal in ("measured", "simulated"))
+        assert np.array_equal(ours, theirs), name
+    for calibration in ("simulated", "measured"):
+        options = "--calibration", tmp_path / calibration, "-o", tmp_path / f"image of {calibration}"
+        assert call("reconstruct", lab.run, *options).code == 0
+    images = (read_frame(tmp_path / f"image of {cal}" / "image.exr")[0] for cal in ("simulated", "measured"))
+    assert np.array_equal(*(image["reflectance"] for image in images))
+
+
+def test_what_the_command_says_of_measured_frames(call: Callable[..., Any], tmp_path: Path) -> None:
+    session = RealSession()
+    frames = session.write(tmp_path / "frames")
+    done = call("calibrate", "--frames", "frames", "-o", "cal", cwd=tmp_path)
+    assert done.code == 0 and done.err == "", done.err
+    assert done.out.startswith("16 frames of 4 stripes in ") and "\nnot known: parallax: " in done.out
+    full = session.frame(np.ones((4, 4)))
+    full[0, 0] = 4095
+    write_image(frames / "f_0.png", full)
+    flagged = call("calibrate", "--frames", "frames", "-o", "other", cwd=tmp_path)
+    assert flagged.code == 1 and "warning: saturation: 1 of 16 frames" in flagged.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        ((), ["give a scene, or --frames DIR"]),
+        (("photograph", "--frames", "frames"), ["--frames frames", "leave out SCENE"]),
+        (("--frames", "frames", "--seed", "0"), ["leave out --seed"]),
+        (("--frames", "frames", "-D", "mask=open"), ["leave out -D"]),
+        (("--frames", "nowhere"), ["frames nowhere: no such folder"]),
+        (("--frames", "frames", "-o", "no/where"), ["no/where", "does not exist"]),
+    ],
+    ids=" ".join,
+)
+def test_measured_frames_leave_no_choice(
+    refused: Callable[..., str], tmp_path: Path, arguments: tuple[str, ...], fragments: list[str]
+) -> None:
+    RealSession().write(tmp_path / "frames")
+    mentions(refused("calibrate", "-o", "new", *arguments), *fragments)

@@ -5,8 +5,10 @@ The camera is a toy of random factors, whose frames under any light are known in
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,12 +18,14 @@ import pytest
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.capture.checkpoint import Checkpoint
 from mitsim.capture.exposer import Exposer
-from mitsim.capture.session import SIDES, LitSession, Session, _Shot
+from mitsim.capture.run import digital_scale
+from mitsim.capture.session import LitSession, Session, _Shot
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate
-from mitsim.rig.patterns import Lighting
+from mitsim.reconstruct.measured import calibrate_frames
+from mitsim.rig.patterns import SIDES, Lighting
 from mitsim.rig.recipe import load_recipe
 from mitsim.rig.rig import Rig
 from mitsim.rig.sensor import SensorModel
@@ -343,3 +347,31 @@ def test_light_that_black_pixels_leak_is_in_both_shots_of_a_pair(shots: dict[tup
         shown = Lighting(np.repeat(np.arange(4), 4), np.array([(1 + sign) / 2, (1 - sign) / 2]))
         for index, frame in enumerate(leaking.frames(shown, 0), start=2 * number):
             np.testing.assert_allclose(shots["horizontal", index], unit * frame.irradiance, rtol=1e-9)
+
+
+# ---- frames on disk --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_frames_of_a_session_in_a_folder_give_its_factors_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    """Shots are numbered in the order that a folder's names have. (Planted: the exposure divided before the gain.)"""
+    lit, shoot = lit_session(mode=mode), Exposer.digital
+
+    def kept(self: Exposer, electrons: FloatArray, *names: str | int) -> Digital:
+        numbers = shoot(self, electrons, *names)
+        np.save(tmp_path / f"{names[1]} {names[2]}.npy", numbers)
+        return numbers
+
+    monkeypatch.setattr(Exposer, "digital", kept)
+    simulated, _ = estimate(lit, Job())
+    digital = digital_scale(lit.session.bench, EXPOSURE_S).model_dump(mode="json")
+    listed = {"camera": "toy", "n": 7, "signed_capture": mode, "digital": digital}
+    (tmp_path / "session.json").write_text(json.dumps(listed))
+    measured = calibrate_frames(tmp_path).estimate
+    assert measured is not None and np.array_equal(measured.left, simulated.left)
+    assert np.array_equal(measured.right, simulated.right)
+    assert measured.separability_residual == simulated.separability_residual
+    # Here the noise is that of the light as it was measured, there the closed form.
+    assert measured.unexplained == pytest.approx(simulated.unexplained, abs=0.02)

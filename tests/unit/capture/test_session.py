@@ -21,7 +21,7 @@ from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
-from mitsim.capture.session import SIDES, Session
+from mitsim.capture.session import Session
 from mitsim.capture.session_cost import session_cost
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame
@@ -31,7 +31,7 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Estimate
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.camera import centred_edges
-from mitsim.rig.patterns import Lighting
+from mitsim.rig.patterns import SIDES, Lighting
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

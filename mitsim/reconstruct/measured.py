@@ -1,0 +1,250 @@
+"""A folder with the frames of a real calibration session in; the camera's factors, and what nobody knows of them, out.
+
+Numbers are those of a simulated session: frames of one, written to such a folder, give its factors bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import checksum, verify
+from mitsim.core.imagefile import image_size, own_end, read_image
+from mitsim.core.job import Job
+from mitsim.core.manifests import CalibrationManifest, Digital
+from mitsim.core.output import output_folder
+from mitsim.core.parallel import in_threads, single_threaded_blas, workers
+from mitsim.core.versions import versions
+from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
+from mitsim.reconstruct.factors import Factors
+from mitsim.rig.framelist import UNIFORM, DarkFile, SessionFrames, StripeFile, load_frames
+from mitsim.rig.patterns import SIDES, Side, stripe_signs
+
+
+def calibrate_frames(
+    folder: Path | str | SessionFrames, output: Path | str | None = None, job: Job | None = None
+) -> Factors:
+    """The camera's two factors, from the frames of a real session.
+
+    Parameters
+    ----------
+    folder
+        with the frames and their list, as docs/formats.md describes it; or what :func:`load_frames` says of it.
+    output
+        CAL folder that is written; None keeps the factors in memory.
+    job
+        clock and progress.
+
+    Returns
+    -------
+    Factors
+        flagged where they cannot be trusted: for saturated frames, and responses that are not separable.
+
+    Raises
+    ------
+    MitsimError
+        for frames that are missing, there twice, of different sizes or cannot be read, for a list that breaks a rule,
+        and an output that cannot be written.
+    """
+    job = job or Job()
+    session = folder if isinstance(folder, SessionFrames) else load_frames(folder)
+    _check_sizes(session)
+    if output is None:
+        return _calibrated(session, job)
+    with output_folder(output) as place:
+        factors = _calibrated(session, job)
+        factors.write(place)
+    return factors
+
+
+def _calibrated(session: SessionFrames, job: Job) -> Factors:
+    listed = session.listed
+    readings = _Readings(session)
+    estimate, noise = _estimate(readings, job)
+    warnings: tuple[str, ...] = () if estimate.ok else (str(estimate.status),)
+    if readings.saturated:
+        warnings += (
+            f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
+            f"ADC's end, first {min(readings.saturated)}, so responses are not linear; expose for less",
+        )
+    error = float(np.hypot(*estimate.predicted_error))
+    result = {
+        "n": listed.n,
+        "frames": len(session.files),
+        "separability_residual": estimate.separability_residual,
+        "unexplained_residual": estimate.unexplained,
+        "noise_free_residual": None,
+        "phi_error": None,
+        "predicted_phi_error": error,
+        "response_noise": noise,
+        "condition": estimate.condition,
+        "exposure_s": listed.digital.exposure_s,
+        "saturated_frames": len(readings.saturated),
+        "dark_frames": len(session.dark),
+        "not_known": [*_not_known(session)],
+        "seconds": job.clock.seconds(),
+        "warnings": warnings,
+    }
+    with job.clock.stage("checksums"):
+        sums = in_threads(lambda name: checksum(session.folder / name), session.files)
+    manifest = CalibrationManifest(
+        configuration={
+            "frames": str(session.folder),
+            "list": listed.model_dump(mode="json"),
+            "frames_sha256": dict(zip(session.files, sums, strict=True)),
+        },
+        camera=listed.camera,
+        centre=listed.centre,
+        board_reflectance=listed.board_reflectance,
+        digital=listed.digital,
+        parallax=listed.parallax,
+        result=result,
+        warnings=warnings,
+        versions=versions(),
+    )
+    return Factors.of(estimate, manifest)
+
+
+def _not_known(session: SessionFrames) -> Iterator[str]:
+    """What neither frames nor list tell, and what follows."""
+    listed = session.listed
+    yield "phi_error, noise_free_residual: nobody has exact factors of a real camera; predicted_phi_error is by noise"
+    if not listed.digital.noise_is_stated:
+        yield "digital.read_noise_e: what noise leaves and what no separable camera explains are not told apart"
+    if listed.digital.saturation_dn is None:
+        yield "digital.saturation_dn: frames count as saturated at the largest number of their file, if at all"
+    if listed.board_reflectance is None:
+        yield "board_reflectance: 1 in an image is this board, whatever it reflects"
+    if listed.parallax is None:
+        yield "parallax: `reconstruct --focus` has no other depth than the board's"
+    if session.dark and session.pairs:
+        yield "dark: the difference of a pair's halves has no dark signal, and dark frames are not used"
+
+
+def _check_sizes(session: SessionFrames) -> None:
+    """MitsimError for a frame that cannot be read, or is of another size than the first."""
+    first, *others = session.files
+    size = image_size(session.folder / first)
+    for name in session.files:
+        verify(session.folder, name, {}, "")  # no link out of it
+    for name in others:
+        own = image_size(session.folder / name)
+        if own != size:
+            raise MitsimError(
+                f"frames {session.folder}: {name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}; "
+                "take all with one camera setting"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """One frame: electrons a second, and the :attr:`Digital` of its exposure."""
+
+    rate: FloatArray
+    digital: Digital
+
+
+@dataclass(frozen=True, eq=False)
+class _Readings:
+    """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read.
+
+    Measurements of all patterns are as in a simulated session: :meth:`mitsim.capture.session.LitSession.noisy`.
+    """
+
+    session: SessionFrames
+    saturated: set[str] = field(default_factory=set)
+
+    def response(self, side: Side, index: int) -> tuple[FloatArray, float]:
+        """Response (rows, columns) to a +-1 pattern [electrons/s], and its mean noise variance.
+
+        Parameters
+        ----------
+        side, index
+            of the pattern.
+        """
+        shots = self.session.shots
+        positive = self._read(shots[side, index, 1])
+        if self.session.pairs:
+            negative = self._read(shots[side, index, -1])
+            light = float(positive.rate.mean() + negative.rate.mean())
+            return positive.rate - negative.rate, float(positive.digital.variance(light, 2))
+        uniform = self._uniform[side]
+        response = 2 * positive.rate - uniform.rate
+        variance = 4 * _variance(positive) + _variance(uniform)
+        if self.session.dark:
+            # 2 (Y - D) - (U - D), where both are exposed alike.
+            both = (shots[side, index, 1], 2), (shots[side, 0, UNIFORM], -1)
+            parts: dict[float, int] = {}
+            for shot, weight in both:
+                exposure = self.session.exposure_s(shot)
+                parts[exposure] = parts.get(exposure, 0) + weight
+            for exposure, weight in parts.items():
+                dark, own = self._dark[exposure]
+                response -= weight * dark
+                variance += weight**2 * own
+        return response, variance
+
+    @cached_property
+    def _uniform(self) -> dict[Side, _Reading]:
+        return {side: self._read(self.session.shots[side, 0, UNIFORM]) for side in SIDES}
+
+    @cached_property
+    def _dark(self) -> dict[float, tuple[FloatArray, float]]:
+        """Mean dark frame (rows, columns) [electrons/s] by exposure, and its noise variance."""
+        found = {}
+        for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
+            frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
+            readings = [self._read(frame) for frame in frames]
+            mean = sum((each.rate for each in readings[1:]), start=readings[0].rate) / len(readings)
+            found[exposure] = mean, _variance(readings[0]) / len(readings)
+        return found
+
+    def _read(self, frame: StripeFile | DarkFile) -> _Reading:
+        digital = self.session.listed.digital
+        if frame.exposure_s is not None:
+            digital = digital.model_copy(update={"exposure_s": frame.exposure_s})
+        values = read_image(self.session.folder / frame.file)
+        end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
+        if end is not None and (values >= end).any():
+            self.saturated.add(frame.file)
+        return _Reading(digital.rate(values), digital)
+
+
+def _variance(reading: _Reading) -> float:
+    """Mean noise variance of a ``reading`` [(electrons/s)^2]."""
+    return max(float(reading.digital.variance(float(reading.rate.mean()))), 0.0)
+
+
+@single_threaded_blas()
+def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None]:
+    """Factors, and the rms noise of the responses [electrons/s] where the list states the sensor's."""
+    session = readings.session
+    signs = stripe_signs(session.listed.n).astype(np.float64)
+    count = signs.shape[1]
+    with job.clock.stage("frames"):
+        first = [readings.response(side, 0) for side in SIDES]
+    sums = stripe_sums(first[0][0], first[1][0], count, session.listed.centre)
+    variances = [variance for _, variance in first]
+    step = 4 * workers()
+    for side, own in zip(SIDES, sums, strict=True):
+
+        def looked(index: int, side: Side = side, own: StripeSums = own) -> tuple[Seen, float]:
+            response, variance = readings.response(side, index)
+            return own.seen(response, index), variance
+
+        for start in range(1, count, step):
+            with job.clock.stage("frames"):
+                chunk = in_threads(looked, range(start, min(start + step, count)))
+            for seen, variance in chunk:
+                own.put(seen)
+                variances.append(variance)
+            job.progress(f"{side} stripes", own.done / count)
+    noise = float(np.sqrt(np.mean(variances))) if session.listed.digital.noise_is_stated else None
+    with job.clock.stage("estimate"):
+        return factors_of_sums(*sums, signs, noise), noise

@@ -1,0 +1,233 @@
+"""What the frames of a real calibration session show: a folder with its list in; which file shows what, checked, out.
+
+The list is `session.toml` or `session.json`. Without a list of frames in it the folder's frames count in the order of
+their names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field
+
+from mitsim.core.configuration import Positive, read_toml, validated
+from mitsim.core.errors import MitsimError
+from mitsim.core.imagefile import SUFFIXES
+from mitsim.core.jsonfile import read_json
+from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
+from mitsim.rig.patterns import SIDES, Side, stripe_count
+
+LISTS = ("session.toml", "session.json")
+"""Names of the list."""
+DARK = "dark"
+"""What names of dark frames begin with, where no list names them."""
+UNIFORM = 0
+"""Sign of a frame under uniform light."""
+Key = tuple[Side, int, int]
+"""Side, number of the pattern, and sign of a frame."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+class StripeFile(_Part):
+    """One frame of a session: the +1 or -1 half of a stripe pattern, or the uniform frame of a side."""
+
+    file: FileName = Field(description="name of the frame in the folder, without a path")
+    side: Side = Field(description="stripes along rows, H[:, index] 1^T, or along columns, 1 H[:, index]^T")
+    index: int = Field(ge=0, lt=2 * MOST_PIXELS, description="column of H; 0 of a uniform frame")
+    sign: int = Field(ge=-1, le=1, description="half (1 + P)/2 or (1 - P)/2 of a pattern P; 0: uniform frame")
+    exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as in `digital`")
+
+
+class DarkFile(_Part):
+    """One frame with the projector off."""
+
+    file: FileName = Field(description="name of the frame in the folder, without a path")
+    exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as in `digital`")
+
+
+def _named(camera: Any) -> Any:
+    return {"name": camera} if isinstance(camera, str) else camera
+
+
+class FrameList(_Part):
+    """What a real session's frames are of, and how they are read."""
+
+    camera: Annotated[Plain, BeforeValidator(_named)] = Field(
+        description="identity that a run must share: a name, or anything as a run's manifest has it"
+    )
+    n: int = Field(ge=1, le=MOST_PIXELS, description="projector pixels a side")
+    signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern was captured")
+    digital: Digital = Field(description="how digital numbers become electrons a second, as in a run's manifest")
+    centre: bool = Field(default=False, description="frames lose row and column means (FlatCam masks)")
+    board_reflectance: float | None = Field(
+        default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; none: unknown"
+    )
+    parallax: Parallax | None = Field(
+        default=None, description="how the factors move with depth; none: not known, and no `--focus`"
+    )
+    frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field(
+        default=(), strict=False, max_length=MOST_SHOTS, description="every frame; none: by the order of their names"
+    )
+    dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field(
+        default=(), strict=False, max_length=MOST_SHOTS, description="frames with the projector off"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SessionFrames:
+    """A real session's frames, every one of them there once.
+
+    Attributes
+    ----------
+    folder
+        that holds them.
+    listed
+        what its list says.
+    shots
+        frame by side, number of the pattern, and sign.
+    dark
+        frames with the projector off.
+    """
+
+    folder: Path
+    listed: FrameList
+    shots: dict[Key, StripeFile]
+    dark: tuple[DarkFile, ...]
+
+    @property
+    def pairs(self) -> bool:
+        """Whether a +-1 pattern is the difference of two frames, and not taken from one and a uniform one."""
+        return self.listed.signed_capture == "pair"
+
+    @cached_property
+    def files(self) -> tuple[str, ...]:
+        """Names of all frames, dark ones last."""
+        return (*(shot.file for shot in self.shots.values()), *(frame.file for frame in self.dark))
+
+    def exposure_s(self, frame: StripeFile | DarkFile) -> float:
+        """Exposure of a ``frame`` [s]."""
+        return frame.exposure_s or self.listed.digital.exposure_s
+
+
+def load_frames(folder: Path | str) -> SessionFrames:
+    """Which file of the ``folder`` shows what.
+
+    MitsimError for a folder without a list, a list that breaks a rule, and for frames that are missing or there twice.
+    """
+    folder = Path(folder)
+    lists = [folder / name for name in LISTS if (folder / name).is_file()]
+    if len(lists) != 1:
+        found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
+        raise MitsimError(
+            f"frames {folder}: {found} {' nor '.join(LISTS) if not lists else ' and '.join(LISTS)}; give one, with "
+            "camera, n, signed_capture and digital"
+        )
+    data = read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
+    listed = validated(FrameList, data, f"frames {lists[0]}")
+    wanted = [*_wanted(listed)]
+    if listed.frames:
+        frames, dark = listed.frames, listed.dark
+    else:
+        names = _names(folder)
+        dark = listed.dark or tuple(DarkFile(file=name) for name in names if name.startswith(DARK))
+        names = [name for name in names if name not in {frame.file for frame in dark}]
+        if len(names) != len(wanted):
+            raise MitsimError(
+                f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, signed_capture "
+                f"{listed.signed_capture!r}, are {len(wanted)} ({wanted[0][0]}, then {wanted[-1][0]}); take those that "
+                f"are missing, or name each frame in {lists[0].name}"
+            )
+        frames = tuple(
+            StripeFile(file=name, side=side, index=index, sign=sign)
+            for name, (side, index, sign) in zip(names, wanted, strict=True)
+        )
+    shots = _each_once(folder, frames, wanted)
+    session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
+    _check_files(session)
+    return session
+
+
+def _wanted(listed: FrameList) -> Iterator[Key]:
+    """Frames of a session in the order in which they are taken."""
+    count = stripe_count(listed.n)
+    for side in SIDES:
+        if listed.signed_capture == "uniform":
+            yield side, 0, UNIFORM
+        for index in range(count):
+            for sign in (1, -1) if listed.signed_capture == "pair" else (1,):
+                yield side, index, sign
+
+
+def _names(folder: Path) -> list[str]:
+    """Names of the images in a ``folder``, numbers in them by their value."""
+
+    def order(name: str) -> tuple[list[tuple[int, str]], str]:
+        parts = re.split(r"(\d+)", name)
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
+
+    return sorted((path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=order)
+
+
+def _each_once(folder: Path, frames: Sequence[StripeFile], wanted: Sequence[Key]) -> dict[Key, StripeFile]:
+    """Frames by what they show; MitsimError for one that is wanted and missing, there twice, or not wanted."""
+    shots: dict[Key, StripeFile] = {}
+    known = set(wanted)
+    for frame in frames:
+        key = frame.side, frame.index, frame.sign
+        if key not in known:
+            raise MitsimError(
+                f"frames {folder}: {frame.file} is {_words(key)}, which no such session has; it has "
+                f"{_words(wanted[0])} to {_words(wanted[-1])}; correct n, signed_capture or the frame's entry"
+            )
+        if key in shots:
+            raise MitsimError(
+                f"frames {folder}: {_words(key)} is there twice, {shots[key].file} and {frame.file}; leave one out"
+            )
+        shots[key] = frame
+    missing = [key for key in wanted if key not in shots]
+    if missing:
+        raise MitsimError(
+            f"frames {folder}: {len(missing)} of {len(wanted)} frames are missing, first {_words(missing[0])}; take "
+            "them, and name them in the list"
+        )
+    return shots
+
+
+def _check_files(session: SessionFrames) -> None:
+    """Every file is in the folder, and shows one thing; halves of a pair are exposed alike, dark frames as the others;
+    MitsimError otherwise."""
+    folder, seen = session.folder, set[str]()
+    for name in session.files:
+        if name in seen:
+            raise MitsimError(f"frames {folder}: {name} is listed twice; give each frame its own file")
+        seen.add(name)
+        if not (folder / name).is_file():
+            raise MitsimError(f"frames {folder}: {name} is listed, but no file of that name is there; copy it there")
+    exposures = {session.exposure_s(shot) for shot in session.shots.values()}
+    if session.pairs:
+        for (side, index, sign), shot in session.shots.items():
+            other = session.shots[side, index, -sign]
+            if session.exposure_s(shot) != session.exposure_s(other):
+                raise MitsimError(
+                    f"frames {folder}: {shot.file} and {other.file} are halves of one pattern, exposed for "
+                    f"{session.exposure_s(shot):g} and {session.exposure_s(other):g} s; their dark signal does not "
+                    "cancel; expose them alike"
+                )
+    elif session.dark and (without := exposures - {session.exposure_s(frame) for frame in session.dark}):
+        raise MitsimError(
+            f"frames {folder}: no dark frame is exposed for {min(without):g} s, as other frames are; take one for each "
+            "exposure, or none"
+        )
+
+
+def _words(key: Key) -> str:
+    side, index, sign = key
+    return f"the uniform frame of {side} stripes" if sign == UNIFORM else f"{side} stripes {index} of sign {sign:+d}"

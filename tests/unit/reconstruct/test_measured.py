@@ -1,0 +1,199 @@
+"""Frames of a real session: a camera that is numpy alone, its factors found again from files in any format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import Digital
+from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.measured import calibrate_frames
+from mitsim.rig.framelist import load_frames
+from tests.real_session import COLUMNS, DIGITAL, ROWS, RealSession, write_image, write_list
+
+
+def error(factors: Factors, session: RealSession) -> tuple[float, float]:
+    """Relative errors of both factors; their common scale is c and 1/c."""
+    errors = []
+    for found, exact in ((factors.left, session.left), (factors.right, session.right)):
+        scaled = found * np.vdot(found, exact) / np.vdot(found, found)
+        errors.append(float(np.linalg.norm(scaled - exact) / np.linalg.norm(exact)))
+    return errors[0], errors[1]
+
+
+@pytest.mark.parametrize("ending", ["png", "tif", "npy", "exr"])
+def test_the_factors_of_pairs_are_the_cameras_within_their_stated_noise(tmp_path: Path, ending: str) -> None:
+    """(Planted: halves in the other order, the transposed side, a black level left in.) 96 numbers of a factor tell a
+    noise to 7 %; the product of both is in electrons a second."""
+    session = RealSession()
+    factors = calibrate_frames(session.write(tmp_path / "frames", name=("f_{}." + ending).format))
+    assert factors.ok and factors.estimate is not None, factors.warnings
+    for own, stated in zip(error(factors, session), factors.estimate.predicted_error, strict=True):
+        assert own == pytest.approx(stated, rel=0.25)
+    assert factors.manifest.result["response_noise"] == pytest.approx(factors.estimate.noise, rel=0.05)
+    light = factors.left.sum(axis=1) @ np.ones(ROWS), session.left.sum(axis=1) @ np.ones(ROWS)
+    other = factors.right.sum(axis=1) @ np.ones(COLUMNS), session.right.sum(axis=1) @ np.ones(COLUMNS)
+    assert light[0] * other[0] == pytest.approx(light[1] * other[1], rel=2e-3)
+
+
+def test_frames_against_a_uniform_one_lose_what_dark_frames_show(tmp_path: Path) -> None:
+    """40 DN that the list's black level does not know of: without dark frames the responses are not separable.
+    (Planted: dark frames taken off twice.)"""
+    session = RealSession()
+    folder = session.write(tmp_path / "frames", "uniform", offset=40.0)
+    bad = calibrate_frames(folder)
+    for number in range(4):
+        write_image(folder / f"dark_{number}.png", session.frame(np.zeros((4, 4)), offset=40.0))
+    good = calibrate_frames(folder)
+    assert good.ok and good.manifest.result["dark_frames"] == 4, good.warnings
+    assert max(error(good, session)) < 0.02 < 0.05 < max(error(bad, session))
+    assert good.estimate is not None
+    assert good.manifest.result["response_noise"] == pytest.approx(good.estimate.noise, rel=0.1)
+
+
+def test_names_count_by_their_numbers_and_a_list_by_what_it_says(tmp_path: Path) -> None:
+    """f_10 follows f_9; frames in a list may be in any order and have exposures of their own."""
+    session = RealSession()
+    ordered = calibrate_frames(session.write(tmp_path / "frames"))
+    again = tmp_path / "again"
+    again.mkdir()
+    entries = []
+    for number, (side, index, sign, _) in enumerate(session.shown("pair")):
+        (tmp_path / "frames" / f"f_{number}.png").rename(again / f"x{number}.png")
+        entries.append({"file": f"x{number}.png", "side": side, "index": index, "sign": sign})
+    write_list(again, frames=entries[::-1])
+    listed = calibrate_frames(again)
+    assert np.array_equal(listed.left, ordered.left) and np.array_equal(listed.right, ordered.right)
+
+    longer = [{**entry, "exposure_s": 0.03} if entry["index"] % 2 else entry for entry in entries]
+    for number, (_, index, _, light) in enumerate(session.shown("pair")):
+        write_image(again / f"x{number}.png", session.frame(light, 0.03 if index % 2 else 0.02))
+    write_list(again, frames=longer)
+    mixed = calibrate_frames(again)
+    assert mixed.ok and max(error(mixed, session)) < 0.02
+
+
+def test_the_folder_is_one_that_reconstruct_takes(tmp_path: Path) -> None:
+    frames = RealSession().write(tmp_path / "frames")
+    factors = calibrate_frames(frames, tmp_path / "cal")
+    kept = load_calibration(tmp_path / "cal")
+    assert np.array_equal(kept.left, factors.left) and kept.status.verdict == factors.status.verdict
+    assert kept.manifest.camera == {"name": "bench 3"} and kept.manifest.digital == Digital(**DIGITAL)
+    assert len(kept.manifest.configuration["frames_sha256"]) == 16
+    with pytest.raises(MitsimError, match="holds files already"):
+        calibrate_frames(frames, tmp_path / "cal")
+
+
+def test_what_is_not_known_is_left_out_and_said(tmp_path: Path) -> None:
+    folder = RealSession().write(tmp_path / "frames")
+    told = calibrate_frames(folder).manifest
+    assert told.result["phi_error"] is None and told.result["noise_free_residual"] is None
+    assert told.board_reflectance is None and told.parallax is None
+    assert [text.split(":")[0] for text in told.result["not_known"]] == [
+        "phi_error, noise_free_residual",
+        "board_reflectance",
+        "parallax",
+    ]
+    bare = {name: value for name, value in DIGITAL.items() if name not in ("read_noise_e", "saturation_dn")}
+    write_list(folder, digital=bare)
+    told = calibrate_frames(folder).manifest
+    assert told.result["response_noise"] is None
+    assert {"digital.read_noise_e", "digital.saturation_dn"} <= {
+        text.split(":")[0] for text in told.result["not_known"]
+    }
+
+
+def test_saturated_frames_flag_the_result(tmp_path: Path) -> None:
+    """Where the list does not state the end, that of the file counts. (Planted: `>`.)"""
+    session = RealSession()
+    folder = session.write(tmp_path / "frames")
+    full = session.frame(np.ones((4, 4)))
+    full[3, 5] = 4095
+    write_image(folder / "f_0.png", full)
+    factors = calibrate_frames(folder)
+    assert not factors.ok and factors.manifest.result["saturated_frames"] == 1
+    assert "saturation: 1 of 16 frames" in factors.warnings[-1] and "f_0.png" in factors.warnings[-1]
+    write_list(folder, digital={**DIGITAL, "saturation_dn": None})
+    assert calibrate_frames(folder).manifest.result["saturated_frames"] == 0
+    full[3, 5] = 65535
+    write_image(folder / "f_0.png", full)
+    assert calibrate_frames(folder).manifest.result["saturated_frames"] == 1
+
+
+def entries(**changes: Any) -> list[dict[str, Any]]:
+    """A list of all frames; the one named f_3.png with ``changes``."""
+    shots = enumerate(RealSession().shown("pair"))
+    found: list[dict[str, Any]] = [
+        {"file": f"f_{number}.png", "side": side, "index": index, "sign": sign}
+        for number, (side, index, sign, _) in shots
+    ]
+    found[3].update(changes)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"frames": entries()[:-2]}, "2 of 16 frames are missing, first vertical stripes 3 of sign +1"),
+        ({"frames": entries(index=0)}, "horizontal stripes 0 of sign -1 is there twice, f_1.png and f_3.png"),
+        ({"frames": entries(file="f_2.png")}, "f_2.png is listed twice"),
+        ({"frames": entries(file="g.png")}, "g.png is listed, but no file"),
+        ({"frames": entries(sign=0)}, "the uniform frame of horizontal stripes, which no such session has"),
+        ({"frames": entries(index=4)}, "horizontal stripes 4 of sign -1, which no such session has"),
+        ({"frames": entries(exposure_s=0.1)}, "halves of one pattern, exposed for 0.02 and 0.1 s"),
+        ({"frames": entries(file="../f_3.png")}, "frames.3.file: got '../f_3.png'"),
+        ({"frames": entries(side="diagonal")}, "frames.3.side: got 'diagonal'"),
+        ({"n": 5}, "holds 16 frames, but 5 projector pixels, signed_capture 'pair', are 32"),
+        ({"signed_capture": "uniform"}, "are 10 (horizontal, then vertical)"),
+        ({"digital": {**DIGITAL, "gain_dn_per_e": 0}}, "digital.gain_dn_per_e: got 0"),
+        ({"cammera": "mine"}, "cammera: got 'mine', no such field; did you mean camera?"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_lists_with_a_mistake_are_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    folder = RealSession().write(tmp_path / "frames")
+    write_list(folder, **changes)
+    with pytest.raises(MitsimError) as told:
+        load_frames(folder)
+    assert words in str(told.value) and str(folder) in str(told.value)
+
+
+def test_folders_with_a_mistake_are_refused(tmp_path: Path) -> None:
+    """Sizes, damage and links are seen before any work."""
+    folder = RealSession().write(tmp_path / "frames")
+
+    def refusal() -> str:
+        with pytest.raises(MitsimError) as told:
+            calibrate_frames(folder, tmp_path / "cal")
+        assert not (tmp_path / "cal").exists()
+        return str(told.value)
+
+    write_image(folder / "f_3.png", np.ones((20, 24)))
+    assert "f_3.png is 20 x 24 pixels, but f_0.png is 24 x 20" in refusal()
+    (folder / "f_3.png").write_bytes(b"no picture")
+    assert "f_3.png: cannot be read" in refusal()
+    (folder / "f_3.png").unlink()
+    assert "holds 15 frames" in refusal()
+    (tmp_path / "elsewhere.png").write_bytes((folder / "f_2.png").read_bytes())
+    (folder / "f_3.png").symlink_to(tmp_path / "elsewhere.png")
+    assert "leads out of its folder" in refusal()
+    (folder / "session.toml").write_text("")
+    assert "holds both session.toml and session.json" in refusal()
+    (folder / "session.toml").unlink()
+    (folder / "session.json").unlink()
+    assert "holds neither session.toml nor session.json" in refusal()
+
+
+def test_one_uniform_exposure_without_a_dark_frame_is_refused(tmp_path: Path) -> None:
+    session = RealSession()
+    folder = session.write(tmp_path / "frames", "uniform")
+    write_image(folder / "dark.png", session.frame(np.zeros((4, 4))))
+    data = json.loads((folder / "session.json").read_text())
+    write_list(folder, **{**data, "dark": [{"file": "dark.png", "exposure_s": 0.5}]})
+    with pytest.raises(MitsimError, match=r"no dark frame is exposed for 0\.02 s"):
+        load_frames(folder)
