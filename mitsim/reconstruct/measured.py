@@ -19,7 +19,8 @@ from mitsim.core.imagefile import image_size, own_end, read_image
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital
 from mitsim.core.output import output_folder
-from mitsim.core.parallel import in_threads, single_threaded_blas, workers
+from mitsim.core.parallel import in_threads, single_threaded_blas
+from mitsim.core.resources import workers
 from mitsim.core.versions import versions
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
