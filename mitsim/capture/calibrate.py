@@ -70,7 +70,7 @@ def calibrate(
         **bench.identity(),
         "accuracy": accuracy,
         "seed": seed,
-        "recipe": recipe.model_dump(),
+        "recipe": recipe.model_dump(exclude_defaults=True),
         "versions": {name: version for name, version in versions().items() if name in DECIDING},
     }
     with claimed_session(output, configuration, resume) as checkpoint:

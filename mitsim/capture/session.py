@@ -93,7 +93,7 @@ class Session:
     def shots(self) -> int:
         """Frames of the whole session."""
         count = int(self.signs.shape[1])
-        return 2 * (2 * count if self.pairs else count + 1)
+        return 2 * (2 * count if self.pairs else count + 1) * self.recipe.repeats
 
     def plan(self, accuracy: float, job: Job) -> Plan:
         """What to simulate for responses of this relative ``accuracy``, and what the session takes.
@@ -166,13 +166,16 @@ class LitSession:
 
         Its two shots share the uniform light: variance (mean electrons + dark + 2 read noise^2) / t^2 for a pair; with
         one shot and a uniform one, 2 Y(positive) - Y(uniform), it is three times the light and 5/2 of the read noise.
+        Means of repeated shots have their number's part of it.
         """
         sensor, time = self.session.bench.sensor, self.exposure_s
         light = float(self._white_rate.mean()) + 2 * sensor.superpixel_dark_current_e_per_s
         read = sensor.superpixel_reading_noise_e**2
         if self.session.pairs:
-            return float(np.sqrt(light / time + 2 * read / time**2))
-        return float(np.sqrt(3 * light / time + 5 * read / time**2))
+            variance = light / time + 2 * read / time**2
+        else:
+            variance = 3 * light / time + 5 * read / time**2
+        return float(np.sqrt(variance / self.session.recipe.repeats))
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
         """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.
@@ -289,9 +292,20 @@ class LitSession:
     def _exposed(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
         """The noisy frame of shot number ``index`` of a ``side``, of expected ``irradiance`` (pixels, pixels)."""
         names = "calibration", side, index
+        # Speckle of a board at rest is the same in all repeats.
         lit = self._exposer.lit(Frame(irradiance, 0.0, 0.0, 0.0), *names)
         digital = self._exposer.digital(lit, *names)
-        return _Shot(digital, int(self._exposer.saturated(digital, lit)))
+        saturated = int(self._exposer.saturated(digital, lit))
+        repeats = self.session.recipe.repeats
+        if repeats == 1:
+            return _Shot(digital, saturated)
+        mean = digital.astype(np.float64)
+        for repeat in range(1, repeats):
+            digital = self._exposer.digital(lit, *names, "repeat", repeat)
+            saturated += self._exposer.saturated(digital, lit)
+            mean += digital
+        mean /= repeats
+        return _Shot(mean, saturated)
 
     @staticmethod
     def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
@@ -306,7 +320,7 @@ class LitSession:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """A noisy frame (pixels, pixels), and whether it has ``saturated`` pixels: 1 or 0."""
+    """A noisy frame (pixels, pixels), the mean of its repeats, and how many of them have ``saturated`` pixels."""
 
     digital: Digital
     saturated: int

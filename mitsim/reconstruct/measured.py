@@ -145,10 +145,11 @@ def _check_sizes(session: SessionFrames) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """One frame: electrons a second, and the :attr:`Digital` of its exposure."""
+    """Mean of ``shots`` frames: electrons a second, and the :class:`Digital` of their exposure."""
 
     rate: FloatArray
     digital: Digital
+    shots: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,21 +170,19 @@ class _Readings:
         side, index
             of the pattern.
         """
-        shots = self.session.shots
-        positive = self._read(shots[side, index, 1])
+        positive = self._read(*self.session.repeated(side, index, 1))
         if self.session.pairs:
-            negative = self._read(shots[side, index, -1])
+            negative = self._read(*self.session.repeated(side, index, -1))
             light = float(positive.rate.mean() + negative.rate.mean())
-            return positive.rate - negative.rate, float(positive.digital.variance(light, 2))
+            return positive.rate - negative.rate, float(positive.digital.variance(light, 2)) / positive.shots
         uniform = self._uniform[side]
         response = 2 * positive.rate - uniform.rate
         variance = 4 * _variance(positive) + _variance(uniform)
         if self.session.dark:
             # 2 (Y - D) - (U - D), where both are exposed alike.
-            both = (shots[side, index, 1], 2), (shots[side, 0, UNIFORM], -1)
+            both = (positive.digital.exposure_s, 2), (uniform.digital.exposure_s, -1)
             parts: dict[float, int] = {}
-            for shot, weight in both:
-                exposure = self.session.exposure_s(shot)
+            for exposure, weight in both:
                 parts[exposure] = parts.get(exposure, 0) + weight
             for exposure, weight in parts.items():
                 dark, own = self._dark[exposure]
@@ -193,7 +192,7 @@ class _Readings:
 
     @cached_property
     def _uniform(self) -> dict[Side, _Reading]:
-        return {side: self._read(self.session.shots[side, 0, UNIFORM]) for side in SIDES}
+        return {side: self._read(*self.session.repeated(side, 0, UNIFORM)) for side in SIDES}
 
     @cached_property
     def _dark(self) -> dict[float, tuple[FloatArray, float]]:
@@ -201,25 +200,27 @@ class _Readings:
         found = {}
         for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
             frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
-            readings = [self._read(frame) for frame in frames]
-            mean = sum((each.rate for each in readings[1:]), start=readings[0].rate) / len(readings)
-            found[exposure] = mean, _variance(readings[0]) / len(readings)
+            mean = self._read(*frames)
+            found[exposure] = mean.rate, _variance(mean)
         return found
 
-    def _read(self, frame: StripeFile | DarkFile) -> _Reading:
-        digital = self.session.listed.digital
-        if frame.exposure_s is not None:
-            digital = digital.model_copy(update={"exposure_s": frame.exposure_s})
-        values = read_image(self.session.folder / frame.file)
-        end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
-        if end is not None and (values >= end).any():
-            self.saturated.add(frame.file)
-        return _Reading(digital.rate(values), digital)
+    def _read(self, *frames: StripeFile | DarkFile) -> _Reading:
+        """The mean of ``frames`` of one exposure."""
+        digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
+        total: FloatArray | None = None
+        for frame in frames:
+            values = read_image(self.session.folder / frame.file)
+            end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
+            if end is not None and (values >= end).any():
+                self.saturated.add(frame.file)
+            total = values.astype(np.float64) if total is None else total + values
+        assert total is not None
+        return _Reading(digital.rate(total / len(frames)), digital, len(frames))
 
 
 def _variance(reading: _Reading) -> float:
-    """Mean noise variance of a ``reading`` [(electrons/s)^2]."""
-    return max(float(reading.digital.variance(float(reading.rate.mean()))), 0.0)
+    """Mean noise variance of a ``reading``, of all its shots [(electrons/s)^2]."""
+    return max(float(reading.digital.variance(float(reading.rate.mean()))), 0.0) / reading.shots
 
 
 @single_threaded_blas()

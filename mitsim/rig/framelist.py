@@ -21,6 +21,7 @@ from mitsim.core.imagefile import SUFFIXES
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
 from mitsim.rig.patterns import SIDES, Side, stripe_count
+from mitsim.rig.recipe import MOST_REPEATS
 
 LISTS = ("session.toml", "session.json")
 """Names of the list."""
@@ -28,8 +29,8 @@ DARK = "dark"
 """What names of dark frames begin with, where no list names them."""
 UNIFORM = 0
 """Sign of a frame under uniform light."""
-Key = tuple[Side, int, int]
-"""Side, number of the pattern, and sign of a frame."""
+Key = tuple[Side, int, int, int]
+"""Side, number of the pattern, sign and repeat of a frame."""
 
 
 class _Part(BaseModel):
@@ -43,6 +44,7 @@ class StripeFile(_Part):
     side: Side = Field(description="stripes along rows, H[:, index] 1^T, or along columns, 1 H[:, index]^T")
     index: int = Field(ge=0, lt=2 * MOST_PIXELS, description="column of H; 0 of a uniform frame")
     sign: int = Field(ge=-1, le=1, description="half (1 + P)/2 or (1 - P)/2 of a pattern P; 0: uniform frame")
+    repeat: int = Field(default=0, ge=0, lt=MOST_REPEATS, description="which one of `repeats`")
     exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as in `digital`")
 
 
@@ -65,6 +67,7 @@ class FrameList(_Part):
     )
     n: int = Field(ge=1, le=MOST_PIXELS, description="projector pixels a side")
     signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern was captured")
+    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="frames of each half, whose mean is taken")
     digital: Digital = Field(description="how digital numbers become electrons a second, as in a run's manifest")
     centre: bool = Field(default=False, description="frames lose row and column means (FlatCam masks)")
     board_reflectance: float | None = Field(
@@ -92,7 +95,7 @@ class SessionFrames:
     listed
         what its list says.
     shots
-        frame by side, number of the pattern, and sign.
+        frame by side, number of the pattern, sign and repeat.
     dark
         frames with the projector off.
     """
@@ -106,6 +109,16 @@ class SessionFrames:
     def pairs(self) -> bool:
         """Whether a +-1 pattern is the difference of two frames, and not taken from one and a uniform one."""
         return self.listed.signed_capture == "pair"
+
+    def repeated(self, side: Side, index: int, sign: int) -> tuple[StripeFile, ...]:
+        """All repeats of one frame.
+
+        Parameters
+        ----------
+        side, index, sign
+            what it shows.
+        """
+        return tuple(self.shots[side, index, sign, repeat] for repeat in range(self.listed.repeats))
 
     @cached_property
     def files(self) -> tuple[str, ...]:
@@ -141,13 +154,14 @@ def load_frames(folder: Path | str) -> SessionFrames:
         names = [name for name in names if name not in {frame.file for frame in dark}]
         if len(names) != len(wanted):
             raise MitsimError(
-                f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, signed_capture "
-                f"{listed.signed_capture!r}, are {len(wanted)} ({wanted[0][0]}, then {wanted[-1][0]}); take those that "
-                f"are missing, or name each frame in {lists[0].name}"
+                f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, "
+                f"signed_capture {listed.signed_capture!r}{_times(listed)}, are {len(wanted)} "
+                f"({wanted[0][0]}, then {wanted[-1][0]}); take those that are missing, or name each "
+                f"frame in {lists[0].name}"
             )
         frames = tuple(
-            StripeFile(file=name, side=side, index=index, sign=sign)
-            for name, (side, index, sign) in zip(names, wanted, strict=True)
+            StripeFile(file=name, side=side, index=index, sign=sign, repeat=repeat)
+            for name, (side, index, sign, repeat) in zip(names, wanted, strict=True)
         )
     shots = _each_once(folder, frames, wanted)
     session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
@@ -157,13 +171,16 @@ def load_frames(folder: Path | str) -> SessionFrames:
 
 def _wanted(listed: FrameList) -> Iterator[Key]:
     """Frames of a session in the order in which they are taken."""
-    count = stripe_count(listed.n)
+    uniform, signs = listed.signed_capture == "uniform", (1, -1) if listed.signed_capture == "pair" else (1,)
     for side in SIDES:
-        if listed.signed_capture == "uniform":
-            yield side, 0, UNIFORM
-        for index in range(count):
-            for sign in (1, -1) if listed.signed_capture == "pair" else (1,):
-                yield side, index, sign
+        halves = [(index, sign) for index in range(stripe_count(listed.n)) for sign in signs]
+        for index, sign in [(0, UNIFORM), *halves] if uniform else halves:
+            for repeat in range(listed.repeats):
+                yield side, index, sign, repeat
+
+
+def _times(listed: FrameList) -> str:
+    return f", repeats {listed.repeats}" if listed.repeats > 1 else ""
 
 
 def _names(folder: Path) -> list[str]:
@@ -181,7 +198,7 @@ def _each_once(folder: Path, frames: Sequence[StripeFile], wanted: Sequence[Key]
     shots: dict[Key, StripeFile] = {}
     known = set(wanted)
     for frame in frames:
-        key = frame.side, frame.index, frame.sign
+        key = frame.side, frame.index, frame.sign, frame.repeat
         if key not in known:
             raise MitsimError(
                 f"frames {folder}: {frame.file} is {_words(key)}, which no such session has; it has "
@@ -212,16 +229,17 @@ def _check_files(session: SessionFrames) -> None:
         if not (folder / name).is_file():
             raise MitsimError(f"frames {folder}: {name} is listed, but no file of that name is there; copy it there")
     exposures = {session.exposure_s(shot) for shot in session.shots.values()}
+    for (side, index, sign, repeat), shot in session.shots.items():
+        other = session.shots[side, index, sign if repeat or not session.pairs else -sign, 0]
+        if session.exposure_s(shot) != session.exposure_s(other):
+            raise MitsimError(
+                f"frames {folder}: {shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one "
+                f"pattern, exposed for {session.exposure_s(shot):g} and {session.exposure_s(other):g} s; expose them "
+                "alike, so that their dark signal is the same"
+            )
     if session.pairs:
-        for (side, index, sign), shot in session.shots.items():
-            other = session.shots[side, index, -sign]
-            if session.exposure_s(shot) != session.exposure_s(other):
-                raise MitsimError(
-                    f"frames {folder}: {shot.file} and {other.file} are halves of one pattern, exposed for "
-                    f"{session.exposure_s(shot):g} and {session.exposure_s(other):g} s; their dark signal does not "
-                    "cancel; expose them alike"
-                )
-    elif session.dark and (without := exposures - {session.exposure_s(frame) for frame in session.dark}):
+        return
+    if session.dark and (without := exposures - {session.exposure_s(frame) for frame in session.dark}):
         raise MitsimError(
             f"frames {folder}: no dark frame is exposed for {min(without):g} s, as other frames are; take one for each "
             "exposure, or none"
@@ -229,5 +247,6 @@ def _check_files(session: SessionFrames) -> None:
 
 
 def _words(key: Key) -> str:
-    side, index, sign = key
-    return f"the uniform frame of {side} stripes" if sign == UNIFORM else f"{side} stripes {index} of sign {sign:+d}"
+    side, index, sign, repeat = key
+    words = f"the uniform frame of {side} stripes" if sign == UNIFORM else f"{side} stripes {index} of sign {sign:+d}"
+    return f"{words}, repeat {repeat}" if repeat else words

@@ -10,9 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from mitsim.core.configuration import load_model, shipped
 from mitsim.rig.sensor import ExposureFraction
 
+MOST_REPEATS = 1024
+"""Shots of one frame: 30 dB less noise, where a session of 512 frames takes days."""
+
 
 class SessionRecipe(BaseModel):
-    """A session's board and exposure, and how signed patterns are taken."""
+    """A session's board and exposure, how signed patterns are taken, and how often."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -20,6 +23,7 @@ class SessionRecipe(BaseModel):
     """Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
     exposure_fraction: ExposureFraction = Field(description="brightest pixel's mean, as a part of the full well")
     signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern is captured")
+    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="shots of every frame, whose mean is taken")
     source: str = Field(description="where the numbers come from")
 
 

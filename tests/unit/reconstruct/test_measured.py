@@ -148,6 +148,8 @@ def entries(**changes: Any) -> list[dict[str, Any]]:
         ({"frames": entries(exposure_s=0.1)}, "halves of one pattern, exposed for 0.02 and 0.1 s"),
         ({"frames": entries(file="../f_3.png")}, "frames.3.file: got '../f_3.png'"),
         ({"frames": entries(side="diagonal")}, "frames.3.side: got 'diagonal'"),
+        ({"repeats": 2}, "signed_capture 'pair', repeats 2, are 32"),
+        ({"repeats": 2, "frames": entries(repeat=1)}, "first horizontal stripes 0 of sign +1, repeat 1"),
         ({"n": 5}, "holds 16 frames, but 5 projector pixels, signed_capture 'pair', are 32"),
         ({"signed_capture": "uniform"}, "are 10 (horizontal, then vertical)"),
         ({"digital": {**DIGITAL, "gain_dn_per_e": 0}}, "digital.gain_dn_per_e: got 0"),
