@@ -31,8 +31,8 @@ _SPACE_BYTES = 0.7e9
 _SPACE_BYTES_PER_PROCESSOR = 85e6
 """What each processor adds, buffers and stacks of two OpenBLAS; measured."""
 _AGAIN_S = 0.01
-"""After which an interrupt that was dropped comes again, and again: the callback that dropped it is over by then, and one
-that comes just before Python waits for something would not wake it."""
+"""After which an interrupt that was dropped comes again, and again: the callback that dropped it is over by then, and
+one that comes just before Python waits for something would not wake it."""
 _LONGEST_ADVICE = 256
 """Bytes; chosen so that any sentence fits."""
 
