@@ -53,8 +53,7 @@ def test_a_drawn_mask_casts_the_named_masks_frames(
     kind: str, small_scene: Callable[..., Path], variant: str, tmp_path: Path
 ) -> None:
     """Both estimators, diffraction on. The separable mask's one term is its code: to the last bit. FlatCam's two come
-    out as two others of the same sum; of these the reference draws its places in another order. (Planted: grids'
-    columns for rows.)"""
+    out as two others of the same sum; of these the reference draws its places in another order."""
     scene = small_scene(mask=kind, mask_order=8)
     named, plate, turned = (
         open_bench(scene, variant, camera_file(tmp_path, name, drawing))
@@ -73,7 +72,7 @@ def test_a_drawn_mask_casts_the_named_masks_frames(
 @pytest.mark.parametrize("kind", ["separable", "flatcam", "open"])
 @pytest.mark.parametrize("thickness", [0.0, 0.1])
 def test_a_drawn_mask_casts_the_named_masks_shadow(kind: str, thickness: float, spectrum: Spectrum | None) -> None:
-    """(Planted: the column not divided by the pivot; fields of the transmission's root twice.)"""
+    """With and without waves, thin and thick."""
     rows, columns = Directions(np.linspace(-0.1, 0.12, 6), 0.003), Directions(np.linspace(-0.1, 0.1, 5), 0.003)
     named = CameraGeometry(pixels=24, mask=kind, mask_order=6, mask_thickness=thickness)
     plate = named.model_copy(update={"mask": "plate", "mask_plate": Plate(0.06, drawn(kind, 6), "it")})
@@ -136,7 +135,7 @@ def test_grey_masks_dim_by_their_transmission(kind: str, spectrum: Spectrum | No
 
 def test_a_frame_equals_rays_counted_through_a_random_grey_mask() -> None:
     """A point source: its rays to 40 x 40 points of each pixel, off the axis. (Planted: columns before rows; the part
-    beyond sight cut on one side; weights left out.)"""
+    beyond sight cut on one side.)"""
     values = np.random.default_rng(4).random((61, 61))
     camera = CameraGeometry(
         pixels=40, pixel_pitch=0.03, mask="plate", mask_plate=Plate(0.06, values, "it"), scene_distance=30.0,
@@ -228,7 +227,7 @@ def test_the_reference_sees_the_same_random_grey_mask(
     small_scene: Callable[..., Path], variant: str, tmp_path: Path
 ) -> None:
     """Slope of the reference's frame on the factored one less its mean, 8 seeds of 128 samples a pixel: 1 to five
-    standard errors of their mean. (Planted: the place's transmission left out; rows for columns.)"""
+    standard errors of their mean."""
     values = np.random.default_rng(5).random((511, 511)) * (np.random.default_rng(6).random((511, 511)) < 0.4)
     bench = open_bench(small_scene(), variant, camera_file(tmp_path, "grey", values))
     factored = bench.render("factored", effects={"diffraction": False, "black-level": False}).mean

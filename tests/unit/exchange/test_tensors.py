@@ -26,8 +26,7 @@ def test_a_missing_package_is_told_in_a_line(format: str, tmp_path: Path, monkey
 
 @pytest.mark.parametrize("signed", [False, True])
 def test_the_physics_is_the_model_and_its_adjoint(signed: bool, tmp_path: Path) -> None:
-    """<A x, y> = <x, A^T y> in double precision, and A x is the solver's own operator. (Planted: rights transposed in
-    the adjoint.)"""
+    """<A x, y> = <x, A^T y> in double precision, and A x is the solver's own operator."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("deepinv")
     bench = made(tmp_path, signed=signed, ambient=not signed)
