@@ -18,7 +18,7 @@ from tests.unit.capture.invented_evidence import EVIDENCE, SIZES, changes, plan,
 
 
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
-    geometry = SimpleNamespace(wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature)
+    geometry = SimpleNamespace(wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True)
     return SimpleNamespace(  # type: ignore[return-value]
         field_stop_cuts=cuts,
         geometry=geometry,

@@ -69,7 +69,9 @@ class ToyLight:
 
 def lit_session(n: int = 7, mode: str = "pair", mask: str = "separable", repeats: int = 1) -> LitSession:
     recipe = load_recipe().model_copy(update={"signed_capture": mode, "repeats": repeats})
-    bench = SimpleNamespace(n=n, rig=RIG, sensor=SENSOR, geometry=SimpleNamespace(mask=mask, pixels=PIXELS))
+    bench = SimpleNamespace(
+        n=n, rig=RIG, sensor=SENSOR, geometry=SimpleNamespace(centred=mask == "flatcam", pixels=PIXELS)
+    )
     light = ToyLight(n)
     white = light.frames(Lighting.uniform(n), 0)[0]
     return LitSession(Session(bench, recipe, seed=4), light, white, EXPOSURE_S, 0.0)  # type: ignore[arg-type]
