@@ -71,7 +71,8 @@ class Orders:
         energy = float(np.square(self._judge.frames[self._stand.few_shots]).sum())
         self._changes = Changes.between(changes, energy)
         for last in (1, *(most for _, most in _ORDERS.values())):
-            if budget.allows(f"time of light over {last} surfaces", whole, kept=kept):
+            most = "all" if last == MOST else "one" if last == 1 else f"up to {last}"
+            if budget.allows(f"time of light followed over {most}", whole, kept=kept):
                 timed = self._followed[last] = Timed(self._following(last))
                 timed.seconds.append(timed.again())
 
