@@ -102,9 +102,17 @@ class Looked:
     rows: Labels
     probed: FloatArray
 
-    def at(self, light: Light, rows: Labels) -> FloatArray | None:
-        """``probed`` where it is of a ``light`` whose rows belong to the classes ``rows``; else None."""
-        same = light.groups is self.groups and light.simulation is self.simulation
+    def at(self, light: Light, rows: Labels, classes: int) -> FloatArray | None:
+        """``probed`` where it is of a ``light`` whose rows belong to these of so many classes; else None.
+
+        Parameters
+        ----------
+        light
+            whose frames are to be formed.
+        rows, classes
+            class of each of its rows, and their number.
+        """
+        same = light.groups is self.groups and light.simulation is self.simulation and len(self.probed) == classes
         return self.probed if same and np.array_equal(rows, self.rows) else None
 
 
@@ -193,7 +201,7 @@ class Light:
             for shots that split a class of the light.
         """
         rows = self.rows_of(lighting)
-        probed = self.looked.at(self, rows) if self.looked and seed == self.seed else None
+        probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
         return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
 
     def rows_of(self, lighting: Lighting) -> Labels:

@@ -236,7 +236,7 @@ class ExpectedFrames:
             if np.array_equal(self._weights, np.eye(len(self))):
                 yield from self._frames(irradiance[start:stop], probed[start:stop])
             else:
-                yield from self._frames(*(self._mix(basis, start, stop) for basis in self._formed))
+                yield from self._frames(*(self._shots_of(basis, start, stop) for basis in self._formed))
 
     def sampling_error(self) -> tuple[float, float]:
         """Relative Monte Carlo error of all frames, and what it is below at 95 %, without forming any.
@@ -273,7 +273,7 @@ class ExpectedFrames:
         """(shots, pixels * groups * probes) frames of single groups as random signs see them."""
         classes, weights = self.probed, self._weights[start:stop]
         if classes is not None:
-            probed = self._mix(classes, start, stop)
+            probed = self._shots_of(classes, start, stop)
         else:
             probed = _formed(self._lights, self._basis[start:stop], self._probes, False)[1]
             if self._leak_formed is not None:
@@ -285,7 +285,7 @@ class ExpectedFrames:
             probed += _formed(self._ambient, _ALL, self._probes, False)[1][0]
         return probed
 
-    def _mix(self, basis: FloatArray, start: int, stop: int) -> FloatArray:
+    def _shots_of(self, basis: FloatArray, start: int, stop: int) -> FloatArray:
         """(shots, ...) sums of a ``basis`` (classes, ...) as the shots from ``start`` to ``stop`` light the classes."""
         if self._own.nnz > _FEW * len(self):
             return _mix(self._weights[start:stop], basis)

@@ -71,7 +71,7 @@ _BY_METHOD = ("saturation_capacity", "linearity_min", "linearity_max")
 
 
 @dataclass(frozen=True)
-class Bench:
+class Procedure:
     """How a camera is characterised.
 
     Attributes
@@ -119,7 +119,7 @@ class Characterisation:
 
     Attributes
     ----------
-    sensor, bench
+    sensor, procedure
         what was characterised, and how.
     exposure_s
         of the ladder and the stacks [s].
@@ -132,7 +132,7 @@ class Characterisation:
     """
 
     sensor: SensorModel
-    bench: Bench
+    procedure: Procedure
     exposure_s: float
     session: Session = field(repr=False)
     expected: Session = field(repr=False)
@@ -153,7 +153,7 @@ class Characterisation:
         """What the command line reports as JSON."""
         return {
             "camera": self.sensor.name,
-            **asdict(self.bench),
+            **asdict(self.procedure),
             "exposure_s": self.exposure_s,
             "figures": [asdict(row) for row in self.rows],
             "warnings": list(self.warnings),
@@ -165,7 +165,8 @@ class Characterisation:
         names = ("set", "expected", "found", "std. error")
         head = f"{'figure':<26}{'symbol':<18}{'unit':<10}" + "".join(f"{name:>12}" for name in names) + f"{'off by':>8}"
         told = [
-            f"{self.sensor.name}: {self.bench.pixels} x {self.bench.pixels} pixels, {self.bench.steps} steps of light"
+            f"{self.sensor.name}: {self.procedure.pixels} x {self.procedure.pixels} pixels, "
+            f"{self.procedure.steps} steps of light"
         ]
         told += [head]
         for row in self.rows:
@@ -193,7 +194,7 @@ class Characterisation:
 
 
 def characterise(
-    sensor: SensorModel, bench: Bench | None = None, output: Path | str | None = None, job: Job | None = None
+    sensor: SensorModel, procedure: Procedure | None = None, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
     """Run EMVA 1288's procedure on frames of a camera, and write JSON and plots where a folder is given.
 
@@ -201,7 +202,7 @@ def characterise(
     ----------
     sensor
         the camera.
-    bench
+    procedure
         sizes and seed.
     output
         new or empty folder, or one of an earlier characterisation, which is replaced.
@@ -213,12 +214,12 @@ def characterise(
     MitsimError
         for a camera that light never saturates, or a folder that holds something else.
     """
-    bench, job = bench or Bench(), job or Job()
+    procedure, job = procedure or Procedure(), job or Job()
     capacity = _capacity(sensor)
     if output is None:
-        return _characterised(sensor, bench, capacity, job)
+        return _characterised(sensor, procedure, capacity, job)
     with study_folder(output, "characterise", ("*.png",)) as folder:
-        done = _characterised(sensor, bench, capacity, job, str(folder))
+        done = _characterised(sensor, procedure, capacity, job, str(folder))
         write_json(folder / "characterise.json", {**done.payload(), "kind": "characterise", "versions": versions()})
         for file, figure in done.figures().items():
             with whole_file(folder / file) as part:
@@ -240,9 +241,9 @@ def _capacity(sensor: SensorModel) -> float:
 
 
 def _characterised(
-    sensor: SensorModel, bench: Bench, capacity: float, job: Job, output: str | None = None
+    sensor: SensorModel, procedure: Procedure, capacity: float, job: Job, output: str | None = None
 ) -> Characterisation:
-    plan = _Plan.of(sensor, bench, capacity)
+    plan = _Plan.of(sensor, procedure, capacity)
     expected = plan.expected()
     drawn = figures(_drawn(plan, expected))
     session = plan.measured(job)
@@ -250,7 +251,7 @@ def _characterised(
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     names = [name for name in UNITS if sensor.quantum_efficiency is not None or name != "quantum_efficiency"]
     rows = tuple(_row(plan, name, found[name], drawn[name]) for name in names)
-    return Characterisation(sensor, bench, plan.exposure_s, session, expected, rows, output)
+    return Characterisation(sensor, procedure, plan.exposure_s, session, expected, rows, output)
 
 
 @dataclass(frozen=True)
@@ -258,7 +259,7 @@ class _Plan:
     """Which frames are taken: electrons of light of each, and exposures [s]."""
 
     sensor: SensorModel
-    bench: Bench
+    procedure: Procedure
     electrons: FloatArray
     half: float
     beyond: float
@@ -266,8 +267,8 @@ class _Plan:
     dark_times: FloatArray
 
     @classmethod
-    def of(cls, sensor: SensorModel, bench: Bench, capacity: float) -> _Plan:
-        steps = capacity * _TO * np.arange(1, bench.steps + 1) / bench.steps
+    def of(cls, sensor: SensorModel, procedure: Procedure, capacity: float) -> _Plan:
+        steps = capacity * _TO * np.arange(1, procedure.steps + 1) / procedure.steps
         hottest = (
             sensor.binning**2 * sensor.dark_factor * (sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s)
         )
@@ -276,18 +277,18 @@ class _Plan:
         longest = min(max(longest, EXPOSURE_S[0] * _DARK_STEPS), EXPOSURE_S[1])
         exposure_s = min(0.01, _FILLED_BY_DARK * capacity / hottest) if hottest else 0.01
         times = longest * np.arange(_DARK_STEPS) / (_DARK_STEPS - 1)
-        return cls(sensor, bench, steps, capacity / 2, 2 * capacity + 20 * math.sqrt(capacity), exposure_s, times)
+        return cls(sensor, procedure, steps, capacity / 2, 2 * capacity + 20 * math.sqrt(capacity), exposure_s, times)
 
     @property
     def shape(self) -> tuple[int, int]:
-        return self.bench.pixels, self.bench.pixels
+        return self.procedure.pixels, self.procedure.pixels
 
     @property
     def photons(self) -> FloatArray:
         return self.electrons / (self.sensor.quantum_efficiency or 1.0)
 
     def frame(self, electrons: float, exposure_s: float, *names: str | int) -> FloatArray:
-        shot, read = (stream(self.bench.seed, "characterise", noise, *names) for noise in ("shot", "read"))
+        shot, read = (stream(self.procedure.seed, "characterise", noise, *names) for noise in ("shot", "read"))
         return np.asarray(expose(np.full(self.shape, electrons), exposure_s, self.sensor, shot, read), dtype=np.float64)
 
     def pair(self, electrons: float, exposure_s: float, name: str, index: int = 0) -> Pair:
@@ -318,7 +319,7 @@ class _Plan:
         )
 
     def _frames(self, electrons: float, name: str) -> Iterator[FloatArray]:
-        for index in range(self.bench.frames):
+        for index in range(self.procedure.frames):
             yield self.frame(electrons, self.exposure_s, name, index)
 
     def expected(self) -> Session:
@@ -390,7 +391,7 @@ def _drawn(plan: _Plan, expected: Session) -> Session:
     A variance of n pixels whose rows share v_r of v has the variance (2 v_o^2 + k_4 / 2)/n + 4 v_o v_r/n + 2 v_r^2/M,
     v_o = v - v_r, k_4 = K^4 mu the fourth cumulant of the counts.
     """
-    sensor, rng = plan.sensor, stream(plan.bench.seed, "characterise", "sessions")
+    sensor, rng = plan.sensor, stream(plan.procedure.seed, "characterise", "sessions")
     m, n = plan.shape
     gain, (pixel, row, column) = sensor.gain_dn_per_e, sensor.response_parts
     response = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(row**2 / m + column**2 / n + pixel**2 / m / n)
@@ -432,7 +433,7 @@ def _drawn_stacks(plan: _Plan, expected: Session, rng: np.random.Generator) -> t
     parts normal. Offsets are the same in both stacks.
     """
     m, n = plan.shape
-    frames = plan.bench.frames
+    frames = plan.procedure.frames
     noise = [
         float(np.interp(light, [0, *plan.electrons], [expected.dark.variance, *expected.ladder.variance]))
         for light in (0.0, plan.half)

@@ -121,16 +121,21 @@ def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Light
     looked = light.looked
     assert looked is not None
     pairs, other = Lighting(family.labels // 2, np.eye(8)), light.behind(bench)
+    unlit = Lighting(family.labels, np.hstack([family.weights, np.ones((16, 1))]))  # a class that no pixel has
     cases = [(light, family, 3), (light, pairs, 3), (light, family, 4), (light.merged(), family, 3), (other, family, 3)]
+    cases.append((light, unlit, 3))
     for which, shots, seed in cases:
         plain = replace(which, looked=None).frames(shots, seed)
         for found, known in zip(which.frames(shots, seed), plain, strict=True):
             assert np.array_equal(found.irradiance, known.irradiance)
             assert found.variance == pytest.approx(known.variance, rel=1e-9)
-    assert [looked.at(which, which.rows_of(shots)) is not None for which, shots, _ in cases] == [
+    assert [
+        looked.at(which, which.rows_of(shots), shots.weights.shape[1]) is not None for which, shots, _ in cases
+    ] == [
         True,
         False,
         True,
+        False,
         False,
         False,
     ]

@@ -10,10 +10,10 @@ import pytest
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.rig.sensor import SensorModel, load_sensor
-from mitsim.study.characterise import Bench, characterise
+from mitsim.study.characterise import Procedure, characterise
 from tests.invented import sensor
 
-SMALL = Bench(pixels=64, steps=25, frames=16)
+SMALL = Procedure(pixels=64, steps=25, frames=16)
 PLAIN = {
     "full_well_e": 20_000.0, "read_noise_e": 4.0, "gain_dn_per_e": 0.19, "black_level_dn": 60.0, "bits": 12,
     "quantum_efficiency": 0.6, "dark_current_e_per_s": 5.0,
@@ -64,14 +64,14 @@ def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> 
             [
                 row.deviations
                 for row in characterise(
-                    camera("nonuniform").model_copy(update={"pattern_seed": seed}), Bench(48, 20, 8, seed)
+                    camera("nonuniform").model_copy(update={"pattern_seed": seed}), Procedure(48, 20, 8, seed)
                 ).rows
             ]
             for seed in range(12)
         ]
     )
     squares = np.square(off).sum(axis=0)
-    names = [row.name for row in characterise(camera("plain"), Bench(48, 20, 8)).rows]
+    names = [row.name for row in characterise(camera("plain"), Procedure(48, 20, 8)).rows]
     for name, value in zip(names, squares, strict=True):
         # The largest variance falls on the same step in all: its figure is known to a step, not to its noise.
         least = 0.0 if name == "saturation_capacity" else 1.6
@@ -89,7 +89,7 @@ def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.Mo
 
 
 def test_json_and_plots_lie_in_the_folder(tmp_path: Path) -> None:
-    done = characterise(camera("plain"), Bench(32, 20, 2), tmp_path / "found")
+    done = characterise(camera("plain"), Procedure(32, 20, 2), tmp_path / "found")
     assert sorted(path.name for path in (tmp_path / "found").glob("[!.]*")) == [
         "characterise.json", "dark_current.png", "deviations.png", "linearity.png", "photon_transfer.png",
     ]  # fmt: skip
@@ -100,7 +100,7 @@ def test_json_and_plots_lie_in_the_folder(tmp_path: Path) -> None:
 
 
 def test_without_a_quantum_efficiency_light_is_counted_in_electrons() -> None:
-    done = characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), Bench(32, 20, 2))
+    done = characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), Procedure(32, 20, 2))
     assert "quantum_efficiency" not in {row.name for row in done.rows} and done.rows[0].name == "system_gain"
 
 
@@ -109,4 +109,4 @@ def test_what_cannot_be_characterised_is_refused() -> None:
         characterise(sensor(full_well_e=math.inf))
     for values, name in (({"pixels": 8}, "pixels"), ({"steps": 5}, "steps"), ({"frames": 1}, "frames")):
         with pytest.raises(MitsimError, match=name):
-            Bench(**values)
+            Procedure(**values)
