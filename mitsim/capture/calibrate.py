@@ -78,7 +78,7 @@ def calibrate(
         checkpoint.begin()
         lit = session.lit(_light(session, plan, checkpoint, job), job)
         (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
-        warnings = lit.light.warnings + session.mask_warnings + (() if noisy.ok else (str(noisy.status),))
+        warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
         if saturated:
             warnings += (
                 f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "

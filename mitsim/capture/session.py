@@ -16,7 +16,7 @@ import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
-from mitsim.capture.exposer import Exposer, in_chunks
+from mitsim.capture.exposer import Exposer, camera_warnings, in_chunks
 from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
@@ -60,6 +60,11 @@ class Session:
     def centre(self) -> bool:
         """Whether row and column means are taken out of every response, as for a FlatCam mask."""
         return self.bench.geometry.centred
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What mask and sensor do that factors do not know of."""
+        return *self.mask_warnings, *camera_warnings(self.bench.sensor, (self.bench.geometry.pixels,) * 2)
 
     @cached_property
     def mask_warnings(self) -> tuple[str, ...]:

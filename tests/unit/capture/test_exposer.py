@@ -14,9 +14,11 @@ import pytest
 
 from mitsim.capture import exposer as exposing
 from mitsim.capture.exposer import Exposer, camera_warnings
+from mitsim.capture.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import Frame
 from mitsim.rig.patterns import parse_patterns
+from mitsim.rig.recipe import load_recipe
 from mitsim.rig.rig import Rig
 from mitsim.rig.sensor import SensorModel
 from tests.invented import sensor
@@ -147,3 +149,10 @@ def test_what_an_image_does_not_know_of_a_camera_is_said() -> None:
     loud = sensor(dead_pixels=0.03, row_noise_e=2.0, linearity=(-0.01,))
     defects, rows, bent = camera_warnings(loud, (10, 10))
     assert "0 are hot and 3 dead" in defects and "2 electrons" in rows and "-1.0%" in bent
+
+
+def test_a_session_says_what_factors_do_not_know_of_a_camera() -> None:
+    """(Planted: the mask's warnings alone.)"""
+    loud = sensor(dead_pixels=0.03, row_noise_e=2.0, linearity=(-0.01,))
+    bench = SimpleNamespace(sensor=loud, geometry=SimpleNamespace(mask_plate=None, pixels=10))
+    assert Session(bench, load_recipe()).warnings == tuple(camera_warnings(loud, (10, 10)))
