@@ -170,7 +170,7 @@ def test_rounding_has_no_offset_and_flooring_would_show(monkeypatch: pytest.Monk
     assert gate < 0.02
     assert exposed(model, 0.0, 250_000, "round").mean() == pytest.approx(100.3, abs=gate)
 
-    def floored(signal_dn: np.ndarray, which: SensorModel) -> np.ndarray:
+    def floored(signal_dn: np.ndarray, which: SensorModel, _out: np.ndarray) -> np.ndarray:
         return np.clip(np.floor(signal_dn), 0, which.largest_dn)
 
     monkeypatch.setattr(chain, "quantise", floored)
