@@ -25,6 +25,7 @@ from mitsim.core.manifests import (
     ShotFile,
 )
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.efficiency import EfficiencyCurve
 from mitsim.rig.framelist import DarkFile, FrameList, StripeFile
 from mitsim.rig.profile import MaskProfile
 from mitsim.rig.projector import ProjectorModel
@@ -33,7 +34,7 @@ from mitsim.rig.sensor import SensorModel
 
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
-    *(CameraGeometry, SensorModel, MaskProfile, ProjectorModel, SessionRecipe),
+    *(CameraGeometry, SensorModel, EfficiencyCurve, MaskProfile, ProjectorModel, SessionRecipe),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile),
 )

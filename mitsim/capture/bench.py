@@ -420,6 +420,11 @@ def open_bench(
 
     sensor, mask = load_sensor(sensor_path), load_mask(sensor_path)
     light = load_model(projector_path, ProjectorModel)
+    if not for_render:
+        try:
+            sensor.efficiency(light.effective_wavelength_nm)
+        except MitsimError as error:
+            raise MitsimError(f"camera {sensor_path}: {error}") from None
     # Only now, with all else checked: the renderer takes a second to import.
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
@@ -433,11 +438,6 @@ def open_bench(
         raise MitsimError(
             f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
             "use the camera of that scene, or change pixel_pitch, or binning"
-        )
-    if not for_render and sensor.quantum_efficiency is None:
-        raise MitsimError(
-            f"camera {sensor_path}: states no quantum_efficiency, so light makes no known number of electrons; "
-            "give one, with its source"
         )
     if mask is not None:
         if "mask" in defines:

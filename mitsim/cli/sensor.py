@@ -25,6 +25,7 @@ def characterise(
     pixels: Annotated[int, typer.Option(help="rows and columns of the frames")] = 256,
     steps: Annotated[int, typer.Option(help="steps of light, from dark to beyond saturation")] = 50,
     frames: Annotated[int, typer.Option(help="frames of each stack")] = 100,
+    wavelength: Annotated[float, typer.Option(help="of the light, for a curve of quantum efficiency [nm]")] = 550.0,
     seed: Seed = 0,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
@@ -39,7 +40,7 @@ def characterise(
     from mitsim.study.characterise import characterise as run_characterise
 
     with job_of(quiet or as_json) as job:
-        done = run_characterise(sensor, Procedure(pixels, steps, frames, seed), output, job)
+        done = run_characterise(sensor, Procedure(pixels, steps, frames, seed, wavelength), output, job)
     return finish(as_json, done.payload(), done.lines(), done.warnings)
 
 

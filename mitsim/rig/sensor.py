@@ -7,6 +7,8 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mitsim.core.configuration import read_toml, validated
+from mitsim.core.errors import MitsimError
+from mitsim.rig.efficiency import EfficiencyCurve, Mosaic, MosaicCurves, Plane
 
 EXPOSURE_S = 1e-12, 1e6
 """Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""
@@ -102,6 +104,15 @@ class SensorModel(BaseModel):
         description="electrons per photon, at source's wavelength; none: no source gives it",
     )
     """One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
+    quantum_efficiency_curve: EfficiencyCurve | None = Field(
+        default=None, description="table: electrons per photon over wavelength, in place of quantum_efficiency"
+    )
+    mosaic: Mosaic | None = Field(
+        default=None, description="colour filters of 2 x 2 pixels, row by row; none: a monochrome sensor"
+    )
+    mosaic_curves: MosaicCurves | None = Field(
+        default=None, description="tables R, G, B: curves of the pixels under each filter, in place of both"
+    )
     gain_dn_per_e: float = Field(ge=1e-12, le=1e6, description="digital numbers per electron")
     """1e-12 spreads the largest full well over one number; electron multiplication brings some 1e3."""
     black_level_dn: float = Field(default=0.0, ge=0, lt=2**24, description="digital number of a pixel without charge")
@@ -158,6 +169,55 @@ class SensorModel(BaseModel):
             if not all(0 < rise < math.inf for rise in rises):
                 raise ValueError(f"linearity {self.linearity} falls below the full well; more light must read as more")
         return self
+
+    @model_validator(mode="after")
+    def _one_efficiency(self) -> "SensorModel":
+        names = "quantum_efficiency", "quantum_efficiency_curve", "mosaic_curves"
+        given = [name for name in names if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"got {' and '.join(given)}; give one of them")
+        if (self.mosaic is None) != (self.mosaic_curves is None):
+            raise ValueError("mosaic and mosaic_curves go together; give both, or none")
+        if self.mosaic is not None and self.binning > 1:
+            raise ValueError(f"mosaic {self.mosaic}: binning {self.binning} would sum its colours; set binning 1")
+        return self
+
+    def efficiency(self, wavelength_nm: float, plane: Plane | None = None) -> float:
+        """Electrons per photon.
+
+        Parameters
+        ----------
+        wavelength_nm
+            of the light; a camera whose file states one number has it at all wavelengths.
+        plane
+            whose pixels, of a camera with a mosaic; None for one without.
+
+        Raises
+        ------
+        MitsimError
+            outside the curve, for a camera whose file states no efficiency, or a plane that it has not.
+        """
+        if (self.mosaic is None) != (plane is None):
+            filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
+            asked = f"plane {plane}" if plane else "monochrome frames"
+            remedy = "use a monochrome camera" if self.mosaic else "leave the plane out"
+            raise MitsimError(f"sensor {self.name!r}: has {filters}, and {asked} was asked for; {remedy}")
+        curve = getattr(self.mosaic_curves, plane) if plane else self.quantum_efficiency_curve
+        try:
+            found = self.quantum_efficiency if curve is None else curve.at(wavelength_nm)
+        except MitsimError as error:
+            raise MitsimError(f"sensor {self.name!r}: {error}") from None
+        if found is None:
+            raise MitsimError(
+                f"sensor {self.name!r}: its file states no quantum_efficiency, so light makes no known number of "
+                "electrons; give one, with its source"
+            )
+        return float(found)
+
+    @property
+    def states_efficiency(self) -> bool:
+        """Whether light makes a known number of electrons in a pixel without colour filters."""
+        return self.quantum_efficiency is not None or self.quantum_efficiency_curve is not None
 
     @property
     def identity(self) -> dict[str, object]:

@@ -80,6 +80,10 @@ def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorMode
     if not np.isfinite(model.full_well_e):
         raise MitsimError(f"exposure: sensor {model.name!r} has no full well to fill; choose exposure_s instead")
     rate = peak_irradiance * _electrons_per_joule_m2(model, wavelength_nm)
+    if rate == 0:
+        raise MitsimError(
+            f"exposure: sensor {model.name!r} is blind at {wavelength_nm:g} nm; choose exposure_s instead"
+        )
     return float(fraction * model.superpixel_full_well_e / (rate + model.superpixel_dark_current_e_per_s))
 
 
@@ -380,12 +384,7 @@ def quantise(signal_dn: FloatArray, model: SensorModel, out: FloatArray | None =
 
 
 def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
-    if model.quantum_efficiency is None:
-        raise MitsimError(
-            f"sensor {model.name!r}: its file states no quantum efficiency, so light makes no known number of "
-            "electrons; give quantum_efficiency"
-        )
-    return model.quantum_efficiency * model.superpixel_area_m2 / photon_energy(wavelength_nm)
+    return model.efficiency(wavelength_nm) * model.superpixel_area_m2 / photon_energy(wavelength_nm)
 
 
 def _frame_shape(shape: tuple[int, ...], model: SensorModel) -> tuple[int, int]:

@@ -84,12 +84,15 @@ class Procedure:
         of each stack.
     seed
         root of every draw; the camera's fixed pattern has its own.
+    wavelength_nm
+        of the light, where the camera has a curve of quantum efficiency.
     """
 
     pixels: int = 256
     steps: int = 50
     frames: int = 100
     seed: int = 0
+    wavelength_nm: float = 550.0
 
     def __post_init__(self) -> None:
         for name, (least, most) in (("pixels", _PIXELS), ("steps", _STEPS), ("frames", _FRAMES)):
@@ -212,10 +215,11 @@ def characterise(
     Raises
     ------
     MitsimError
-        for a camera that light never saturates, or a folder that holds something else.
+        for a camera that light never saturates, a wavelength outside its curve, or a folder that holds something else.
     """
     procedure, job = procedure or Procedure(), job or Job()
     capacity = _capacity(sensor)
+    _efficiency(sensor, procedure)
     if output is None:
         return _characterised(sensor, procedure, capacity, job)
     with study_folder(output, "characterise", ("*.png",)) as folder:
@@ -225,6 +229,11 @@ def characterise(
             with whole_file(folder / file) as part:
                 figure.savefig(part, dpi=DPI, format="png")
     return done
+
+
+def _efficiency(sensor: SensorModel, procedure: Procedure) -> float:
+    """Electrons per photon; 1 where the camera states none, or has colour filters: light is counted in electrons."""
+    return sensor.efficiency(procedure.wavelength_nm) if sensor.states_efficiency else 1.0
 
 
 def _capacity(sensor: SensorModel) -> float:
@@ -249,7 +258,7 @@ def _characterised(
     session = plan.measured(job)
     found = figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
-    names = [name for name in UNITS if sensor.quantum_efficiency is not None or name != "quantum_efficiency"]
+    names = [name for name in UNITS if sensor.states_efficiency or name != "quantum_efficiency"]
     rows = tuple(_row(plan, name, found[name], drawn[name]) for name in names)
     return Characterisation(sensor, procedure, plan.exposure_s, session, expected, rows, output)
 
@@ -285,7 +294,7 @@ class _Plan:
 
     @property
     def photons(self) -> FloatArray:
-        return self.electrons / (self.sensor.quantum_efficiency or 1.0)
+        return self.electrons / _efficiency(self.sensor, self.procedure)
 
     def frame(self, electrons: float, exposure_s: float, *names: str | int) -> FloatArray:
         shot, read = (stream(self.procedure.seed, "characterise", noise, *names) for noise in ("shot", "read"))
@@ -486,7 +495,7 @@ def _set(plan: _Plan, name: str) -> float:
     dark = mean_dark_current(sensor)
     return {
         "system_gain": sensor.gain_dn_per_e,
-        "quantum_efficiency": (sensor.quantum_efficiency or 1.0) * (1 - sensor.dead_pixels),
+        "quantum_efficiency": _efficiency(sensor, plan.procedure) * (1 - sensor.dead_pixels),
         "dark_noise": math.sqrt(sensor.superpixel_reading_noise_e**2 + dark * time),
         "row_noise": sensor.superpixel_row_noise_e**2,
         "saturation_capacity": _capacity(sensor),
@@ -557,7 +566,7 @@ def _linearity(done: Characterisation) -> Figure:
         line = start + slope * session.photons[used]
         axes.plot(session.photons[used], 100 * (signal[used] / line - 1), label=label, **style)
     axes.axhline(0, color=BLACK, lw=1)
-    light = "photons on a pixel" if done.sensor.quantum_efficiency is not None else "photoelectrons of a pixel"
+    light = "photons on a pixel" if done.sensor.states_efficiency else "photoelectrons of a pixel"
     label_axes(axes, light, "deviation from a line [%]")
     axes.legend(fontsize=FONT - 1, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
     return figure

@@ -154,6 +154,10 @@ def test_a_missing_toml(refused: Refused, lab: Any, verb: str, option: str) -> N
     mentions(refused(verb, lab.scene, *rest, option, "nowhere.toml"), "nowhere.toml", "No such file")
 
 
+_CURVE = "quantum_efficiency_curve = {wavelengths_nm = [600, 700], efficiency = [0.5, 0.4]}"
+"""Of a camera that does not see the projector."""
+
+
 @pytest.mark.parametrize(
     ("old", "new", "fragments"),
     [
@@ -169,6 +173,7 @@ def test_a_missing_toml(refused: Refused, lab: Any, verb: str, option: str) -> N
         ("bits = 12", "bits = 12.5", ["bits", "12.5"]),
         ("quantum_efficiency = 0.75", "quantum_efficiency = 1.2", ["quantum_efficiency", "1.2"]),
         ("quantum_efficiency = 0.75", "quantum_efficiency = '75 %'", ["quantum_efficiency", "75 %"]),
+        ("quantum_efficiency = 0.75", _CURVE, ["562 nm", "600 to 700 nm"]),
         ("bits = 12", "bits = ", ["not valid TOML", "line 11"]),
         ("bits = 12", "bits = 12\nbits = 10", ["not valid TOML", "line 12"]),
     ],

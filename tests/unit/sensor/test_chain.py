@@ -37,6 +37,19 @@ def test_electrons_scale_with_efficiency_and_keep_their_shape() -> None:
     assert full[0, 2] == 2 * full[0, 1]
 
 
+def test_a_curve_is_taken_at_the_light_s_wavelength() -> None:
+    curve = {"wavelengths_nm": [500.0, 550.0, 600.0], "efficiency": [0.0, 0.5, 0.5]}
+    model = sensor(quantum_efficiency=None, quantum_efficiency_curve=curve)
+    light = np.array([1e-9, 2e-9])
+    by_number = chain.electrons_from_irradiance(light, 0.1, sensor(quantum_efficiency=0.25), 525.0)
+    np.testing.assert_array_equal(chain.electrons_from_irradiance(light, 0.1, model, 525.0), by_number)
+    assert chain.exposure_for_peak(1e-9, 0.5, model, 525.0) == chain.exposure_for_peak(
+        1e-9, 0.5, sensor(quantum_efficiency=0.25), 525.0
+    )
+    with pytest.raises(MitsimError, match="blind at 500 nm"):
+        chain.exposure_for_peak(1e-9, 0.5, model, 500.0)
+
+
 def test_the_exposure_fills_the_fraction_asked_for() -> None:
     model = sensor(binning=2, dark_current_e_per_s=50.0, quantum_efficiency=0.6)
     seconds = chain.exposure_for_peak(2e-6, 0.8, model, 550.0)

@@ -104,6 +104,20 @@ def test_without_a_quantum_efficiency_light_is_counted_in_electrons() -> None:
     assert "quantum_efficiency" not in {row.name for row in done.rows} and done.rows[0].name == "system_gain"
 
 
+def test_of_a_curve_the_efficiency_is_found_at_the_light_s_wavelength() -> None:
+    """That of a mosaic has no one value: its light is counted in electrons."""
+    curve = {"wavelengths_nm": [400.0, 600.0], "efficiency": [0.2, 0.6]}
+    of_a_curve = sensor(**{**PLAIN, "quantum_efficiency": None, "quantum_efficiency_curve": curve})
+    small = Procedure(32, 20, 2, wavelength_nm=500.0)
+    by_number = characterise(sensor(**{**PLAIN, "quantum_efficiency": 0.4}), small)
+    assert characterise(of_a_curve, small).rows == by_number.rows and by_number.rows[1].set == 0.4
+    with pytest.raises(MitsimError, match="700 nm"):
+        characterise(of_a_curve, Procedure(32, 20, 2, wavelength_nm=700.0))
+    filters = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": {plane: curve for plane in "RGB"}}
+    rows = characterise(sensor(**{**PLAIN, **filters}), small).rows
+    assert rows == characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), small).rows
+
+
 def test_what_cannot_be_characterised_is_refused() -> None:
     with pytest.raises(MitsimError, match="no light saturates it"):
         characterise(sensor(full_well_e=math.inf))
