@@ -158,6 +158,13 @@ def test_importing_mitsim_imports_nothing_else() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
+def test_what_checks_a_request_imports_no_numpy() -> None:
+    """Half the time of a refusal would be numpy's."""
+    rooms = "mitsim.cli, mitsim.capture.request, mitsim.core.manifests, mitsim.rig.sensor, mitsim.rig.recipe"
+    program = f"import sys, {rooms}; assert 'numpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 def test_importing_every_module_selects_no_variant_and_touches_no_global_state() -> None:
     names = [m.name for m in pkgutil.walk_packages(mitsim.__path__, "mitsim.") if "__main__" not in m.name]
     program = f"""
