@@ -1,6 +1,6 @@
-"""Recipes in, textures and meshes of the shipped scenes out: 8-bit grey PNGs whose value / 255 IS the reflectance
-(or the projector's window), and binary PLYs. `python scenes/generate.py` writes them, `--check` compares what is
-shipped.
+"""Recipes in, files of the shipped scenes out: textures, 8-bit grey PNGs whose value / 255 IS the reflectance (or the
+projector's window), meshes, binary PLYs, and XML of shapes with spectra. `python scenes/generate.py` writes them,
+`--check` compares what is shipped.
 
 Rows run top (+y) to bottom, columns left (+x) to right, as one sees the sheet looking along +z. A sheet is
 128 mm a side; the projector's lit window is its central 120 mm. No resampling library and no font takes part,
@@ -28,6 +28,29 @@ WINDOW_MM = 120.0
 PROJECTOR_GRID = 128
 REFLECTANCE_RANGE = (0.03, 0.90)
 CHART_FRAME, CHART_PAPER = 0.04, 0.80
+# The chart in texels of 0.25 mm: from patch to patch, a patch, the frame around it; 4 rows of 6.
+CHART_PITCH, CHART_PATCH, CHART_GAP, CHART_ROWS, CHART_COLUMNS = 74, 64, 10, 4, 6
+CHART_TEXEL_MM = 0.25
+CHART_SPECTRA = "ColorChecker N Ohta"
+PATCHES_XML = """<?xml version="1.0" encoding="utf-8"?>
+<!-- The patches of a ColorChecker with their measured reflectances, nm:part, as colour-science has them
+(SDS_COLOURCHECKERS["{spectra}"], N. Ohta). Made by ../generate.py. -->
+<scene version="3.0.0">
+{shapes}</scene>
+"""
+PATCH_XML = """    <shape type="rectangle" id="{name}">
+        <transform name="to_world">
+            <rotate z="1" angle="180"/>
+            <scale x="{half:g}" y="{half:g}" z="1"/>
+            <translate x="{x:g}" y="{y:g}" z="$sheet_z"/>
+        </transform>
+        <boolean name="flip_normals" value="true"/>
+        <bsdf type="diffuse">
+            <spectrum name="reflectance" value="
+                {values}"/>
+        </bsdf>
+    </shape>
+"""
 TARGET_BLACK, TARGET_WHITE = 0.04, 0.90
 # Reflectances are averaged over the span of a laser projector's three lines, in nm.
 CHART_BAND_NM = (450.0, 640.0, 5.0)
@@ -91,18 +114,71 @@ def colour_chart() -> Grey:
 
     first, last, step = CHART_BAND_NM
     band = np.arange(first, last + step / 2, step)
-    spectra = SDS_COLOURCHECKERS["ColorChecker N Ohta"].values()
+    spectra = SDS_COLOURCHECKERS[CHART_SPECTRA].values()
     means = [float(np.mean([spectrum[float(w)] for w in band])) for spectrum in spectra]
     sheet = np.full((512, 512), CHART_PAPER)
-    pitch, patch, gap = 74, 64, 10
-    height, width = 4 * pitch + gap, 6 * pitch + gap
-    top, left = (512 - height) // 2, (512 - width) // 2
+    top, left, height, width = chart_box()
     sheet[top : top + height, left : left + width] = CHART_FRAME
-    for index, mean in enumerate(means):
-        row = top + gap + pitch * (index // 6)
-        column = left + gap + pitch * (index % 6)
-        sheet[row : row + patch, column : column + patch] = mean
+    for (row, column), mean in zip(chart_patches(), means, strict=True):
+        sheet[row : row + CHART_PATCH, column : column + CHART_PATCH] = mean
     return _to_grey(sheet)
+
+
+def chart_box() -> tuple[int, int, int, int]:
+    """Top, left, height and width [texels of 0.25 mm] of the chart's frame on its sheet of 512 x 512."""
+    height, width = (count * CHART_PITCH + CHART_GAP for count in (CHART_ROWS, CHART_COLUMNS))
+    return (512 - height) // 2, (512 - width) // 2, height, width
+
+
+def chart_patches() -> list[tuple[int, int]]:
+    """Top row and left column [texels of 0.25 mm] of each of the 24 patches."""
+    top, left, _, _ = chart_box()
+    rows, columns = (
+        [start + CHART_GAP + CHART_PITCH * i for i in range(count)]
+        for start, count in ((top, CHART_ROWS), (left, CHART_COLUMNS))
+    )
+    return [(row, column) for row in rows for column in columns]
+
+
+def chart_paper() -> meshes.Mesh:
+    """The sheet of the coloured chart around its frame, in mm about its middle."""
+    top, left, height, width = chart_box()
+    low, right = top + height, left + width
+    return _tiles([(0, 0, top, 512), (top, 0, low, left), (top, right, low, 512), (low, 0, 512, 512)])
+
+
+def chart_frame() -> meshes.Mesh:
+    """The frame of the coloured chart, in mm about the sheet's middle, with a gap for each patch."""
+    top, left, height, width = chart_box()
+    tops, lefts = (sorted({place[axis] for place in chart_patches()}) for axis in (0, 1))
+    ends = [top, *(start + CHART_PATCH for start in tops)]
+    bars = [(above, left, below, left + width) for above, below in zip(ends, [*tops, top + height], strict=True)]
+    for start in tops:
+        sides = [left, *(first + CHART_PATCH for first in lefts)]
+        pairs = zip(sides, [*lefts, left + width], strict=True)
+        bars += [(start, one, start + CHART_PATCH, other) for one, other in pairs]
+    return _tiles(bars)
+
+
+def _tiles(tiles: list[tuple[int, int, int, int]]) -> meshes.Mesh:
+    """Flat tiles of the chart's sheet, each by its top, left, bottom and right in texels."""
+    return meshes.flat([tuple((256 - edge) * CHART_TEXEL_MM for edge in tile) for tile in tiles])
+
+
+def chart_patches_xml() -> str:
+    """The 24 patches of the coloured chart, each a rectangle with N. Ohta's measured spectral reflectance (380 to 780
+    nm in steps of 5 nm, as colour-science has it). First patch (dark skin) top left."""
+    from colour import SDS_COLOURCHECKERS
+
+    shapes = []
+    half = CHART_PATCH * CHART_TEXEL_MM / 2
+    for (row, column), spectrum in zip(chart_patches(), SDS_COLOURCHECKERS[CHART_SPECTRA].values(), strict=True):
+        x, y = ((256 - edge) * CHART_TEXEL_MM - half for edge in (column, row))
+        values = [f"{nm:g}:{part:g}" for nm, part in zip(spectrum.wavelengths, spectrum.values, strict=True)]
+        lines = [", ".join(values[start : start + 9]) for start in range(0, len(values), 9)]
+        name = spectrum.name.partition(" (")[0].replace(" ", "_").replace(".", "_")
+        shapes.append(PATCH_XML.format(name=name, half=half, x=x, y=y, values=(",\n" + 16 * " ").join(lines)))
+    return PATCHES_XML.format(spectra=CHART_SPECTRA, shapes="".join(shapes))
 
 
 def resolution_target() -> Grey:
@@ -169,6 +245,7 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "photograph/reflectance.png": photograph,
     "colour_chart/projector.png": projector_window,
     "colour_chart/reflectance.png": colour_chart,
+    "colour_checker/projector.png": projector_window,
     "compact_disc/projector.png": projector_window,
     "resolution_target/projector.png": projector_window,
     "resolution_target/reflectance.png": resolution_target,
@@ -192,24 +269,27 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
 }
 MESHES: dict[str, Callable[[], meshes.Mesh]] = {
     "corner/walls.ply": meshes.corner,
+    "colour_checker/paper.ply": chart_paper,
+    "colour_checker/frame.ply": chart_frame,
     "cookie_bag/bag.ply": meshes.cookie_bag,
     "cookie_bag/box.ply": meshes.box,
     "metal_blade/blade.ply": meshes.blade,
 }
+TEXTS: dict[str, Callable[[], str]] = {"colour_checker/patches.xml": chart_patches_xml}
 
 
 def difference(folder: Path, name: str) -> str | None:
     """None when the file at folder/name is exactly what its recipe makes, else a sentence saying why.
 
-    A PNG is compared by its pixels (packing differs between library versions), a mesh by its bytes.
+    A PNG is compared by its pixels (packing differs between library versions), another file by its bytes.
     """
     from PIL import Image
 
     path = folder / name
     if not path.is_file():
         return f"{path} is missing"
-    if name in MESHES:
-        return None if path.read_bytes() == MESHES[name]().ply() else f"{path} differs from its recipe"
+    if name not in TEXTURES:
+        return None if path.read_bytes() == _recipe(name) else f"{path} differs from its recipe"
     with Image.open(path) as image:
         mode, shipped = image.mode, np.asarray(image)
     expected = TEXTURES[name]()
@@ -219,30 +299,35 @@ def difference(folder: Path, name: str) -> str | None:
     return f"{path} differs from its recipe in {wrong} pixels" if wrong else None
 
 
+def _recipe(name: str) -> bytes:
+    """What a mesh or a text is to hold."""
+    return MESHES[name]().ply() if name in MESHES else TEXTS[name]().encode()
+
+
 def write(folder: Path, name: str) -> None:
     """Write the file of `name` under `folder` (beside it first, then moved into place)."""
     from PIL import Image
 
     path = folder / name
     part = path.with_suffix(".part")
-    if name in MESHES:
-        part.write_bytes(MESHES[name]().ply())
-    else:
+    if name in TEXTURES:
         Image.fromarray(TEXTURES[name]()).save(part, format="PNG", optimize=True)
+    else:
+        part.write_bytes(_recipe(name))
     os.replace(part, path)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """0 when all is written, or with --check when all agrees; 1 when a shipped file differs."""
-    parser = argparse.ArgumentParser(description="Make the textures and meshes of the shipped scenes.")
+    parser = argparse.ArgumentParser(description="Make the textures, meshes and spectra of the shipped scenes.")
     parser.add_argument("--check", action="store_true", help="compare, write nothing")
     check: bool = parser.parse_args(arguments).check
     folder = Path(__file__).resolve().parent
     if not check:
-        for name in (*TEXTURES, *MESHES):
+        for name in (*TEXTURES, *MESHES, *TEXTS):
             write(folder, name)
         return 0
-    complaints = [text for name in (*TEXTURES, *MESHES) if (text := difference(folder, name))]
+    complaints = [text for name in (*TEXTURES, *MESHES, *TEXTS) if (text := difference(folder, name))]
     for text in complaints:
         sys.stderr.write(f"{text}; run: python scenes/generate.py\n")
     return 1 if complaints else 0

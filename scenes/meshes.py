@@ -146,6 +146,16 @@ def blade() -> Mesh:
     return Mesh(points, uv, _quads(len(sides)))
 
 
+def flat(tiles: Sequence[tuple[float, float, float, float]]) -> Mesh:
+    """Tiles in the plane z = 0 that face -z, each by its top (y), left (x), bottom (y) and right (x)."""
+    corners = [
+        [(x, y, 0) for x, y in ((left, top), (right, top), (right, bottom), (left, bottom))]
+        for top, left, bottom, right in tiles
+    ]
+    uv = np.tile([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], (len(tiles), 1))
+    return Mesh(np.array(corners, dtype=np.float64).reshape(-1, 3), uv, _quads(len(tiles)))
+
+
 def _quads(count: int) -> Faces:
     """(2 count, 3) triangles: every four vertices, clockwise as seen from outside, are one face."""
     first = 4 * np.arange(count, dtype=np.int32)[:, None]

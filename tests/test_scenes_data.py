@@ -50,7 +50,7 @@ def _projector_pixels(name: str) -> np.ndarray:
     return share @ sheet @ share.T
 
 
-@pytest.mark.parametrize("name", sorted({**generate.TEXTURES, **generate.MESHES}))
+@pytest.mark.parametrize("name", sorted({**generate.TEXTURES, **generate.MESHES, **generate.TEXTS}))
 def test_shipped_file_is_what_its_recipe_makes(name: str) -> None:
     assert generate.difference(SCENES, name) is None
 
@@ -58,6 +58,8 @@ def test_shipped_file_is_what_its_recipe_makes(name: str) -> None:
 def test_every_file_of_a_scene_has_a_recipe() -> None:
     shipped = {str(path.relative_to(SCENES)) for path in SCENES.rglob("*.*") if path.suffix in (".png", ".ply")}
     assert shipped == {*generate.TEXTURES, *generate.MESHES}
+    parts = {str(path.relative_to(SCENES)) for path in SCENES.rglob("*.xml") if path.name != "scene.xml"}
+    assert parts == set(generate.TEXTS)
 
 
 def test_a_changed_texture_is_noticed(tmp_path: Path) -> None:
@@ -107,6 +109,27 @@ def test_chart_patches_keep_the_grey_scale_in_order() -> None:
     assert np.all(np.diff(greys) < 0)
     # N. Ohta's flat greys: 0.89 (white 9.5) and 0.03 (black 2), to 8 bits.
     assert greys[0] == pytest.approx(0.888, abs=0.003) and greys[-1] == pytest.approx(0.034, abs=0.003)
+
+
+def test_the_coloured_chart_lies_where_the_grey_one_does() -> None:
+    """A ray to each texel of colour_chart meets the patch, frame or paper of colour_checker that this texel shows."""
+    import drjit as dr
+
+    mi, loaded = opened("colour_checker")
+    sheet = np.full((512, 512), "paper", dtype=object)
+    sheet[103:409, 29:483] = "frame"
+    names = [shape.id() for shape in loaded.shapes() if shape.id() not in ("paper", "frame")]
+    assert names[0] == "dark_skin" and names[18:] == ["white_9_5", "neutral_8", *names[20:23], "black_2"]
+    for index, name in enumerate(names):
+        row, column = 113 + 74 * (index // 6), 39 + 74 * (index % 6)
+        sheet[row : row + 64, column : column + 64] = name
+    rows, columns = (axis.ravel() for axis in np.indices(sheet.shape))
+    x, y = 64 - (columns + 0.5) / 4, 64 - (rows + 0.5) / 4
+    hit = loaded.ray_intersect(mi.Ray3f(mi.Point3f(0.0), dr.normalize(mi.Vector3f(mi.Float(x), mi.Float(y), 400.0))))
+    of = dr.reinterpret_array(mi.UInt32, hit.shape)
+    order = {int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]): shape.id() for shape in loaded.shapes()}
+    assert np.array_equal([order.get(int(index)) for index in np.array(of)], sheet.ravel())
+    assert np.all(np.array(hit.wi)[2] > 0), "every face faces the camera"
 
 
 def test_group_5_is_the_last_that_the_projector_grid_resolves() -> None:

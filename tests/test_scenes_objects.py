@@ -16,6 +16,7 @@ from tests.shipped_scenes import SCENES, emitter, opened, projected
 DEPTHS = {
     "photograph": (400.0, 400.0),
     "colour_chart": (400.0, 400.0),
+    "colour_checker": (400.0, 400.0),
     "resolution_target": (400.0, 400.0),
     "lamp_bench": (400.0, 400.0),
     "keystone": (400.0, 400.0),
