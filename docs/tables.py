@@ -14,6 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from mitsim.core.colours import ColourManifest, Line
 from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,
@@ -25,6 +26,7 @@ from mitsim.core.manifests import (
     ShotFile,
 )
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.chart import ChartPlace
 from mitsim.rig.efficiency import EfficiencyCurve
 from mitsim.rig.framelist import DarkFile, FrameList, StripeFile
 from mitsim.rig.profile import MaskProfile
@@ -37,6 +39,7 @@ MODELS = (
     *(CameraGeometry, SensorModel, EfficiencyCurve, MaskProfile, ProjectorModel, SessionRecipe),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile),
+    *(ColourManifest, Line, ChartPlace),
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 

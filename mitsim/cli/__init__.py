@@ -373,16 +373,29 @@ def reconstruct(
             metavar="auto|MM|map",
         ),
     ] = None,
+    chart: Annotated[
+        str | None,
+        typer.Option(
+            help="of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
+            metavar="NAME|FILE.json",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """Recover the image from frames and a calibration alone."""
+    """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
+    from mitsim.core.colours import is_coloured
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
+    if is_coloured(run):
+        options = {"lam": strength, "method": method, "overwrite": overwrite, "focus": depth}
+        return _reconstruct_colours(run, calibration, output or run / "reconstruction", chart, options, as_json)
+    if chart is not None:
+        raise MitsimError(f"--chart {chart}: {run} is not coloured; leave out --chart")
     # Refused before the solver is imported, which takes half a second.
     read_manifest(run, RunManifest)
     read_manifest(calibration, CalibrationManifest)
@@ -403,6 +416,43 @@ def reconstruct(
         lines.append(str(result.reconstruction.focus))
     lines += result.reconstruction.trust
     return finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
+
+
+def _reconstruct_colours(
+    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], as_json: bool
+) -> int:
+    """The image of every line of a coloured run, and one in colour.
+
+    Parameters
+    ----------
+    run, calibration, output, chart, as_json
+        as the options of `mitsim reconstruct`.
+    options
+        those that every line is solved with.
+    """
+    from mitsim.core.colours import CALIBRATION, RUN, read_colours
+    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+    from mitsim.rig.chart import load_chart
+
+    # Refused before the solver and colour-science are imported.
+    for name in read_colours(run, RUN).names:
+        read_manifest(run / name, RunManifest)
+    for name in read_colours(calibration, CALIBRATION).names:
+        read_manifest(calibration / name, CalibrationManifest)
+    place = None if chart is None else load_chart(chart)
+    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.study.colours import reconstruct_colours
+
+    held = memory_from_here()
+    found = reconstruct_colours(run, calibration, output, place, **options)
+    payload = {**found.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    lines = [
+        f"{name}: {judged.quality or 'no truth to compare with'}, lambda {judged.reconstruction.lam:.3g}, residual "
+        f"{judged.reconstruction.residual:.1e}"
+        for name, judged in found.images.items()
+    ]
+    lines.append(f"colours by a matrix fitted on {found.model.fitted_on}: {found.output}")
+    return finish(as_json, payload, lines, found.warnings)
 
 
 @app.command()

@@ -56,6 +56,15 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
     return buffer.getvalue()
 
 
+def colour_png(rgb: npt.ArrayLike) -> bytes:
+    """A PNG in colour of linear sRGB ``rgb`` (rows, columns, 3), cut to 0..1 and encoded for a screen."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(255 * lightness(rgb)).astype(np.uint8)).save(buffer, format="png", optimize=True)
+    return buffer.getvalue()
+
+
 def data_uri(picture: bytes) -> str:
     """A PNG ``picture`` as the address that holds it, for a page that refers to nothing outside itself."""
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
