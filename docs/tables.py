@@ -25,6 +25,7 @@ from mitsim.core.manifests import (
     RunManifest,
     ShotFile,
 )
+from mitsim.rig.board import BoardShape
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.chart import ChartPlace
 from mitsim.rig.efficiency import EfficiencyCurve
@@ -36,7 +37,9 @@ from mitsim.rig.sensor import SensorModel
 
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
-    *(CameraGeometry, SensorModel, EfficiencyCurve, MaskProfile, ProjectorModel, SessionRecipe),
+    *(CameraGeometry, MaskProfile, ProjectorModel),
+    *(SensorModel, EfficiencyCurve),
+    *(SessionRecipe, BoardShape),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile),
     *(ColourManifest, Line, ChartPlace),
@@ -55,7 +58,7 @@ def table(model: type[BaseModel]) -> str:
 
 
 def _default(value: Any) -> str:
-    if value is None or value in ({}, (), ""):
+    if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
         return "none"
     if isinstance(value, bool):
         return str(value).lower()

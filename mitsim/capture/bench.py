@@ -16,8 +16,6 @@ from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.outline import Outline
 
 if TYPE_CHECKING:
-    import mitsuba as mi
-
     from mitsim.capture.glint import Glint
     from mitsim.capture.light import Light
     from mitsim.capture.plan import Plan
@@ -26,6 +24,7 @@ if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
+    from mitsim.rig.board import BoardShape
     from mitsim.rig.camera import CameraGeometry
     from mitsim.rig.patterns import PatternFamily
     from mitsim.rig.projector import ProjectorModel, Spectrum
@@ -353,20 +352,23 @@ class Bench:
             },
         }
 
-    def with_board(self, reflectance: float) -> Bench:
-        """The same rig before a diffuse board of that ``reflectance`` on the aligned plane, larger than the view."""
+    def with_board(self, reflectance: float, shape: BoardShape | None = None) -> Bench:
+        """The same rig before a diffuse board on the aligned plane.
+
+        Parameters
+        ----------
+        reflectance
+            of the board.
+        shape
+            its size, bow and tilt; None: flat, and larger than the view.
+        """
         import mitsuba as mi
 
+        from mitsim.capture.board import board_object
+        from mitsim.rig.board import BoardShape
         from mitsim.scene.guard.estimators import Unfit
 
-        z = self.geometry.scene_distance
-        half = 1.1 * (self.geometry.tan_half_fov * z + self.geometry.half_width)
-        place = mi.ScalarAffineTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180).scale([half, half, 1])
-        board = {
-            "type": "rectangle",
-            "to_world": _scalar_transform(self.loaded.camera) @ place,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}},
-        }
+        board = board_object(self, reflectance, shape or BoardShape())
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
@@ -453,11 +455,3 @@ def open_bench(
 def _text(value: object) -> str:
     """A parameter as a scene spells it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _scalar_transform(camera: mi.Sensor) -> mi.ScalarAffineTransform4f:
-    import mitsuba as mi
-    import numpy as np
-
-    matrix = np.array(camera.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
-    return mi.ScalarAffineTransform4f(matrix.tolist())

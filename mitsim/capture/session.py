@@ -15,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.board import missed_pixels
 from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import Exposer, camera_warnings, in_chunks
 from mitsim.capture.light import Light, Sampling, trace_light
@@ -31,6 +32,7 @@ from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, decibels
+from mitsim.rig.board import BoardShape
 from mitsim.rig.patterns import SIDES, Lighting, stripe_signs
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
@@ -54,7 +56,7 @@ class Session:
     @cached_property
     def board(self) -> Bench:
         """The bench with the white board instead of its scene."""
-        return self.bench.with_board(self.recipe.board_reflectance)
+        return self.bench.with_board(self.recipe.board_reflectance, self.recipe.board)
 
     @property
     def centre(self) -> bool:
@@ -63,8 +65,27 @@ class Session:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What mask and sensor do that factors do not know of."""
-        return *self.mask_warnings, *camera_warnings(self.bench.sensor, (self.bench.geometry.pixels,) * 2)
+        """What board, mask and sensor do that factors do not know of."""
+        return (
+            *self.board_warnings,
+            *self.mask_warnings,
+            *camera_warnings(self.bench.sensor, (self.bench.geometry.pixels,) * 2),
+        )
+
+    @cached_property
+    def board_warnings(self) -> tuple[str, ...]:
+        """Projector pixels that the board leaves dark."""
+        shape = self.recipe.board
+        missed = 0 if shape == BoardShape() else missed_pixels(self.board)
+        if not missed:
+            return ()
+        z = self.bench.geometry.scene_distance
+        rows, columns = (z * (last - first) for first, last in self.bench.windows)
+        return (
+            f"board: {missed} of {self.bench.n**2} projector pixels do not fall whole on it ({shape.words}), and "
+            f"their light is missing in the factors; the window is {rows:.4g} x {columns:.4g} mm on the aligned plane: "
+            "take a larger board, or hang it straight",
+        )
 
     @cached_property
     def mask_warnings(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import load_model, shipped
+from mitsim.rig.board import BoardShape
 from mitsim.rig.sensor import ExposureFraction
 
 MOST_REPEATS = 1024
@@ -21,6 +22,7 @@ class SessionRecipe(BaseModel):
 
     board_reflectance: float = Field(ge=0.01, le=1, description="diffuse reflectance of the white board")
     """Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
+    board: BoardShape = Field(default=BoardShape(), description="size, bow and tilt of the board; none: ideal")
     exposure_fraction: ExposureFraction = Field(description="brightest pixel's mean, as a part of the full well")
     signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern is captured")
     repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="shots of every frame, whose mean is taken")
