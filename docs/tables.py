@@ -75,6 +75,8 @@ def _allowed(rules: dict[str, Any]) -> str:
     if "$ref" in rules or rules.get("type") == "object":
         return "object"
     if rules.get("type") == "array":
+        if "prefixItems" in rules:
+            return f"{len(rules['prefixItems'])} of: {_allowed(rules['prefixItems'][0])}"
         most = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
         return f"list: {_allowed(rules['items'])}{most}"
     if "pattern" in rules:

@@ -6,12 +6,13 @@ A board without these is flat, faces the camera on the aligned plane, and is lar
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mitsim.core.arrays import FloatArray
-from mitsim.rig.camera import CameraGeometry
+if TYPE_CHECKING:
+    from mitsim.core.arrays import FloatArray
+    from mitsim.rig.camera import CameraGeometry
 
 _BEYOND = 1.1
 """Half side of a board without a size, as a part of what the sensor's edge sees; chosen: more than rounding."""
@@ -66,6 +67,8 @@ class BoardShape(BaseModel):
     def turn(self) -> FloatArray:
         """(3, 3) rotation of the board in the camera's frame, by the smallest angle that gives it its slopes: its plane
         is z = tan(tilt_row) s_row + tan(tilt_column) s_column, s_row = -y and s_column = -x. So no axis comes first."""
+        import numpy as np  # here: recipes are checked without it
+
         slope = np.array([-math.tan(math.radians(tilt)) for tilt in (self.tilt_column_deg, self.tilt_row_deg)])
         steep = float(np.linalg.norm(slope))
         if steep == 0:
@@ -96,6 +99,8 @@ class BoardShape(BaseModel):
 
         The paraboloid z = bow (x^2 + y^2) / half^2.
         """
+        import numpy as np
+
         line = np.linspace(-half, half, CELLS + 1)
         x, y = np.meshgrid(line, line)
         part = self.bow_mm / half**2
