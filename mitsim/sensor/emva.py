@@ -17,6 +17,9 @@ from mitsim.core.arrays import FloatArray
 
 QUANTISATION = 1 / 12
 """Variance of rounding [DN^2] (EMVA 1288, "noise model")."""
+_LEAST_DARK = 0.24
+"""Variance [DN^2] of dark frames below which rounding hides their noise: it counts as this much, an upper limit of
+0.4 DN for the noise (EMVA 1288 4.0, "limit for minimal temporal standard deviation")."""
 _FITTED, _LEAST, _MOST = 0.7, 0.05, 0.95
 """Parts of saturation: gain and responsivity are fitted up to 70 %, linearity from 5 to 95 % (EMVA 1288 4.0)."""
 SPLIT = ("total", "row", "column", "pixel")
@@ -84,6 +87,8 @@ class Session:
         these pairs (..., T).
     dark_stack, bright_stack
         at that time, in the dark and at half of saturation.
+    rounded
+        whether the frames are whole numbers.
     """
 
     shape: tuple[int, int]
@@ -95,6 +100,7 @@ class Session:
     dark_series: Pair
     dark_stack: Stack
     bright_stack: Stack
+    rounded: bool = True
 
 
 def pair_of(first: npt.ArrayLike, second: npt.ArrayLike) -> Pair:
@@ -160,13 +166,14 @@ def figures(session: Session) -> dict[str, FloatArray]:
     gain = _slope(signal, noise, fitted)
     efficiency = _slope(np.broadcast_to(photons, signal.shape), signal, fitted) / gain
     low, high = _linearity(photons, signal, (signal >= _LEAST * full) & (signal <= _MOST * full))
+    still = np.maximum(dark.variance, _LEAST_DARK) - QUANTISATION if session.rounded else dark.variance
     times, series = session.dark_times, session.dark_series
     about = times - times.mean()
     slopes = [(values * about).sum(axis=-1) / np.square(about).sum() for values in (series.mean, series.variance)]
     found = {
         "system_gain": gain,
         "quantum_efficiency": efficiency,
-        "dark_noise": np.sqrt(np.maximum(dark.variance - QUANTISATION, 0)) / gain,
+        "dark_noise": np.sqrt(still) / gain,
         "row_noise": dark.rows / gain**2,
         "saturation_capacity": efficiency * photons[peak],
         "full_well": (session.overexposed - dark.mean) / gain,

@@ -66,6 +66,8 @@ UNITS: Mapping[str, tuple[str, str]] = {
 """Symbol of the standard, and unit, of each figure in the order in which they are shown."""
 _SQUARES = ("row_noise", "dsnu", "prnu")
 """Figures that are found as variances, which may be below zero, and shown as their roots."""
+_DITHERED = 0.5
+"""Dark noise [DN] from which rounding adds its 1/12 DN^2, to 1 %: below, it hides part of the noise."""
 _BY_METHOD = ("saturation_capacity", "linearity_min", "linearity_max")
 """Figures that depend on the steps of light and on their noise, and have no value that a camera file sets."""
 
@@ -325,6 +327,7 @@ class _Plan:
             dark_series=pairs_of(dark),
             dark_stack=stacks[0],
             bright_stack=stacks[1],
+            rounded=self.sensor.bits is not None,
         )
 
     def _frames(self, electrons: float, name: str) -> Iterator[FloatArray]:
@@ -345,6 +348,7 @@ class _Plan:
             dark_series=pairs_of(series),
             dark_stack=self._expected_stack(dark.mean, 0.0),
             bright_stack=self._expected_stack(self._expected_pair(self.half).mean, self.half),
+            rounded=self.sensor.bits is not None,
         )
 
     def _expected_pair(self, electrons: FloatArray | float, exposure_s: float | None = None) -> Pair:
@@ -432,6 +436,7 @@ def _drawn(plan: _Plan, expected: Session) -> Session:
         plan.dark_times,
         series,
         *stacks,
+        expected.rounded,
     )
 
 
@@ -515,6 +520,7 @@ def _row(plan: _Plan, name: str, found: FloatArray, drawn: FloatArray) -> Row:
     # What the linear method makes of a camera that is not linear, and of rows that share noise, is not what is set.
     method = name in _BY_METHOD or bool(sensor.linearity)
     method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
+    method |= name == "dark_noise" and sensor.bits is not None and given * sensor.gain_dn_per_e < _DITHERED
     if name == "saturation_capacity":
         spread = math.hypot(spread, float(plan.electrons[0]) / math.sqrt(12))
     against = centre if method else given

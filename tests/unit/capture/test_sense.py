@@ -9,8 +9,10 @@ from PIL import Image
 
 from mitsim.capture.request import Exposure
 from mitsim.capture.sense import check_ending, irradiance_behind_lens, read_image, sense
+from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame, write_frame
+from mitsim.rig.sensor import load_sensor
 from mitsim.sensor import chain, moments
 from tests.invented import sensor
 
@@ -92,6 +94,8 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
         sense(IMAGE, sensor(quantum_efficiency=None))
     with pytest.raises(MitsimError, match="wavelength"):
         sense(IMAGE, CAMERA, wavelength_nm=0.0)
+    with pytest.raises(MitsimError, match="mosaic BGGR, and monochrome frames"):
+        sense(IMAGE, load_sensor(shipped("calibration", "ov5647.toml")))
 
 
 def test_a_png_holds_16_bits(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_what_is_set_is_found_within_five_predicted_standard_errors(name: str) -
     assert rows["system_gain"].set == 0.19 and (rows["system_gain"].expected is None) == (name != "bent")
 
 
-@pytest.mark.parametrize("name", ["imx249", "imx250", "imx255", "imx477", "mt9m031", "mt9m034"])
+@pytest.mark.parametrize("name", ["imx249", "imx250", "imx255", "imx477", "mt9m031", "mt9m034", "ov5647"])
 def test_shipped_cameras_have_sources_and_are_found_as_their_files_say(name: str) -> None:
     model = load_sensor(locate(name, "calibration", ".toml"))
     assert "http" in model.source
@@ -116,6 +116,16 @@ def test_of_a_curve_the_efficiency_is_found_at_the_light_s_wavelength() -> None:
     filters = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": {plane: curve for plane in "RGB"}}
     rows = characterise(sensor(**{**PLAIN, **filters}), small).rows
     assert rows == characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), small).rows
+
+
+def test_noise_that_rounding_hides_is_the_standard_s_limit_and_of_real_numbers_what_was_set() -> None:
+    """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself."""
+    quiet = {**PLAIN, "read_noise_e": 0.5, "dark_current_e_per_s": 0.0, "gain_dn_per_e": 0.2}
+    for bits, expected, limit in ((12, 0.39581 / 0.2, True), (None, 0.5, False)):
+        done = characterise(sensor(**{**quiet, "bits": bits}), SMALL)
+        (row,) = (row for row in done.rows if row.name == "dark_noise")
+        assert not done.warnings and row.set == 0.5 and (row.expected is not None) == limit
+        assert row.found == pytest.approx(expected, abs=5 * row.standard_error)
 
 
 def test_what_cannot_be_characterised_is_refused() -> None:
