@@ -9,7 +9,6 @@ from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy import special
 
 from mitsim.capture.request import Exposure
 from mitsim.core.arrays import FloatArray
@@ -25,14 +24,11 @@ from mitsim.sensor.chain import (
     dn_to_electrons,
     electrons_from_irradiance,
     expose,
-    most_gathered,
 )
-from mitsim.sensor.moments import mean_variance
+from mitsim.sensor.moments import mean_variance, saturated_pixels
 from mitsim.sensor.specimen import specimen
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
-_CAN_SATURATE = 1e-3
-"""Chance of saturation anywhere in a frame from which a reading at the full well counts as saturation."""
 FRAMES_AT_ONCE, _BYTES_AT_ONCE = 16, 2**27
 """Frames exposed at a time: enough work for eight processors; and their bytes, where fewer have as many: 4 frames of a
 sensor of 2048 pixels."""
@@ -83,19 +79,8 @@ class Exposer:
         return math.sqrt(variance) / self.rig.sensor.gain_dn_per_e
 
     def saturated(self, digital: Digital, electrons: FloatArray) -> bool:
-        """Whether any pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end.
-
-        A reading at the full well counts where the light can have filled it: with a chance of 1e-3 in the whole frame.
-        Elsewhere it is read noise.
-        """
-        sensor = self.rig.sensor
-        well, brightest = sensor.superpixel_full_well_e, float(digital.max())
-        if sensor.largest_dn is not None and brightest >= sensor.largest_dn:
-            return True
-        if np.isinf(well) or brightest < np.floor(sensor.full_well_dn):
-            return False
-        peak = most_gathered(electrons, self.exposure_s, sensor)
-        return bool(special.pdtrc(np.ceil(well) - 1, peak) * electrons.size >= _CAN_SATURATE)
+        """Whether a pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end."""
+        return saturated_pixels(digital, electrons, self.exposure_s, self.rig.sensor) > 0
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
         """Noisy measurement [electrons / s] of every pattern (i, j) of ``family``, from its ``expected`` frames.
@@ -171,6 +156,11 @@ def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str
         yield (
             f"defect pixels: {own.hot} are hot and {own.dead} dead, and frames have them as they are read; an image "
             "takes what they read for light; leave them out of the camera's file, or look at its misfit"
+        )
+    if sensor.prnu_pixel:
+        yield (
+            f"response nonuniformity: pixels differ by {sensor.response_parts[0]:.2%} of their light, which is no product of "
+            "a row's and a column's; factors hold none of it, and an image takes it for light"
         )
     if sensor.row_noise_e:
         yield (

@@ -23,7 +23,7 @@ from mitsim.core.plainfile import check_plain
 from mitsim.core.seeds import stream
 from mitsim.core.versions import versions
 from mitsim.rig.sensor import SensorModel
-from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak, most_gathered
+from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak
 
 ENDINGS = (".png", ".exr", ".npy")
 """Files that digital numbers are written to."""
@@ -61,12 +61,10 @@ class Sensed:
 
     @property
     def saturated(self) -> int:
-        """Pixels whose number is the ADC's largest, or that of a full well which their light can have filled."""
-        largest = math.inf if self.sensor.largest_dn is None else self.sensor.largest_dn
-        full = np.floor(min(self.sensor.full_well_dn, largest))
-        if most_gathered(self.electrons, self.exposure_s, self.sensor) < 0.5 * self.sensor.superpixel_full_well_e:
-            full = largest
-        return int(np.count_nonzero(self.digital >= full))
+        """Pixels that reached the full well or the ADC's end, as a capture counts them."""
+        from mitsim.sensor.moments import saturated_pixels
+
+        return saturated_pixels(self.digital, self.electrons, self.exposure_s, self.sensor)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -13,12 +13,14 @@ from scipy import special
 from mitsim.core.arrays import FloatArray
 from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.chain import (
+    Digital,
     add_dark_current,
     amplify,
     bend,
     checked_light,
     clip_at_full_well,
     gathered,
+    most_gathered,
     poisson_quantile,
     reading_offset,
 )
@@ -28,6 +30,8 @@ _FEW = 64.0
 _SOME = 1e4
 """Electrons below which they are summed over the counts that occur, on a grid of expected counts; chosen: above, 129
 counts stand for all to 1 % of the variance (tests/hard/test_hard_moments.py)."""
+_CAN_SATURATE = 1e-3
+"""Chance of saturation anywhere in a frame from which a reading at the full well counts as saturation."""
 _DITHERED = 0.8
 """Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
 _SMOOTH = 2.0
@@ -418,3 +422,25 @@ def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tupl
     still = deviation < 1e-9
     first[still], second[still] = 0, 0
     return nearest + first, np.maximum(second - first**2, 0.0)
+
+
+def saturated_pixels(digital: Digital, expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> int:
+    """Pixels of a frame that reached the full well or the ADC's end.
+
+    A reading at the full well counts where the light can have filled it: with a chance of 1e-3 in the whole frame.
+    Elsewhere it is read noise.
+
+    Parameters
+    ----------
+    digital
+        the frame's numbers.
+    expected_electrons, exposure_s, model
+        as :func:`mitsim.sensor.chain.expose` took them.
+    """
+    well, brightest = model.superpixel_full_well_e, float(digital.max())
+    ends = math.inf if model.largest_dn is None else float(model.largest_dn)
+    if np.isfinite(well) and brightest >= np.floor(model.full_well_dn):
+        peak = most_gathered(expected_electrons, exposure_s, model)
+        if special.pdtrc(np.ceil(well) - 1, peak) * digital.size >= _CAN_SATURATE:
+            ends = min(ends, float(np.floor(model.full_well_dn)))
+    return int(np.count_nonzero(digital >= ends)) if brightest >= ends else 0

@@ -144,11 +144,11 @@ def test_sensor_noise_is_shot_and_read_noise_in_electrons() -> None:
 
 
 def test_what_an_image_does_not_know_of_a_camera_is_said() -> None:
-    quiet = sensor(dsnu_pixel_e=2.0, prnu_pixel=0.01)
+    quiet = sensor(dsnu_pixel_e=2.0, prnu_row=0.01, prnu_column=0.01)
     assert not list(camera_warnings(quiet, (10, 10)))
-    loud = sensor(dead_pixels=0.03, row_noise_e=2.0, linearity=(-0.01,))
-    defects, rows, bent = camera_warnings(loud, (10, 10))
-    assert "0 are hot and 3 dead" in defects and "2 electrons" in rows and "-1.0%" in bent
+    loud = sensor(dead_pixels=0.03, row_noise_e=2.0, linearity=(-0.01,), prnu_pixel=0.01, binning=2)
+    defects, response, rows, bent = camera_warnings(loud, (10, 10))
+    assert " are hot and " in defects and "by 0.50% of" in response and "5.65685 electrons" in rows and "-1.0%" in bent
 
 
 def test_a_session_says_what_factors_do_not_know_of_a_camera() -> None:

@@ -44,6 +44,21 @@ def test_seconds_by_hand_and_saturation_are_as_a_capture_has_them() -> None:
     assert "saturation" in longer.warnings[0]
 
 
+def test_a_reading_at_the_well_that_light_cannot_have_filled_is_read_noise_as_in_a_capture() -> None:
+    """Light of 0.9 of the well, 9 deviations below it; of 4800 readings with 400 electrons of noise some lie above.
+
+    (Planted: the well in place of the chance that light fills it.) One pixel at twice the light is saturated, and then
+    all readings at the well count.
+    """
+    noisy = CAMERA.model_copy(update={"read_noise_e": 400.0, "bits": 14})
+    even = np.full((60, 80), 1e-6)
+    frame = sense(even, noisy, Exposure(fraction=0.9))
+    assert frame.digital.max() >= math.floor(noisy.full_well_dn) and frame.saturated == 0 and not frame.warnings
+    even[3, 4] = 2e-6
+    bright = sense(even, noisy, Exposure(frame.exposure_s))
+    assert bright.saturated == np.count_nonzero(bright.digital >= math.floor(noisy.full_well_dn)) > 10
+
+
 def test_a_lens_of_f_number_n_images_radiance_l_as_pi_l_over_4_n_squared() -> None:
     assert irradiance_behind_lens(np.array([[4.0]]), 2.0)[0, 0] == pytest.approx(math.pi / 4)
     with pytest.raises(MitsimError, match="f_number"):
