@@ -15,6 +15,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from mitsim.core.colours import ColourManifest, Line
+from mitsim.core.imagefile import Raw
 from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,
@@ -41,7 +42,7 @@ MODELS = (
     *(SensorModel, EfficiencyCurve),
     *(SessionRecipe, BoardShape),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
-    *(FrameList, StripeFile, DarkFile),
+    *(FrameList, StripeFile, DarkFile, Raw),
     *(ColourManifest, Line, ChartPlace),
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
@@ -76,7 +77,7 @@ def _allowed(rules: dict[str, Any]) -> str:
         return "object"
     if rules.get("type") == "array":
         if "prefixItems" in rules:
-            return f"{len(rules['prefixItems'])} of: {_allowed(rules['prefixItems'][0])}"
+            return f"list of {len(rules['prefixItems'])}: {_allowed(rules['prefixItems'][0])}"
         most = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
         return f"list: {_allowed(rules['items'])}{most}"
     if "pattern" in rules:

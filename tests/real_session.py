@@ -27,9 +27,11 @@ ROWS, COLUMNS, N = 24, 20, 4
 
 
 def write_image(path: Path, numbers: np.ndarray) -> None:
-    """``numbers`` as a PNG or TIFF of 16 bits, as NPY or OpenEXR."""
+    """``numbers`` as a PNG or TIFF of 16 bits, as NPY or OpenEXR, or bare, the large byte first."""
     if path.suffix == ".npy":
         np.save(path, numbers.astype(np.uint16))
+    elif path.suffix == ".raw":
+        numbers.astype(">u2").tofile(path)
     elif path.suffix == ".exr":
         write_frame(path, {"DN": numbers.astype(np.uint32)}, {})
     else:

@@ -94,7 +94,7 @@ def import_(
             raise MitsimError(f"{source}: says itself what its frames are; leave the options of frames out")
         payload = import_file(source, output, calibration_output, channel)
     else:
-        from mitsim.exchange.frames import Raw
+        from mitsim.core.imagefile import Raw
         from mitsim.exchange.real import RealCapture, import_frames
 
         if output is None or calibration_output is not None:

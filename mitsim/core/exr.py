@@ -16,6 +16,8 @@ from pathlib import Path
 
 import OpenEXR
 
+from mitsim.core.plainfile import MOST_SIDE
+
 MAGIC = b"\x76\x2f\x31\x01"
 """First bytes of every OpenEXR file."""
 _ATTRIBUTE = re.compile(rb"[^\0]{1,255}\0[^\0]{1,255}\0(.{4})", re.DOTALL)
@@ -26,8 +28,6 @@ _LARGEST_RATIO = 1100
 """Deflate cannot shrink more than 1032 times; a small file of any compression may claim ``_SMALL`` bytes."""
 _SMALL = 1 << 24
 """16 MiB, so that an even image of 2048 x 2048 pixels is read whatever compresses it."""
-_LARGEST_SIDE = 16384
-"""Pixels a side of the largest sensor and environment map that are simulated."""
 _MOST_BYTES = 4 << 30
 """Four float32 channels of the largest sensor."""
 _MOST_CHANNELS = 64
@@ -74,8 +74,8 @@ def read_header(path: Path) -> ExrHeader:
         raise ValueError("the image is tiled, deep or of several parts; save it as one part of scan lines")
     (left, top), (right, bottom) = ([int(edge) for edge in corner] for corner in header["dataWindow"])
     width, height, channels = right - left + 1, bottom - top + 1, header["channels"]
-    if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
-        raise ValueError(f"claims {width}x{height} pixels; 1 to {_LARGEST_SIDE} a side are allowed")
+    if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
+        raise ValueError(f"claims {width}x{height} pixels; 1 to {MOST_SIDE} a side are allowed")
     if not 0 < len(channels) <= _MOST_CHANNELS:
         raise ValueError(f"has {len(channels)} channels; 1 to {_MOST_CHANNELS} are allowed")
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels):

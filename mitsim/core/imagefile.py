@@ -1,126 +1,379 @@
-"""Frames of other programs, as PNG, TIFF, NPY or OpenEXR: a path in; size, or digital numbers as stored, out."""
+"""Pictures of other programs, as PNG, TIFF, NPY, OpenEXR or bare numbers: a path in; size, or numbers as stored, out.
+
+Nothing is scaled, inverted or made grey: a file whose numbers its reader would change is refused.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.errors import MitsimError
-from mitsim.core.exr import read_header
-from mitsim.core.framefile import read_frame
-from mitsim.core.plainfile import check_plain
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.plainfile import MOST_SIDE, check_plain
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
-"""Endings of files that are read, in small or capital letters."""
-_GREY = ("L", "I;16", "I;16L", "I;16B", "I", "F")
-"""Pillow's names of one channel of 8, 16 or 32 bits; it has none for one of 12, which it reads as 16."""
-_LARGEST_SIDE = 16384
-"""Pixels a side of the largest sensor."""
-_WHITE_IS_ZERO, _PHOTOMETRIC = 0, 262
-"""TIFF 6.0, section 3: such files store black as their largest number, and not all programs turn them round."""
+Numbers = npt.NDArray[Any]
+"""(rows, columns) numbers of a picture: whole, or real; where colours are wanted, (rows, columns, 3 or 4)."""
+_BARE = (".raw", ".bin", ".dat")
+"""Endings of files without a header."""
+_SIGNATURE, _HEAD = b"\x89PNG\r\n\x1a\n", 26
+"""First bytes of a PNG, and bytes up to its colour type (ISO/IEC 15948, 5.2 and 11.2.2)."""
+_PNG_BITS = (1, 2, 4, 8, 16)
+"""Of a grey number in a PNG."""
+_GREY, _COLOURS = 0, (2, 6)
+"""Colour types of a PNG: one number a pixel; red, green, blue, without and with alpha."""
+_BITS, _PHOTOMETRIC, _SAMPLES = 258, 262, 339
+"""Tags of TIFF 6.0: BitsPerSample, PhotometricInterpretation, SampleFormat."""
+_BLACK_IS_ZERO, _RGB = 1, 2
+"""PhotometricInterpretation of files that are read; 0 stores black as the largest number."""
+_UNSIGNED = 1
+"""SampleFormat of whole numbers from 0, which is also meant where the tag is missing."""
+_Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
 _CHANNEL = "DN"
+"""Channel of an OpenEXR file of several that is read."""
 
 
-def image_size(path: Path | str) -> tuple[int, int]:
-    """Rows and columns of the frame ``path``, from its header; MitsimError as :func:`read_image`."""
-    path = Path(path)
-    check_plain(path, "frame")
-    with _told(path):
-        if _suffix(path) == ".npy":
-            size = _array(path).shape
-        elif _suffix(path) == ".exr":
-            header = read_header(path)
-            size = header.height, header.width
-        else:
-            with _picture(path) as picture:
-                size = picture.height, picture.width
-    if max(size) > _LARGEST_SIDE or min(size) < 1:
-        raise MitsimError(f"frame {path}: {size[0]} x {size[1]} pixels; 1 to {_LARGEST_SIDE} a side are allowed")
-    return size[0], size[1]
+class Raw(BaseModel):
+    """How files without a header (`.raw`, `.bin`, `.dat`) are read."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    shape: tuple[_Side, _Side] = Field(strict=False, description="rows and columns")
+    bits: int = Field(ge=1, le=32, description="of a number; up to 8 take a byte, up to 16 two, up to 32 four")
+    byte_order: Literal["little", "big"] = Field("little", description="which byte of a number comes first")
+
+    @classmethod
+    def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:
+        """From what the command line says.
+
+        Parameters
+        ----------
+        shape
+            ROWSxCOLUMNS.
+        bits, byte_order
+            as the class has them.
+
+        Raises
+        ------
+        MitsimError
+            for what is none.
+        """
+        sides = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", shape)
+        if not sides or not all(0 < int(side) <= MOST_SIDE for side in sides.groups()):
+            raise ArgumentError("shape", f"{shape!r}: give ROWSxCOLUMNS, 1 to {MOST_SIDE} each")
+        if bits is None or not 1 <= bits <= 32:
+            raise ArgumentError("bits", f"{bits}: give the bits of a number in such a file, 1 to 32")
+        if byte_order not in ("little", "big"):
+            raise ArgumentError("byte_order", f"{byte_order!r}: use little or big")
+        return cls(
+            shape=(int(sides[1]), int(sides[2])), bits=bits, byte_order="big" if byte_order == "big" else "little"
+        )
+
+    @property
+    def kind(self) -> np.dtype[Any]:
+        """The type of a number."""
+        width = 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
+        return np.dtype(f"{'<' if self.byte_order == 'little' else '>'}u{width}")
 
 
-def read_image(path: Path | str) -> npt.NDArray[Any]:
-    """(rows, columns) numbers of the frame ``path`` as they are stored: one channel, no gamma, no scale.
+@dataclass(frozen=True)
+class Wanted:
+    """What pictures are of, and which of them are read.
 
-    PNG and TIFF of 8 or 16 bits, TIFF of 32, NPY of whole or real numbers, OpenEXR with a channel `DN` or one channel.
+    Attributes
+    ----------
+    what
+        that they are of, for messages.
+    most
+        pixels a side.
+    bits
+        of a number in PNG and TIFF files. Frames have none of 2 and 4, which Pillow spreads over 0 to 255.
+    colour
+        whether red, green and blue of 8 bits are read too.
+    raw
+        how files without a header are read; None: such files are refused.
+    """
+
+    what: str = "frame"
+    most: int = MOST_SIDE
+    bits: Sequence[int] = (8, 12, 16, 32)
+    colour: bool = False
+    raw: Raw | None = None
+
+    def refusal(self, path: Path, reason: str) -> MitsimError:
+        """A line that says for what ``reason`` the file ``path`` is not read."""
+        return MitsimError(f"{self.what} {path}: {reason}")
+
+
+FRAME = Wanted()
+"""Frames of a camera, in files with a header."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a file's header says: pages, size of the first, and what reads the numbers of each page."""
+
+    pages: int
+    size: tuple[int, int]
+    read: Callable[[], Iterator[Numbers]]
+
+
+def image_files(source: Path, wanted: Wanted = FRAME) -> tuple[Path, ...]:
+    """Pictures in a folder, in the order of the numbers in their names: shot 10 comes after shot 9.
+
+    Parameters
+    ----------
+    source
+        the folder; or a file, which is then all.
+    wanted
+        files without a header count where they can be read.
 
     Raises
     ------
     MitsimError
-        for a file that is missing, damaged, of another kind, in colour, of several pages, too large, or with values
-        that are not finite.
+        where there is none.
+    """
+    if not source.is_dir():
+        check_plain(source, wanted.what)
+        return (source,)
+    endings = tuple(ending for ending in _READERS if wanted.raw or ending not in _BARE)
+    files = [path for path in source.iterdir() if path.suffix.lower() in endings and not path.name.startswith(".")]
+    if not files:
+        bare = "" if wanted.raw else f"; {', '.join(_BARE)} count where shape and bits are stated"
+        raise MitsimError(f"{source}: holds no file that ends in {', '.join(endings)}{bare}")
+    return tuple(sorted(files, key=_natural))
+
+
+def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
+    """Rows and columns of a picture, from its header; of several pages, of the first.
+
+    Parameters
+    ----------
+    path, wanted
+        as for :func:`read_images`, whose errors it raises.
     """
     path = Path(path)
-    image_size(path)
-    with _told(path):
-        if _suffix(path) == ".npy":
-            values: npt.NDArray[Any] = np.array(_array(path))
-        elif _suffix(path) == ".exr":
-            channels = read_frame(path)[0]
-            name = _CHANNEL if _CHANNEL in channels or len(channels) > 1 else next(iter(channels))
-            if name not in channels:
-                raise ValueError(f"its channels are {', '.join(channels)}; {_CHANNEL}, or a single one, is needed")
-            values = channels[name]
-        else:
-            with _picture(path) as picture:
-                values = np.asarray(picture)
-                # Some versions of Pillow give 16 bits of a PNG as 32.
-                values = values.astype(np.uint16) if picture.format == "PNG" and picture.mode == "I" else values
-        bad = np.count_nonzero(~np.isfinite(values))
-        if bad:
-            raise ValueError(f"{bad} values are not finite")
-    return values
+    with _told(path, wanted):
+        return _look(path, wanted).size
 
 
-def own_end(values: npt.NDArray[Any]) -> float | None:
+def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
+    """Numbers of a picture of one page.
+
+    Parameters
+    ----------
+    path, wanted
+        as for :func:`read_images`.
+
+    Raises
+    ------
+    MitsimError
+        as there, and for several pages.
+    """
+    path = Path(path)
+    with _told(path, wanted):
+        pages = _look(path, wanted).pages
+    if pages != 1:
+        raise wanted.refusal(path, f"has {pages} pages; give each {wanted.what} a file of its own")
+    return next(read_images(path, wanted))
+
+
+def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
+    """Numbers of every page of a picture as they are stored: no gamma, no scale.
+
+    PNG, TIFF (of one page or more), NPY of whole or real numbers (rows x columns, or pages before them), OpenEXR with a
+    channel `DN` or one channel, and bare numbers.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    wanted
+        what is read.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is missing, damaged, of another kind or size, in colours that are not wanted, with numbers that
+        its reader would change, or that are not finite.
+    """
+    path = Path(path)
+    with _told(path, wanted):
+        for values in _look(path, wanted).read():
+            _check_size(path, wanted, values.shape[0], values.shape[1])
+            bad = np.count_nonzero(~np.isfinite(values))
+            if bad:
+                raise wanted.refusal(path, f"{bad} values are not finite; write it again")
+            yield values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+def own_end(values: Numbers) -> float | None:
     """Largest number that a file of such ``values`` can hold: 255 or 65535; None where cameras seldom reach it."""
     return float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" and values.dtype.itemsize < 4 else None
 
 
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"ends in {suffix or 'nothing'}; read are {', '.join(SUFFIXES)}")
-    return suffix
+def _look(path: Path, wanted: Wanted) -> _Found:
+    """What the header of a file says, before pixels are read: what it claims is allocated."""
+    check_plain(path, wanted.what)
+    ending = path.suffix.lower()
+    if ending not in _READERS:
+        raise wanted.refusal(path, f"ends in {ending or 'nothing'}; read are {', '.join(_READERS)}")
+    found = _READERS[ending](path, wanted)
+    _check_size(path, wanted, *found.size)
+    return found
 
 
-def _array(path: Path) -> npt.NDArray[Any]:
-    """The array in an NPY file, its numbers left on disk."""
+def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
+    if not (0 < rows <= wanted.most and 0 < columns <= wanted.most):
+        raise wanted.refusal(path, f"{rows} x {columns} pixels; 1 to {wanted.most} a side are allowed")
+
+
+def _png(path: Path, wanted: Wanted) -> _Found:
+    with open(path, "rb") as file:
+        head = file.read(_HEAD)
+    if len(head) < _HEAD or not head.startswith(_SIGNATURE):
+        raise ValueError("it does not begin as a PNG")
+    columns, rows = (int.from_bytes(head[place : place + 4], "big") for place in (16, 20))
+    bits, colour = head[24], head[25]
+    if not (colour == _GREY and bits in wanted.bits) and not (wanted.colour and colour in _COLOURS and bits == 8):
+        raise wanted.refusal(
+            path, f"is no {_allowed('PNG', (bits for bits in wanted.bits if bits in _PNG_BITS), wanted)}"
+        )
+
+    def read() -> Iterator[Numbers]:
+        """Its one page."""
+        with _opened(path, "PNG") as picture:
+            if "transparency" in picture.info:
+                raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
+            # Some versions of Pillow give 16 bits of a PNG as 32.
+            yield np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
+
+    return _Found(1, (rows, columns), read)
+
+
+def _tiff(path: Path, wanted: Wanted) -> _Found:
+    def read() -> Iterator[Numbers]:
+        """Its pages."""
+        from PIL import ImageSequence
+
+        with _opened(path, "TIFF") as file:
+            for picture in ImageSequence.Iterator(file):
+                unsigned = _check_tags(path, picture, wanted)
+                _check_size(path, wanted, picture.height, picture.width)
+                values = np.array(picture)
+                # Pillow holds 32 bits as if they had a sign.
+                yield values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
+
+    with _opened(path, "TIFF") as picture:
+        _check_tags(path, picture, wanted)
+        return _Found(getattr(picture, "n_frames", 1), (picture.height, picture.width), read)
+
+
+def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
+    """Whether numbers of a page of a TIFF ``picture`` have no sign; MitsimError for a page that is not ``wanted``."""
+    tags: Any = picture.tag_v2  # type: ignore[attr-defined]
+    bits, photometric, samples = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC), tags.get(_SAMPLES, (_UNSIGNED,))
+    grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
+    if not grey and not (wanted.colour and photometric == _RGB and set(bits) == {8}):
+        raise wanted.refusal(path, f"is no {_allowed('TIFF', wanted.bits, wanted)}")
+    return bool(samples[0] == _UNSIGNED)
+
+
+def _npy(path: Path, wanted: Wanted) -> _Found:
     array = np.load(path, mmap_mode="r", allow_pickle=False)
-    if array.ndim != 2 or array.dtype.kind not in "uif":
-        raise ValueError(f"holds {array.dtype} of shape {array.shape}; rows x columns of numbers are needed")
-    return np.asarray(array)
+    kinds = "buif" if 1 in wanted.bits else "uif"
+    if not isinstance(array, np.ndarray) or array.ndim not in (2, 3) or array.dtype.kind not in kinds:
+        told = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else "several arrays"
+        raise wanted.refusal(path, f"holds {told}; rows x columns of numbers are needed, or pages of them")
+    pages = array if array.ndim == 3 else array[None]
+    return _Found(len(pages), (pages.shape[1], pages.shape[2]), lambda: (np.array(page) for page in pages))
+
+
+def _exr(path: Path, wanted: Wanted) -> _Found:
+    from mitsim.core.exr import read_header  # most work reads no picture of this kind
+    from mitsim.core.framefile import read_frame
+
+    header = read_header(path)
+
+    def read() -> Iterator[Numbers]:
+        """Its one page."""
+        channels = read_frame(path)[0]
+        name = _CHANNEL if _CHANNEL in channels or len(channels) > 1 else next(iter(channels))
+        if name not in channels:
+            names = ", ".join(channels)
+            raise wanted.refusal(path, f"its channels are {names}; {_CHANNEL}, or a single one, is needed")
+        yield channels[name]
+
+    return _Found(1, (header.height, header.width), read)
+
+
+def _bare(path: Path, wanted: Wanted) -> _Found:
+    raw = wanted.raw
+    if raw is None:
+        raise wanted.refusal(path, "has no header; say how it is read by shape and bits")
+    needed, size = math.prod(raw.shape) * raw.kind.itemsize, path.stat().st_size
+    if size != needed:
+        raise wanted.refusal(
+            path,
+            f"has {size} bytes, but {raw.shape[0]}x{raw.shape[1]} numbers of {raw.bits} bits take {needed}; "
+            "correct shape or bits",
+        )
+
+    def read() -> Iterator[Numbers]:
+        """Its one page."""
+        values = np.fromfile(path, raw.kind).reshape(raw.shape)
+        if values.max() >= 2**raw.bits:
+            most = values.max()
+            raise wanted.refusal(path, f"has the number {most}, beyond {raw.bits} bits; correct bits or byte_order")
+        yield values
+
+    return _Found(1, raw.shape, read)
+
+
+_READERS: dict[str, Callable[[Path, Wanted], _Found]] = {
+    ".png": _png,
+    ".tif": _tiff,
+    ".tiff": _tiff,
+    ".npy": _npy,
+    ".exr": _exr,
+    **dict.fromkeys(_BARE, _bare),
+}
+"""What looks into a file, by the end of its name in small letters."""
+
+
+def _allowed(kind: str, bits: Any, wanted: Wanted) -> str:
+    numbers = [str(count) for count in bits]
+    colours = ", nor of red, green and blue of 8 bits" if wanted.colour else ""
+    zero = " whose zero is black" if kind == "TIFF" else ""
+    return f"grey {kind} of {', '.join(numbers[:-1])} or {numbers[-1]} bits{zero}{colours}; save one number a pixel"
 
 
 @contextmanager
-def _picture(path: Path) -> Iterator[Image]:
-    """A PNG or TIFF file, its pixels not yet read."""
+def _opened(path: Path, kind: str) -> Iterator[Image]:
+    """A picture file of that ``kind``, its pixels not yet read."""
     from PIL import Image  # most work reads no picture
 
     with warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
-        picture = Image.open(path, formats=("PNG", "TIFF"))
+        picture = Image.open(path, formats=(kind,))
     with picture:
-        if picture.mode not in _GREY:
-            raise ValueError(f"is of Pillow's mode {picture.mode}; one grey channel of 8, 16 or 32 bits is needed")
-        if getattr(picture, "n_frames", 1) != 1:
-            raise ValueError(f"has {getattr(picture, 'n_frames', 1)} pages; give each frame a file of its own")
-        if getattr(picture, "tag_v2", {}).get(_PHOTOMETRIC) == _WHITE_IS_ZERO:
-            raise ValueError("stores black as its largest number (TIFF's WhiteIsZero); save it with black as 0")
         yield picture
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _told(path: Path, wanted: Wanted) -> Iterator[None]:
     """Whatever readers raise, as one line that names the file."""
     try:
         yield
@@ -129,4 +382,12 @@ def _told(path: Path) -> Iterator[None]:
     # Readers of damaged files raise whatever they stumble over.
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise MitsimError(f"frame {path}: cannot be read ({reason}); write or copy it again") from error
+        raise wanted.refusal(
+            path, f"cannot be read: damaged, or of another kind than its name says ({reason}); write or copy it again"
+        ) from error
+
+
+def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """A key by which shot 10 comes after shot 9."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts], path.name

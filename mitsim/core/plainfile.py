@@ -8,6 +8,9 @@ from pathlib import Path
 
 from mitsim.core.errors import MitsimError
 
+MOST_SIDE = 16384
+"""Pixels a side of the largest picture that is read: of the largest sensor and environment map that are simulated."""
+
 
 def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
     """The status of the plain file ``path``, called ``what`` in errors. MitsimError when it cannot be looked at, or is

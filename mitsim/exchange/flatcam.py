@@ -128,7 +128,6 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
     manifest = CalibrationManifest(camera={"name": path.stem, "channel": channel}, centre=True, warnings=warnings)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         return {"factor": sides[name]}, {}
 
     return Packed(manifest, "", FACTORS, read, path)

@@ -20,12 +20,11 @@ from mitsim.core.framefile import Channels, Metadata, Value
 from mitsim.core.jsonfile import parse_json
 from mitsim.core.manifests import CalibrationManifest, RunManifest
 from mitsim.core.output import whole_file
-from mitsim.core.plainfile import check_plain
+from mitsim.core.plainfile import MOST_SIDE, check_plain
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture
 from mitsim.exchange.packed import (
     FACTORS,
-    MOST_SIDE,
     Packed,
     checked_channel,
     manifest_text,
@@ -209,7 +208,6 @@ def _run(file: h5py.File, path: Path) -> Packed[RunManifest]:
     others = ({ambient.file: "ambient"} if ambient else {}) | ({TRUTH: "truth"} if "truth" in group else {})
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         with _told(path):
             if name in others:
                 return _frame(_group(group, others[name], path), path)
@@ -227,7 +225,6 @@ def _calibration(file: h5py.File, path: Path) -> Packed[CalibrationManifest]:
     text = _manifest(group, path)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         with _told(path):
             return _frame(_group(group, Path(name).stem, path), path)
 

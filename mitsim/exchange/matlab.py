@@ -259,7 +259,6 @@ def calibration_in(variables: Variables, digital: Digital, path: Path) -> Packed
         metadata = {**metadata, "reflectance": manifest.board_reflectance}
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         variable = f"phi_{Path(name).stem}"
         factor = matrix_in(variables, variable, path) / math.sqrt(dn_per_rate(digital))
         # Rounding in double precision is far below half of the last digit in single: the number is the first one.
@@ -345,7 +344,6 @@ def run_in(variables: Variables, manifest: RunManifest, frame: Any, path: Path) 
         return checked_channel(matrix_in(variables, variable, path).astype(np.float32), variable, path)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         if name in shots:
             shot = shots[name]
             return {"DN": _digital(frame(shot), kind, name, path)}, {

@@ -23,7 +23,7 @@ from mitsim.core.manifests import (
     write_manifest,
 )
 from mitsim.core.output import LOCK, whole_folder
-from mitsim.core.plainfile import read_text
+from mitsim.core.plainfile import MOST_SIDE, read_text
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import load_run
 
@@ -34,8 +34,6 @@ FACTORS = tuple(f"{name}.exr" for name in SIDES)
 """Names of a CAL folder's files: the left factor's and the right one's."""
 _OWN = frozenset((".", "..", MANIFEST, LOCK, TRUTH))
 """Names that no frame may have."""
-MOST_SIDE = 16384
-"""Pixels a side of the largest frame that is read, as of OpenEXR files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,6 @@ def packed_calibration(folder: Path) -> Packed[CalibrationManifest]:
     manifest = read_manifest(folder, CalibrationManifest)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         verify(folder, name, manifest.checksums, "calibrate again")
         return read_frame(folder / name)
 

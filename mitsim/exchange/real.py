@@ -15,12 +15,12 @@ import numpy.typing as npt
 from mitsim.core.configuration import locate, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import Channel, Channels, Metadata, checksum
+from mitsim.core.imagefile import Numbers, Raw, Wanted, image_files, read_images
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest
 from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.core.versions import versions
 from mitsim.exchange.flatcam import PLANES
-from mitsim.exchange.frames import Numbers, Raw, frame_files, frames_in
 from mitsim.exchange.packed import FACTORS, Packed, packed_calibration
 from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import PatternFamily, parse_patterns
@@ -72,6 +72,11 @@ class RealCapture:
     channel: str | None = None
     seed: int = 0
 
+    @property
+    def wanted(self) -> Wanted:
+        """How its files are read."""
+        return Wanted(raw=self.raw)
+
     def check(self) -> None:
         """MitsimError for values that cannot be, before any file is read."""
         least, most = EXPOSURE_S
@@ -117,7 +122,7 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
         stated = {**digital.model_dump(), "black_level_dn": known.black_level_dn}
         digital = validated(Digital, stated, "black_level")
     patterns = _patterns(known, fit.scene)
-    files = frame_files(source)
+    files = image_files(source, known.wanted)
     shots = _Shots(files, known, sensor, fit)
     count = len(patterns.captures)
     if len(shots.places) != count:
@@ -142,7 +147,6 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
     index = {shot.file: number for number, shot in enumerate(patterns.captures)}
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         if name not in index and ambient is not None:
             return {"DN": ambient[0]}, {"shots": ambient[1], "exposure_s": known.exposure_s}
         shot, (path, _) = patterns.captures[index[name]], shots.places[index[name]]
@@ -200,7 +204,7 @@ class _Shots:
         self.places: list[tuple[Path, int]] = []
         self.shape: tuple[int, int] = (0, 0)
         for path in files:
-            for number, frame in enumerate(frames_in(path, known.raw)):
+            for number, frame in enumerate(read_images(path, known.wanted)):
                 digital = self._digital(path, frame)
                 self.shape = digital.shape if not self.places else self.shape
                 if digital.shape != self.shape:
@@ -213,7 +217,7 @@ class _Shots:
     def read(self, index: int) -> Channel:
         """The frame number ``index``, (rows, columns) digital numbers."""
         path, wanted = self.places[index]
-        frame = next(frame for number, frame in enumerate(frames_in(path, self._known.raw)) if number == wanted)
+        frame = next(frame for number, frame in enumerate(read_images(path, self._known.wanted)) if number == wanted)
         return self._digital(path, frame)
 
     def _digital(self, path: Path, frame: Numbers) -> Channel:
@@ -272,8 +276,6 @@ def digital_numbers(path: Path, frame: Numbers, sensor: SensorModel, mean: bool 
         for numbers that this camera does not give.
     """
     largest = sensor.largest_dn
-    if frame.dtype.kind not in "uif" or not np.isfinite(frame).all():
-        raise MitsimError(f"{path}: holds {frame.dtype}, or numbers that are not finite; digital numbers are needed")
     if largest is None or mean:
         top = float(frame.max())
         if largest is not None and top > largest:
@@ -303,8 +305,8 @@ def _ambient(known: RealCapture, sensor: SensorModel, fit: _Fit) -> tuple[npt.ND
     if known.ambient is None:
         raise ArgumentError("ambient", "is not given")
     total, count = np.zeros(()), 0
-    for path in frame_files(known.ambient):
-        for frame in frames_in(path, known.raw):
+    for path in image_files(known.ambient, known.wanted):
+        for frame in read_images(path, known.wanted):
             part = part_of(path, digital_numbers(path, frame, sensor, mean=True), known.channel, fit.shape)
             if count and part.shape != total.shape:
                 raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(total.shape)}")
@@ -344,7 +346,7 @@ def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
 
 def _configuration(known: RealCapture, sensor: SensorModel, files: tuple[Path, ...]) -> dict[str, Any]:
     """All that decides the frames: whose files, and as what they are read."""
-    more = () if known.ambient is None else frame_files(known.ambient)
+    more = () if known.ambient is None else image_files(known.ambient, known.wanted)
     return {
         "imported": {path.name: checksum(path) for path in files},
         "ambient": {path.name: checksum(path) for path in more},

@@ -131,11 +131,11 @@ def _not_known(session: SessionFrames) -> Iterator[str]:
 def _check_sizes(session: SessionFrames) -> None:
     """MitsimError for a frame that cannot be read, or is of another size than the first."""
     first, *others = session.files
-    size = image_size(session.folder / first)
+    size = image_size(session.folder / first, session.wanted)
     for name in session.files:
         verify(session.folder, name, {}, "")  # no link out of it
     for name in others:
-        own = image_size(session.folder / name)
+        own = image_size(session.folder / name, session.wanted)
         if own != size:
             raise MitsimError(
                 f"frames {session.folder}: {name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}; "
@@ -209,7 +209,7 @@ class _Readings:
         digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
         total: FloatArray | None = None
         for frame in frames:
-            values = read_image(self.session.folder / frame.file)
+            values = read_image(self.session.folder / frame.file, self.session.wanted)
             end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
             if end is not None and (values >= end).any():
                 self.saturated.add(frame.file)

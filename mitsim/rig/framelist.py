@@ -6,7 +6,6 @@ their names.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field
 
 from mitsim.core.configuration import Positive, read_toml, validated
 from mitsim.core.errors import MitsimError
-from mitsim.core.imagefile import SUFFIXES
+from mitsim.core.imagefile import Raw, Wanted, image_files
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
 from mitsim.rig.patterns import SIDES, Side, stripe_count
@@ -76,6 +75,7 @@ class FrameList(_Part):
     parallax: Parallax | None = Field(
         default=None, description="how the factors move with depth; none: not known, and no `--focus`"
     )
+    raw: Raw | None = Field(default=None, description="how frames without a header are read; none: there are none")
     frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field(
         default=(), strict=False, max_length=MOST_SHOTS, description="every frame; none: by the order of their names"
     )
@@ -104,6 +104,11 @@ class SessionFrames:
     listed: FrameList
     shots: dict[Key, StripeFile]
     dark: tuple[DarkFile, ...]
+
+    @property
+    def wanted(self) -> Wanted:
+        """How its frames are read."""
+        return Wanted(raw=self.listed.raw)
 
     @property
     def pairs(self) -> bool:
@@ -149,7 +154,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
     if listed.frames:
         frames, dark = listed.frames, listed.dark
     else:
-        names = _names(folder)
+        names = [path.name for path in image_files(folder, Wanted(raw=listed.raw))]
         dark = listed.dark or tuple(DarkFile(file=name) for name in names if name.startswith(DARK))
         names = [name for name in names if name not in {frame.file for frame in dark}]
         if len(names) != len(wanted):
@@ -181,16 +186,6 @@ def _wanted(listed: FrameList) -> Iterator[Key]:
 
 def _times(listed: FrameList) -> str:
     return f", repeats {listed.repeats}" if listed.repeats > 1 else ""
-
-
-def _names(folder: Path) -> list[str]:
-    """Names of the images in a ``folder``, numbers in them by their value."""
-
-    def order(name: str) -> tuple[list[tuple[int, str]], str]:
-        parts = re.split(r"(\d+)", name)
-        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
-
-    return sorted((path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=order)
 
 
 def _each_once(folder: Path, frames: Sequence[StripeFile], wanted: Sequence[Key]) -> dict[Key, StripeFile]:

@@ -40,7 +40,7 @@ class MaskProfile(BaseModel):
     features: int | None = Field(None, ge=1, le=LARGEST, description="mura (an odd prime), random: features a side")
     open_part: float = Field(0.5, gt=0, le=1, description="random: probability that a feature is open")
     seed: int = Field(0, ge=0, le=2**63 - 1, description="random: which of all such masks")
-    file: str | None = Field(None, min_length=1, max_length=4096, description="drawing: PNG, TIFF or NPY file")
+    file: str | None = Field(None, min_length=1, max_length=4096, description="drawing: PNG, TIFF, NPY or OpenEXR file")
 
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> MaskProfile:

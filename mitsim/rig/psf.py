@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
-from mitsim.core.plainfile import check_plain
+from mitsim.core.imagefile import Wanted, image_size, read_image
 
+_PICTURE = Wanted("point spread function", colour=True)
 _MOST_PIXELS = 2**26
 """Of a picture: four times what cameras for such measurements have; it is held as 8 bytes each."""
 _BORDER = 16
@@ -22,7 +22,7 @@ is centred does not reach."""
 
 
 def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
-    """The point spread function in a picture (PNG, TIFF).
+    """The point spread function in a picture (PNG, TIFF, NPY, OpenEXR).
 
     Colours are averaged, the median of a frame along the edges is taken off as background, ``reduce`` x ``reduce``
     pixels are averaged, what is left below zero (noise around the background) is zero, and the sum is made 1.
@@ -30,21 +30,24 @@ def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
     Parameters
     ----------
     path
-        of the picture; rows first, any depth.
+        of the picture; rows first, any depth of grey, or colours of 8 bits.
     reduce
         pixels a side that become one; rows and columns that remain at the far edges are left out.
 
     Raises
     ------
     MitsimError
-        for a file that is no picture or too large, a ``reduce`` that does not fit, no light above the background.
+        for a file that is no picture, has a palette or is too large, a ``reduce`` that does not fit, no light above the
+        background.
     """
+    path = Path(path)
     values = _grey(path)
     rows, columns = (size // reduce for size in values.shape) if reduce >= 1 else (0, 0)
     if min(rows, columns) < 1 or min(values.shape) <= 2 * _BORDER:
-        raise MitsimError(
-            f"point spread function {path}: {values.shape[0]} x {values.shape[1]} pixels, reduce {reduce}; it needs "
-            f"more than {2 * _BORDER} pixels a side, and reduce from 1 to its shorter side"
+        raise _PICTURE.refusal(
+            path,
+            f"{values.shape[0]} x {values.shape[1]} pixels, reduce {reduce}; it needs "
+            f"more than {2 * _BORDER} pixels a side, and reduce from 1 to its shorter side",
         )
     inside = np.zeros(values.shape, dtype=bool)
     inside[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
@@ -53,23 +56,13 @@ def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
     light = np.maximum(means, 0)
     total = float(light.sum())
     if total <= 0:
-        raise MitsimError(f"point spread function {path}: nothing is brighter than its edges; give another picture")
+        raise _PICTURE.refusal(path, "nothing is brighter than its edges; give another picture")
     return np.asarray(light / total)
 
 
-def _grey(path: Path | str) -> FloatArray:
-    # Imported here: most work reads no picture of this kind.
-    from PIL import Image
-
-    check_plain(path, "point spread function")
-    try:
-        with Image.open(path) as picture:
-            if picture.width * picture.height > _MOST_PIXELS:
-                raise MitsimError(
-                    f"point spread function {path}: {picture.height} x {picture.width} pixels; "
-                    f"at most {_MOST_PIXELS} in all are read"
-                )
-            values = np.asarray(picture, dtype=np.float64)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise MitsimError(f"point spread function {path}: cannot be read as a picture ({error})") from error
+def _grey(path: Path) -> FloatArray:
+    rows, columns = image_size(path, _PICTURE)
+    if rows * columns > _MOST_PIXELS:
+        raise _PICTURE.refusal(path, f"{rows} x {columns} pixels; at most {_MOST_PIXELS} in all are read")
+    values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
     return values if values.ndim == 2 else np.asarray(values[..., :3].mean(axis=2))

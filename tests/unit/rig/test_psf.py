@@ -52,7 +52,7 @@ def test_what_shows_no_light_is_refused(tmp_path: Path) -> None:
     for name, words in (
         ("flat.png", "nothing is brighter"),
         ("small.png", "more than 32 pixels"),
-        ("text.png", "cannot be read as a picture"),
+        ("text.png", "does not begin as a PNG"),
         ("none.png", "cannot be read"),
     ):
         with pytest.raises(MitsimError, match=words):
