@@ -94,8 +94,15 @@ def read_colours(folder: Path | str, kind: str) -> ColourManifest:
 
 
 def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:
-    """Write colour.json to a ``folder``, all or nothing: its ``colours``, and ``more`` entries.
+    """Write colour.json, all or nothing. MitsimError when it cannot be written.
 
-    MitsimError when it cannot be written.
+    Parameters
+    ----------
+    folder
+        that it is of.
+    colours
+        the folder's kind and lines.
+    **more
+        entries beside these.
     """
     write_json(folder / COLOUR, {**colours.model_dump(), **more})

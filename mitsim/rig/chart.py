@@ -16,7 +16,7 @@ from mitsim.core.jsonfile import read_json
 PATCHES = 24
 """Of a ColorChecker."""
 Edge = Annotated[int, Field(ge=0, le=1 << 14)]
-Box = Annotated[tuple[Edge, Edge, Edge, Edge], Field(strict=False)]
+Box = Annotated[tuple[Edge, ...], Field(strict=False, min_length=4, max_length=4)]
 """First row, row after the last, first column, column after the last [projector pixels]."""
 
 
