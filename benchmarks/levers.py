@@ -87,9 +87,9 @@ def repeats_of(simulation: Simulation, samples: int) -> tuple[int, ...]:
 
 def traced(stage: Stage, labels: np.ndarray, seed: int, samples: int, device: bool) -> FiledLight:
     """Light of one group, per sample."""
-    ledger = stage.ledger(labels) if device else None
-    light = stage.file(stage.trace(seed, 0, samples, ledger), labels, samples)
-    if ledger and stage.file_ledger:
+    ledgers = stage.ledgers(labels, 1) if device else ()
+    light = stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
+    for ledger in ledgers if stage.file_ledger else ():
         light = light + stage.file_ledger(ledger, ledger.fetched()) / samples
     dr.sync_thread()
     return light

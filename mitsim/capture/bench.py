@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mitsim.rig.board import BoardShape
     from mitsim.rig.camera import CameraGeometry
     from mitsim.rig.patterns import PatternFamily
-    from mitsim.rig.projector import ProjectorModel, Spectrum
+    from mitsim.rig.projector import Lines, ProjectorModel, Spectrum
     from mitsim.rig.recipe import SessionRecipe
     from mitsim.rig.rig import Rig
     from mitsim.rig.sensor import SensorModel
@@ -52,12 +52,15 @@ class Bench:
         of Mitsuba.
     defines
         parameters that the scene was loaded with.
+    lines
+        lines of the projector's light that spectral variants trace; None: wavelengths drawn from all.
     """
 
     loaded: LoadedScene
     rig: Rig
     variant: str
     defines: dict[str, str]
+    lines: Lines | None = None
 
     def __repr__(self) -> str:
         path, pixels = self.loaded.path, self.geometry.pixels
@@ -250,6 +253,7 @@ class Bench:
             model.aperture_radius_mm,
             model.focus_mm or self.geometry.scene_distance,
             model.blur_pixels,
+            self.lines,
         )
 
     @property

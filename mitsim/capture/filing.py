@@ -293,12 +293,12 @@ class Trays:
         return self._light(deposits, samples, fine=fine, smooth=smooth)
 
     def file_smooth(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
-        """Light in a ``ledger`` of :meth:`smooth_ledger`, from what it ``counted``."""
+        """Light in a ``ledger`` of :meth:`smooth_ledgers`, from what it ``counted``."""
         smooth, received, outside = ledger.filed(counted)
         return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
 
     def file_anchors(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
-        """Light in a ``ledger`` of :meth:`anchors_ledger` beyond its mean, from what it ``counted``."""
+        """Light in a ``ledger`` of :meth:`anchors_ledgers` beyond its mean, from what it ``counted``."""
         light, *_ = ledger.filed(counted)
         return self._light(None, 1, followed=self._less_mean(self.followed.bundle, light))
 

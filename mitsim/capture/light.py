@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
@@ -261,7 +261,6 @@ class Light:
         return self.apparent.reflectance
 
 
-@single_threaded_blas()
 def trace_light(
     bench: Bench,
     plan: Plan,
@@ -287,44 +286,64 @@ def trace_light(
     progress
         told how near the target is.
     """
+    (light,) = trace_lines(bench, (bench,), plan, lighting, seed, sampling, progress)
+    return light
+
+
+@single_threaded_blas()
+def trace_lines(
+    bench: Bench,
+    benches: Sequence[Bench],
+    plan: Plan,
+    lighting: Lighting,
+    seed: int,
+    sampling: Sampling | None = None,
+    progress: Progress = silent,
+) -> list[Light]:
+    """Light of each line of a projector, from paths that all lines share; as :func:`trace_light`, until the frames of
+    every line meet the target.
+
+    Parameters
+    ----------
+    bench
+        what is traced: its lines, or light that is not told apart.
+    benches
+        the same with each of its lines alone; ``bench`` itself where light is not told apart.
+    plan, lighting, seed, sampling, progress
+        as for :func:`trace_light`.
+    """
     sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
+    own = [simulation if each is bench else Simulation(each, plan.settings) for each in benches]
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
     followed = bool(simulation.indirect or simulation.from_camera)
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
-    groups = [_Group(simulation, labels, stream) for stream in streams]
+    groups = [_Group(simulation, labels, stream, len(benches)) for stream in streams]
     rounds = first_round(simulation)
     while True:
         for group in groups:
             group.sample(rounds)
-        light = Light(
-            groups=tuple(group.light for group in groups),
-            simulation=simulation,
-            plan=plan,
-            seed=seed,
-            labels=labels,
-            flux=np.mean([group.flux for group in groups], axis=0),
-            flux_error=np.std([group.flux for group in groups], axis=0, ddof=1) / GROUPS**0.5,
-            paths=sum(group.paths for group in groups),
-            sampling_error=math.inf,
-            reached=False,
-            samples=dict(groups[0].done),
-        )
-        light, bound = _looked(light, lighting, followed)
-        # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
-        if sampling.target:
-            target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
-        else:
-            target = plan.sampling_target
-        seen = light.sampling_error if sampling.target else bound
-        progress("transport", min(1.0, (target / seen) ** 2) if seen > 0 else 1.0)
-        if seen <= target or light.paths >= _MOST_PATHS:
-            return replace(light, reached=seen <= target)
+        lights, most, near = list[Light](), 0.0, 1.0
+        for line, each in enumerate(own):
+            light, bound = _looked(_line_of(groups, line, each, plan, seed), lighting, followed)
+            # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
+            if sampling.target:
+                target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
+            else:
+                target = plan.sampling_target
+            seen = light.sampling_error if sampling.target else bound
+            lights.append(replace(light, reached=seen <= target))
+            if seen > target:
+                # Capped before the power as well: a target that was set very low would overflow it.
+                most = max(most, min(seen / target, _LARGEST_GROWTH))
+            near = min(near, (target / seen) ** 2 if seen > 0 else 1.0)
+        progress("transport", near)
+        if all(light.reached for light in lights) or lights[0].paths >= _MOST_PATHS:
+            return lights
         rate, least, beyond = (
             (_FOLLOWED_RATE, _LEAST_GROWTH, _BEYOND) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH, 1.0)
         )
-        # Capped before the power as well: a target that was set very low would overflow it.
-        growth = min(seen / target, _LARGEST_GROWTH) ** rate
+        growth = most**rate
         rounds *= min(max(beyond * growth, least), _LARGEST_GROWTH)
 
 
@@ -345,8 +364,26 @@ def traced_again(light: Light, simulation: Simulation, purpose: str = "scene") -
     groups = [_Group(simulation, light.labels, stream) for stream in streams]
     for group in groups:
         group.trace(light.samples)
-    flux = np.mean([group.flux for group in groups], axis=0)
-    return replace(light, groups=tuple(group.light for group in groups), simulation=simulation, flux=flux)
+    flux = np.mean([group.flux() for group in groups], axis=0)
+    return replace(light, groups=tuple(group.light() for group in groups), simulation=simulation, flux=flux)
+
+
+def _line_of(groups: Sequence[_Group], line: int, simulation: Simulation, plan: Plan, seed: int) -> Light:
+    """What groups know of the light of a ``line``, whose frames a ``simulation`` forms; its error is not known yet."""
+    flux = [group.flux(line) for group in groups]
+    return Light(
+        groups=tuple(group.light(line) for group in groups),
+        simulation=simulation,
+        plan=plan,
+        seed=seed,
+        labels=groups[0].labels,
+        flux=np.mean(flux, axis=0),
+        flux_error=np.std(flux, axis=0, ddof=1) / GROUPS**0.5,
+        paths=sum(group.paths for group in groups),
+        sampling_error=math.inf,
+        reached=False,
+        samples=dict(groups[0].done),
+    )
 
 
 def _mostly_followed(simulation: Simulation) -> bool:
@@ -419,15 +456,15 @@ def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> tuple[flo
 
 
 class _Group:
-    """One independent estimate of the light: the sum over its samples so far."""
+    """One independent estimate of the light, by line: the sum over its samples so far."""
 
-    def __init__(self, simulation: Simulation, labels: Labels, seed: int) -> None:
+    def __init__(self, simulation: Simulation, labels: Labels, seed: int, lines: int = 1) -> None:
         self.simulation, self.labels = simulation, labels
-        self.seed = seed
+        self.seed, self._lines = seed, lines
         self.done: dict[str, int] = {}
         self.paths = 0
-        self._sums: dict[str, FiledLight] = {}
-        self._flux = {name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")}
+        self._sums: list[dict[str, FiledLight]] = [{} for _ in range(lines)]
+        self._flux = [{name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")} for _ in range(lines)]
 
     def sample(self, rounds: float) -> None:
         """Trace until this many times the samples that the plan predicted are done."""
@@ -439,50 +476,68 @@ class _Group:
         Light is filed while the next is traced: filing takes one processor, and a tracer waits for its last paths.
         """
         with ThreadPoolExecutor(1) as filing:
-            filed: deque[Future[tuple[str, FiledLight, FloatArray | None]]] = deque()
+            filed: deque[Future[list[_Filed]]] = deque()
             for name, stage in self.simulation.tracers().items():
                 seed = integer(self.seed, stage.stream)
-                ledger = stage.ledger(self.labels) if self.done.get(name, 0) < wanted.get(name, 0) else None
+                more = self.done.get(name, 0) < wanted.get(name, 0)
+                ledgers = stage.ledgers(self.labels, self._lines) if more else ()
                 while (done := self.done.get(name, 0)) < wanted.get(name, 0):
                     count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
-                    deposits = stage.trace(seed, done, count, ledger)
+                    deposits = stage.trace(seed, done, count, ledgers)
                     if len(filed) == _WAITING:
-                        self._add(*filed.popleft().result())
+                        self._add(filed.popleft().result())
                     filed.append(filing.submit(self._filed, name, stage, deposits))
                     self.done[name] = done + count
                     self.paths += count * stage.tracer.lanes
-                if ledger:
-                    filed.append(filing.submit(self._from_ledger, name, stage, ledger, ledger.fetched()))
+                if ledgers:
+                    counted = [ledger.fetched() for ledger in ledgers]
+                    filed.append(filing.submit(self._from_ledgers, name, stage, ledgers, counted))
             while filed:
-                self._add(*filed.popleft().result())
+                self._add(filed.popleft().result())
 
-    def _filed(self, name: str, stage: Stage, deposits: Deposits) -> tuple[str, FiledLight, FloatArray | None]:
-        """Light of a stage, and the flux of each pixel where it is direct light."""
-        flux = self.simulation.flux(deposits, 1) if name in self._flux else None
-        return name, stage.file(deposits, self.labels, 1), flux
+    def _filed(self, name: str, stage: Stage, deposits: Deposits) -> list[_Filed]:
+        """Light of a stage by line, and the flux of each pixel where it is direct light."""
+        return [
+            _Filed(
+                name,
+                stage.file(light, self.labels, 1),
+                self.simulation.flux(light, 1) if name in self._flux[0] else None,
+            )
+            for light in deposits.by_line(self._lines)
+        ]
 
     @staticmethod
-    def _from_ledger(
-        name: str, stage: Stage, ledger: Ledger, counted: npt.NDArray[np.uint64]
-    ) -> tuple[str, FiledLight, None]:
-        """Light of a stage that its ledger ``counted``."""
+    def _from_ledgers(
+        name: str, stage: Stage, ledgers: Sequence[Ledger], counted: Sequence[npt.NDArray[np.uint64]]
+    ) -> list[_Filed]:
+        """Light of a stage by line that its ledgers ``counted``."""
         assert stage.file_ledger is not None
-        return name, stage.file_ledger(ledger, counted), None
+        pairs = zip(ledgers, counted, strict=True)
+        return [_Filed(name, stage.file_ledger(ledger, units), None) for ledger, units in pairs]
 
-    def _add(self, name: str, light: FiledLight, flux: FloatArray | None) -> None:
-        self._sums[name] = self._sums[name] + light if name in self._sums else light
-        if flux is not None:
-            self._flux[name] += flux
+    def _add(self, by_line: Sequence[_Filed]) -> None:
+        for sums, fluxes, more in zip(self._sums, self._flux, by_line, strict=True):
+            sums[more.name] = sums[more.name] + more.light if more.name in sums else more.light
+            if more.flux is not None:
+                fluxes[more.name] += more.flux
 
-    @property
-    def light(self) -> FiledLight:
-        """Mean over the samples."""
-        return reduce(add, (light / self.done[name] for name, light in self._sums.items()))
+    def light(self, line: int = 0) -> FiledLight:
+        """Mean over the samples, of a ``line``."""
+        return reduce(add, (light / self.done[name] for name, light in self._sums[line].items()))
 
-    @property
-    def flux(self) -> FloatArray:
-        """(n^2,) mean over the samples."""
-        return np.asarray(sum(self._flux[name] / done for name, done in self.done.items() if name in self._flux))
+    def flux(self, line: int = 0) -> FloatArray:
+        """(n^2,) mean over the samples, of a ``line``."""
+        fluxes = self._flux[line]
+        return np.asarray(sum(fluxes[name] / done for name, done in self.done.items() if name in fluxes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Filed:
+    """Light of a stage by its ``name``, and the flux of each pixel (n^2,) where it is direct light."""
+
+    name: str
+    light: FiledLight
+    flux: FloatArray | None
 
 
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:

@@ -130,9 +130,9 @@ def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
 
 def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
     """What so many ``samples`` of a ``stage`` take to be traced and filed."""
-    ledger = stage.ledger(labels)
+    ledgers = stage.ledgers(labels, 1)
     started = time.perf_counter()
-    stage.file(stage.trace(seed, 0, samples, ledger), labels, samples)
+    stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
     # What is filed on the device is not waited for.
     dr.sync_thread()
     return time.perf_counter() - started

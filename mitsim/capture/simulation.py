@@ -36,31 +36,31 @@ AT_ANCHORS = ("indirect at anchors", "from camera at anchors")
 class Stage:
     """A tracer, the samples of it that the plan predicted, how its light is filed, and its random stream's name.
 
-    ``file`` takes deposits, labels and the number of samples. ``ledger`` makes, from labels, what indirect light is
-    filed in on the device, where that has room, and ``file_ledger`` takes it and its sums on the host; None for other
-    light.
+    ``file`` takes deposits, labels and the number of samples. ``ledgers`` makes, from labels and a number of lines,
+    what indirect light of each line is filed in on the device, where that has room, and ``file_ledger`` takes one and
+    its sums on the host; none for other light.
     """
 
     tracer: DirectTracer | IndirectTracer | FromCameraTracer
     predicted: float
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
-    ledger: Callable[[Labels], Ledger | None] = lambda labels: None
+    ledgers: Callable[[Labels, int], tuple[Ledger, ...]] = lambda labels, lines: ()
     file_ledger: Callable[[Ledger, npt.NDArray[np.uint64]], FiledLight] | None = None
 
-    def trace(self, seed: int, first: int, samples: int, ledger: Ledger | None) -> Deposits:
-        """Light of some samples, but for what is filed in the ``ledger``.
+    def trace(self, seed: int, first: int, samples: int, ledgers: Sequence[Ledger] = ()) -> Deposits:
+        """Light of some samples, but for what is filed in the ``ledgers``.
 
         Parameters
         ----------
         seed, first, samples
             as for :meth:`mitsim.transport.paths.Tracer.trace`.
-        ledger
-            of :attr:`ledger`.
+        ledgers
+            of :attr:`ledgers`.
         """
-        if ledger is None or not isinstance(self.tracer, IndirectTracer):
+        if not ledgers or not isinstance(self.tracer, IndirectTracer):
             return self.tracer.trace(seed, first, samples)
-        return self.tracer.trace_into(ledger, seed, first, samples)
+        return self.tracer.trace_into(ledgers, seed, first, samples)
 
 
 class Simulation(Trays):
@@ -153,17 +153,18 @@ class Simulation(Trays):
         tracers = [tracer for tracer in (self.indirect, self.from_camera) if tracer is not None]
         return Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers])
 
-    def smooth_ledger(self, labels: Labels) -> Ledger | None:
-        """What indirect light is filed in by class in ``labels`` (n^2,), where it has room."""
-        return self._ledger(self.smooth.bundle, labels)
+    def smooth_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+        """What indirect light of each of ``lines`` is filed in by class in ``labels`` (n^2,), where it has room."""
+        return self._ledgers(self.smooth.bundle, labels, lines)
 
-    def anchors_ledger(self, labels: Labels) -> Ledger | None:
-        """What indirect light at anchors is filed in by class in ``labels`` (n^2,), where it has room."""
-        return self._ledger(self.followed.bundle, labels)
+    def anchors_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+        """The same of indirect light at anchors, as :meth:`smooth_ledgers` takes ``labels`` and ``lines``."""
+        return self._ledgers(self.followed.bundle, labels, lines)
 
-    def _ledger(self, bundle: Bundle, labels: Labels) -> Ledger | None:
-        fits = self.indirect is not None and Ledger.holds(bundle, labels)
-        return Ledger(bundle, labels, self.indirect.board) if self.indirect and fits else None
+    def _ledgers(self, bundle: Bundle, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+        if self.indirect is None or not Ledger.holds(bundle, labels, lines):
+            return ()
+        return tuple(Ledger(bundle, labels, self.indirect.board) for _ in range(lines))
 
     def tracers(self) -> dict[str, Stage]:
         """What is traced: samples a group is predicted to need, and how the light is filed, by name."""
@@ -178,7 +179,7 @@ class Simulation(Trays):
         if self.apart is not None:
             stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp")
         if self.indirect is not None:
-            ledger = self.smooth_ledger, self.file_smooth
+            ledger = self.smooth_ledgers, self.file_smooth
             stages["indirect"] = Stage(
                 self.indirect, settings.indirect_samples, self.file_followed, "indirect", *ledger
             )
@@ -190,7 +191,7 @@ class Simulation(Trays):
             samples, file, names = settings.followed_samples, self.file_at_anchors, AT_ANCHORS
             indirect, from_camera = self.at_anchors
             if indirect is not None:
-                stages[names[0]] = Stage(indirect, samples, file, names[0], self.anchors_ledger, self.file_anchors)
+                stages[names[0]] = Stage(indirect, samples, file, names[0], self.anchors_ledgers, self.file_anchors)
             if from_camera is not None:
                 stages[names[1]] = Stage(from_camera, samples, file, names[1])
         return stages

@@ -52,6 +52,33 @@ class Spectrum(ByValue):
         return Spectrum(np.array([np.sum(self.wavelengths_nm * self.weights)]), np.ones(1))
 
 
+@dataclass(frozen=True)
+class Lines:
+    """Spectral lines that light is traced at, all of them along one path.
+
+    Attributes
+    ----------
+    wavelengths_nm
+        of the lines [nm].
+    shares
+        part of the power that a scene states in each of them; 1 in all, unless some lines are left out.
+    """
+
+    wavelengths_nm: tuple[float, ...]
+    shares: tuple[float, ...]
+
+    @property
+    def several(self) -> bool:
+        """Whether light is told apart by line."""
+        return len(self.wavelengths_nm) > 1
+
+    @property
+    def single(self) -> tuple[Lines, ...]:
+        """Each of them alone."""
+        pairs = zip(self.wavelengths_nm, self.shares, strict=True)
+        return tuple(Lines((wavelength,), (share,)) for wavelength, share in pairs)
+
+
 Nanometres = Annotated[float, Field(ge=1, le=1e6)]
 """Wavelength [nm]: from soft X-rays to a millimetre."""
 Share = Annotated[float, Field(ge=0, le=1e6)]
@@ -129,6 +156,18 @@ class ProjectorModel(BaseModel):
     def black_level(self) -> float:
         """Light of a black pixel, as a part of a white one's."""
         return 1 / self.contrast_ratio
+
+    @property
+    def lines(self) -> Lines:
+        """Lines of the light, the effective wavelength where none are known, and the part of the power in each."""
+        shares = self.radiant_shares or (1.0,)
+        total = sum(shares)
+        return Lines(self.wavelengths_nm or (self.effective_wavelength_nm,), tuple(share / total for share in shares))
+
+    def at(self, wavelength_nm: float) -> ProjectorModel:
+        """The same projector that shows one line of ``wavelength_nm`` alone."""
+        alone = {"wavelengths_nm": (wavelength_nm,), "radiant_shares": (1.0,), "effective_wavelength_nm": wavelength_nm}
+        return self.model_copy(update=alone)
 
     @property
     def spectrum(self) -> Spectrum:

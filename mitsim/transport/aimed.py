@@ -179,7 +179,7 @@ class AimedTracer(DirectTracer):
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         shared, rng = streams(_SEED, pixel, sample)
         jitter = stratified(sample, shared)
-        wavelengths, _ = sampled_wavelengths(self.receiver.camera, rng)
+        wavelengths, _ = sampled_wavelengths(self.receiver.camera, rng, self.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         none = _Axis(mi.Float(0), mi.Float(0), mi.Float(1), mi.Bool(False))
         axis, _ = self.receiver.passage.along(ray, mi.Spectrum(1), (none, rng), self._axis)

@@ -18,7 +18,7 @@ from mitsim.transport.histogram import DIRECT, Deposits, Sightings
 from mitsim.transport.paths import Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, Reception, SensorPoints, sampled_wavelengths
-from mitsim.transport.sampling import panchromatic, shuffled, stratified, streams
+from mitsim.transport.sampling import shuffled, stratified, streams
 
 IntArray = npt.NDArray[np.int64]
 
@@ -75,7 +75,7 @@ class DirectTracer(Tracer):
         # Streams belong to pixels: every anchor is connected to the same points.
         shared, rng = streams(seed, pixel, sample)
         jitter, weight = self._place(number, row, column, stratified(sample, shared))
-        wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng)
+        wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng, self.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         sensor = self._sensor(row, column, sample, shared, rng)
         flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
@@ -88,10 +88,11 @@ class DirectTracer(Tracer):
             state: tuple[Sightings, mi.PCG32],
         ) -> tuple[Sightings, mi.PCG32]:
             seen, rng = state
-            reception, value = self._received(si, direction, light, sensor, active, rng)
-            return seen.joined_by(reception.sightings(value, pixel), rng), rng
+            reception, received = self._received(si, direction, light, sensor, active, rng)
+            return seen.joined_by(reception.sightings(received, pixel, by_line), rng), rng
 
-        seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(), rng), seen_at)
+        by_line = self.projector.by_line
+        seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(by_line), rng), seen_at)
         return seen, DIRECT, (row, column)
 
     def _received(
@@ -102,7 +103,7 @@ class DirectTracer(Tracer):
         sensor: mi.Point3f,
         active: mi.Bool,
         rng: mi.PCG32,
-    ) -> tuple[Reception, mi.Float]:
+    ) -> tuple[Reception, mi.UnpolarizedSpectrum]:
         """What ``light`` that comes to surfaces in a ``direction`` brings to ``sensor`` points."""
         del rng
         return self._connected(si, direction, light, sensor, active)
@@ -114,10 +115,10 @@ class DirectTracer(Tracer):
         light: mi.Spectrum,
         sensor: mi.Point3f,
         active: mi.Bool,
-    ) -> tuple[Reception, mi.Float]:
+    ) -> tuple[Reception, mi.UnpolarizedSpectrum]:
         """The same by one connection."""
         reception = self.receiver.receive(si, -direction, sensor, active)
-        return reception, panchromatic(reception.irradiance * light)
+        return reception, reception.irradiance * light
 
     def _pair(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """A lane's place in the list of pixels, its anchor, and its weight."""

@@ -102,7 +102,7 @@ class FluxTracer:
         pixels = dr.opaque(mi.UInt32, self._pixels)
         shared, rng = streams(seed, pixel + group * pixels, sample)
         jitter = stratified(sample, shared)
-        wavelengths, spectral = sampled_wavelengths(self._receiver.camera, rng)
+        wavelengths, spectral = sampled_wavelengths(self._receiver.camera, rng, self._rays.projector.lines)
         ray = self._rays.sample(pixel, jitter, rng, wavelengths)
         point = stratified(shuffled(sample, shared), shared)
         turn = stratified(shuffled(sample, shared), shared) if self._glossy else None

@@ -36,7 +36,7 @@ from mitsim.transport.passage import Passage
 from mitsim.transport.paths import FollowingTracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.receiver import SensorPoints, sampled_wavelengths
-from mitsim.transport.sampling import panchromatic, stratified, streams
+from mitsim.transport.sampling import stratified, streams
 
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
@@ -116,7 +116,9 @@ class CameraWalk(Walk):
         seed, sample, lane
             of the random numbers, and of every path.
         """
-        super().__init__(tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection, tracer.orders)
+        super().__init__(
+            tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection, tracer.orders, tracer.projector.by_line
+        )
         cell, row, column = tracer.points.of(lane, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
         self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
@@ -143,7 +145,7 @@ class CameraWalk(Walk):
         self.column = _place(grid.columns, cell % columns, jitter.y) - self.start[1] * nearness
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
-        wavelengths, spectral = sampled_wavelengths(tracer.camera, self.rng)
+        wavelengths, spectral = sampled_wavelengths(tracer.camera, self.rng, tracer.projector.lines)
         to_world = tracer.camera.world_transform()
         direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
         self.ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
@@ -292,9 +294,9 @@ class CameraWalk(Walk):
 
     # ---- light that is kept -----------------------------------------------------------------------------------------
 
-    def _radiance(self, light: mi.Spectrum) -> mi.Float:
-        """One number for the light of a connection, as irradiance where the path started."""
-        return panchromatic(mi.unpolarized_spectrum(light) * self.strength * self.weight)
+    def _radiance(self, light: mi.Spectrum) -> mi.UnpolarizedSpectrum:
+        """The light of a connection, as irradiance where the path started."""
+        return mi.unpolarized_spectrum(light) * self.strength * self.weight
 
     def _lamps(self) -> mi.UInt32:
         return mi.UInt32(self.tracer.projector.n**2)
@@ -304,17 +306,20 @@ class CameraWalk(Walk):
         """Balance heuristic of two ways to find the same light; a pdf of 0 means that a way cannot find it."""
         return dr.select(own > 0, own / (own + rival), 1)
 
-    def _keep_of_projector(self, active: mi.Bool, value: mi.Float, pixel: mi.UInt32, surfaces: mi.UInt32) -> None:
+    def _keep_of_projector(
+        self, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, surfaces: mi.UInt32
+    ) -> None:
         """``surfaces``: those on the light's way that are no mirrors."""
         active &= self._wanted(surfaces)
-        self._keep_seen("direct", active & (surfaces == 1), value * self.part, pixel)
+        self._keep_seen("direct", active & (surfaces == 1), light * self.part, pixel)
         if self.paths.interreflection:
-            self._keep_seen("indirect", active & (surfaces > 1), value * self.part, pixel)
+            self._keep_seen("indirect", active & (surfaces > 1), light * self.part, pixel)
 
-    def _keep_seen(self, kind: str, active: mi.Bool, value: mi.Float, pixel: mi.UInt32) -> None:
+    def _keep_seen(self, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
         # Filed as the sensor's centre sees it.
         row, column = (t + s * self.inverse_depth for t, s in zip((self.row, self.column), self.start, strict=True))
-        self._keep(kind, Sightings(dr.select(active, value, 0), pixel, row, column, self.inverse_depth))
+        lit = dr.select(active, light, 0)
+        self._keep(kind, Sightings.of(lit, self.by_line, pixel, row, column, self.inverse_depth))
 
 
 def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:

@@ -111,7 +111,7 @@ class GlintRays:
             surfaces that a ray may meet between the two.
         """
         self._scene, self._max_depth = scene, max_depth
-        self._wavelengths = wavelength_sets()
+        self._wavelengths = wavelength_sets(projector.lines)
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))

@@ -21,6 +21,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import Directions
 from mitsim.transport.cells import CellAxis, CellGrid
+from mitsim.transport.sampling import panchromatic
 
 IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
@@ -31,25 +32,59 @@ _COUNTED = 2**26
 
 @dataclass
 class Sightings:
-    """Light of connections, a lane each, and where the camera sees it; meaning and units as in :class:`Deposits`."""
+    """Light of connections, a lane each, and where the camera sees it; meaning and units as in :class:`Deposits`.
+    ``lines`` is ``value`` by line, where it is told apart."""
 
     value: mi.Float
     pixel: mi.UInt32
     row: mi.Float
     column: mi.Float
     inverse_depth: mi.Float
+    lines: mi.UnpolarizedSpectrum | None = None
 
     @classmethod
-    def none(cls) -> Sightings:
-        """No light yet."""
-        return cls(mi.Float(0), mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0))
+    def of(cls, light: mi.UnpolarizedSpectrum, by_line: bool, pixel: mi.UInt32, *place: mi.Float) -> Sightings:
+        """Of light at the wavelengths of its paths.
+
+        Parameters
+        ----------
+        light
+            [W m^-2], by the weights of :func:`mitsim.transport.receiver.sampled_wavelengths`.
+        by_line
+            whether it is told apart by line.
+        pixel
+            of the projector.
+        *place
+            row, column and inverse depth.
+        """
+        row, column, inverse_depth = place
+        lines = light / len(light) if by_line else None
+        return cls(panchromatic(light), pixel, row, column, inverse_depth, lines)
+
+    @classmethod
+    def none(cls, by_line: bool = False) -> Sightings:
+        """No light yet, which may be told apart ``by_line``."""
+        return cls.of(mi.UnpolarizedSpectrum(0), by_line, mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
     def joined_by(self, more: Sightings, rng: mi.PCG32) -> Sightings:
-        """Of these and ``more`` one, drawn by ``rng`` in proportion to its light, which carries the light of both."""
+        """Of these and ``more`` one, drawn by ``rng`` in proportion to its light, which carries the light of both.
+
+        By line it carries its own light over the chance that it is drawn.
+        """
         total = self.value + more.value
         new = rng.next_float32() * total < more.value
         places = ((getattr(more, name), getattr(self, name)) for name in ("pixel", "row", "column", "inverse_depth"))
-        return Sightings(total, *(dr.select(new, theirs, mine) for theirs, mine in places))
+        joined = Sightings(total, *(dr.select(new, theirs, mine) for theirs, mine in places))
+        if self.lines is not None and more.lines is not None:
+            own, drawn = (
+                dr.select(new, theirs, mine) for theirs, mine in ((more.value, self.value), (more.lines, self.lines))
+            )
+            joined.lines = dr.select(own == 0, 0, drawn * (total / own))
+        return joined
+
+    def by_line(self, lines: int) -> list[mi.Float]:
+        """The value, or of several ``lines`` that of each."""
+        return [self.value] if self.lines is None or lines == 1 else [self.lines[line] for line in range(lines)]
 
 
 def check_finite(light: npt.NDArray[Any]) -> None:
@@ -78,6 +113,8 @@ class Deposits:
         (m,) :data:`DIRECT` or :data:`INDIRECT` light of the projector, or :data:`AMBIENT` light.
     lane
         (m,) number of each path in its launch, increasing; None where that is not known.
+    lines
+        (m, 4) ``value`` by line, then zeros; None where it is not told apart.
     """
 
     pixel: IntArray
@@ -89,12 +126,23 @@ class Deposits:
     value: FloatArray
     kind: npt.NDArray[np.int16]
     lane: IntArray | None = None
+    lines: FloatArray | None = None
 
     @classmethod
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
         """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS))
+        by_line = [part.lines for part in parts if part.lines is not None]
+        lines = np.concatenate(by_line) if len(by_line) == len(parts) else None
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        return cls(**arrays, lines=lines)
+
+    def by_line(self, lines: int) -> list[Deposits]:
+        """These, or the same of each of several ``lines`` with its light."""
+        if lines == 1:
+            return [self]
+        assert self.lines is not None, "traced by line"
+        return [replace(self, value=np.ascontiguousarray(self.lines[:, line]), lines=None) for line in range(lines)]
 
     @classmethod
     def fetched(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> Deposits:
@@ -134,6 +182,7 @@ class Deposits:
             value=lit_ones(light, np.float64),
             kind=np.full(lit.size, kind, dtype=np.int16),
             lane=lit,
+            lines=None if seen.lines is None else np.array(seen.lines).T[lit].astype(np.float64),
         )
 
     @classmethod
@@ -150,16 +199,19 @@ class Deposits:
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> Deposits:
         """The entries that are ``chosen`` (m,)."""
-        return Deposits(*(getattr(self, name)[chosen] for name in _ARRAYS))
+        return self._taken(chosen)
 
     def of_lanes(self, first: int, last: int) -> Deposits:
         """The entries of lanes ``first`` .. ``last`` - 1."""
         assert self.lane is not None, "known of what one launch brought"
-        inside = slice(*np.searchsorted(self.lane, (first, last)))
-        return Deposits(*(getattr(self, name)[inside] for name in _ARRAYS))
+        return self._taken(slice(*np.searchsorted(self.lane, (first, last))))
+
+    def _taken(self, which: slice | npt.NDArray[np.bool_]) -> Deposits:
+        lines = None if self.lines is None else self.lines[which]
+        return Deposits(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
 
 
-_ARRAYS = tuple(name for name in Deposits.__dataclass_fields__ if name != "lane")
+_ARRAYS = tuple(name for name in Deposits.__dataclass_fields__ if name not in ("lane", "lines"))
 """What is told of each entry."""
 
 

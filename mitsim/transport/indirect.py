@@ -85,22 +85,24 @@ class IndirectTracer(FollowingTracer):
     def board(self) -> float:
         """Irradiance [W m^-2] by a pixel's light from a white board at the rig's distance, to which light compares."""
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
-        wavelengths, spectral = sampled_wavelengths(self.receiver.camera, generator(mi.UInt32(0), pixel))
+        wavelengths, spectral = sampled_wavelengths(
+            self.receiver.camera, generator(mi.UInt32(0), pixel), self.projector.lines
+        )
         flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.receiver.geometry.scene_distance**2)
 
-    def trace_into(self, ledger: Ledger, seed: int, first: int, samples: int) -> Deposits:
-        """The same as :meth:`trace`, indirect light filed in a ``ledger`` as far as it can be: the rest, on the host.
+    def trace_into(self, ledgers: Sequence[Ledger], seed: int, first: int, samples: int) -> Deposits:
+        """The same as :meth:`trace`, indirect light filed in ledgers as far as it can be: the rest, on the host.
 
         Parameters
         ----------
-        ledger
-            of light by pixel, whose unit is :attr:`board`.
+        ledgers
+            of light by pixel, whose unit is :attr:`board`; of several lines, one for each.
         seed, first, samples
             as for :meth:`trace`.
         """
         lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
-        launched = [self._walk(seed, *launch).file(ledger) for launch in lanes]
+        launched = [self._walk(seed, *launch).file(ledgers) for launch in lanes]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
     def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
@@ -125,11 +127,13 @@ class IndirectWalk(Walk):
         seed, sample, lane
             of the random numbers; the lane tells pixel and anchor.
         """
-        super().__init__(tracer.receiver.passage, tracer.mirrors, tracer.interreflection, tracer.orders)
+        super().__init__(
+            tracer.receiver.passage, tracer.mirrors, tracer.interreflection, tracer.orders, tracer.projector.by_line
+        )
         self.tracer = tracer
         weight = self._place(sample, lane)
         self._begin(seed)
-        wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, self.rng)
+        wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, self.rng, tracer.projector.lines)
         jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
         self.ray = tracer.rays.sample(self.pixel, jitter, self.rng, wavelengths)
         self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * weight
@@ -152,15 +156,16 @@ class IndirectWalk(Walk):
         shared, self.rng = streams(seed, self.pixel, self.sample)
         self.first_turn = stratified(self.sample, shared)
 
-    def file(self, ledger: Ledger) -> list[Deposits]:
-        """Follow all paths; indirect light goes into a ``ledger``, caustics to the host."""
+    def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
+        """Follow all paths; indirect light goes into ``ledgers``, caustics to the host."""
         self.follow(further=True)
         seen = self.kept["indirect"]
-        place = ledger.place(seen, self.rng.next_float32(), self.anchor)
-        ledger.add(seen.value, seen.pixel, place, ~(seen.value == 0))  # not a number is light to be refused
+        place = ledgers[0].place(seen, self.rng.next_float32(), self.anchor)
+        for ledger, light in zip(ledgers, seen.by_line(len(ledgers)), strict=True):
+            ledger.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
         caustics = self.kept["direct"] if self.tracer.mirrors else None
         # Together: apart, each would follow all paths again.
-        dr.eval(caustics, ledger.sums)
+        dr.eval(caustics, [ledger.sums for ledger in ledgers])
         return [Deposits.fetched(caustics, DIRECT, self.anchor)] if caustics else []
 
     def vertex(self, first: bool) -> None:
@@ -185,11 +190,11 @@ class IndirectWalk(Walk):
     def _take(self, si: mi.SurfaceInteraction3f, way: Way) -> None:
         """Keep the light that a surface sends by a ``way``."""
         reception = self.tracer.receiver.received(si, -self.ray.d, way)
-        value = panchromatic(reception.irradiance * self.flux * self.strength)
+        light = reception.irradiance * self.flux * self.strength
         caustic = self.scattered == 0
-        value *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
+        light *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
-            self._keep(kind, reception.sightings(dr.select(chosen, value, 0), self.pixel))
+            self._keep(kind, reception.sightings(dr.select(chosen, light, 0), self.pixel, self.by_line))
 
     def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Sample where each path goes on, and end some of them."""

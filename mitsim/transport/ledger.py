@@ -21,7 +21,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.transport.histogram import Bundle, Sightings
 
 _MOST_PLACES = 2**26
-"""Places of all rows that are held: 0.5 GB."""
+"""Places of all rows and lines that are held: 0.5 GB."""
 _UNIT_BITS = 30
 """Power of two of units in the light that is passed as one: rounding moves a path's by 5e-10 of it at most, either way,
 and a place holds 2^34 times as much."""
@@ -58,9 +58,17 @@ class Ledger:
         self.sums = dr.zeros(mi.UInt64, self._rows * self._width + 1)
 
     @staticmethod
-    def holds(bundle: Bundle, labels: Labels) -> bool:
-        """Whether a ledger of a ``bundle`` and ``labels`` has room, and can file as the bundle does."""
-        fits = (int(labels.max()) + 1) * (bundle.size + 1) < _MOST_PLACES
+    def holds(bundle: Bundle, labels: Labels, ledgers: int = 1) -> bool:
+        """Whether so many ledgers have room, and can file as a bundle does.
+
+        Parameters
+        ----------
+        bundle, labels
+            of each.
+        ledgers
+            their number.
+        """
+        fits = ledgers * (int(labels.max()) + 1) * (bundle.size + 1) < _MOST_PLACES
         return fits and not bundle.between
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:

@@ -30,6 +30,7 @@ from mitsim.transport.from_camera import CameraWalk, FromCameraTracer, Paths
 from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits, Sightings
 from mitsim.transport.paths import camera_part
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
+from mitsim.transport.sampling import panchromatic
 
 _LENS = 0.02
 """Radius of the lens over the scene's distance: 8 mm at 400, which one path in 3000 meets from a matt surface."""
@@ -145,12 +146,13 @@ class _LeftOutWalk(CameraWalk):
         met = once & (camera_part(self.density) > 0)
         hit = self.connector.hit(self.ray, si.t, self.rng, lost | met, self.since)
         light, none = self._radiance(hit.radiance), mi.Float(0)
-        self._keep(
-            "indirect", Sightings(dr.select(hit.met & lost, light * self.part, 0), self.mirror, none, none, none)
-        )
+        missed = dr.select(hit.met & lost, light * self.part, 0)
+        self._keep("indirect", Sightings.of(missed, self.by_line, self.mirror, none, none, none))
         met &= hit.met
-        connected = dr.select(met, dr.select(self.in_mirror, light * self.density / hit.pdf, self._lit(hit)), 0)
-        self._keep("direct", Sightings(dr.select(met, light, 0), self.lobe, connected, none, none))
+        in_mirror = panchromatic(light) * self.density / hit.pdf
+        connected = dr.select(met, dr.select(self.in_mirror, in_mirror, self._lit(hit)), 0)
+        seen = Sightings.of(dr.select(met, light, 0), self.by_line, self.lobe, connected, none, none)
+        self._keep("direct", seen)
 
     def _lit(self, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
@@ -158,7 +160,13 @@ class _LeftOutWalk(CameraWalk):
         flux = self.rays.flux(hit.pixel, self.ray.wavelengths)
         # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
         view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
-        return self._radiance(flux) / view * self.density * self.slope * dr.square(self.inverse_depth * self.slope)
+        return (
+            panchromatic(self._radiance(flux))
+            / view
+            * self.density
+            * self.slope
+            * dr.square(self.inverse_depth * self.slope)
+        )
 
     def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> mi.Bool:
         passing = super()._leave(si, first)

@@ -206,10 +206,10 @@ class _Connections(DirectTracer):
         light: mi.Spectrum,
         sensor: mi.Point3f,
         active: mi.Bool,
-    ) -> tuple[Reception, mi.Float]:
-        reception, value = super()._connected(si, direction, light, sensor, active)
+    ) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+        reception, received = super()._connected(si, direction, light, sensor, active)
         sharp = reception.pdf > self._of_lane
-        return reception, dr.select(sharp == self._over_sharp, value, 0)
+        return reception, dr.select(sharp == self._over_sharp, received, 0)
 
 
 class _Lobes:
@@ -274,7 +274,7 @@ class _Lobes:
         half = dr.opaque(mi.Float, wider * self.geometry.half_width)
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-        wavelengths, spectral = sampled_wavelengths(self.camera, rng)
+        wavelengths, spectral = sampled_wavelengths(self.camera, rng, self.rays.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         flux = self.rays.flux(pixel, wavelengths) * spectral
         none = _Met(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))

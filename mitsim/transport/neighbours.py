@@ -136,8 +136,9 @@ class _Block(IndirectWalk):
         dr.eval(values)
         return [*own, self._paired(values[0], self.way), self._paired(values[1], self.further)]
 
-    def file(self, ledger: Ledger) -> list[Deposits]:
-        """Light of each pixel's own paths on the host; that of pairs in a ``ledger``."""
+    def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
+        """Light of each pixel's own paths on the host; that of pairs in ``ledgers``, of which there is one."""
+        (ledger,) = ledgers
         own = self._own()
         seen = Sightings(self.way.geometric, self.pixel, self.way.row, self.way.column, self.way.inverse_depth)
         places = [ledger.place(each, self.rng.next_float32()) for each in (seen, self.further)]

@@ -183,7 +183,12 @@ class Walk(ABC):
     anchor: tuple[mi.UInt32, mi.UInt32]
 
     def __init__(
-        self, passage: Passage, mirrors: bool, interreflection: bool, orders: tuple[int, int] | None = None
+        self,
+        passage: Passage,
+        mirrors: bool,
+        interreflection: bool,
+        orders: tuple[int, int] | None = None,
+        by_line: bool = False,
     ) -> None:
         """Paths before their first surface.
 
@@ -195,10 +200,13 @@ class Walk(ABC):
             paths over delta reflections and transmissions, and over other surfaces.
         orders
             of :class:`FollowingTracer`; None: all.
+        by_line
+            whether light is told apart by line.
         """
         self.passage, self.scene, self.straight = passage, passage.scene, mi.Bool(True)
         self.mirrors, self.interreflection = mirrors, interreflection
-        self.kept = {kind: Sightings.none() for kind in KINDS}
+        self.by_line = by_line
+        self.kept = {kind: Sightings.none(by_line) for kind in KINDS}
         self._orders = [dr.opaque(mi.UInt32, order) for order in orders or ()]
 
     @abstractmethod

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.rig.projector import Lines
 from mitsim.transport.coordinates import Numbers, turn_and_origin
 from mitsim.transport.host import channels, per_lane
 
@@ -40,7 +41,8 @@ class ProjectorOptics:
     """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas.
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
-    standard deviation of a projector pixel's spot, in projector pixels.
+    standard deviation of a projector pixel's spot, in projector pixels. ``lines`` are those that spectral variants
+    trace its light at; None: wavelengths drawn from all.
     """
 
     emitter: mi.Emitter
@@ -51,6 +53,12 @@ class ProjectorOptics:
     aperture: float = 0.0
     focus: float = 400.0
     blur: float = 0.0
+    lines: Lines | None = None
+
+    @property
+    def by_line(self) -> bool:
+        """Whether light is told apart by line."""
+        return self.lines is not None and self.lines.several
 
     @cached_property
     def canvas_map(self) -> CanvasMap:
@@ -193,10 +201,24 @@ class ProjectorRays:
         return mi.Vector3f(*self._map.tangents(*canvas_point, lambda value: dr.opaque(mi.Float, value)), 1)
 
 
-def wavelength_sets() -> list[mi.Color0f | None]:
-    """Wavelengths [nm] at which spectra are taken: none but for spectral variants, there evenly over the range."""
+def line_wavelengths(lines: Lines) -> tuple[mi.Color0f, FloatArray]:
+    """Wavelengths [nm] of a path that carries some ``lines``, and weights (4,) whose mean over light is the sum of its
+    lines. Where the lines are fewer than four, the first is repeated, with weight 0."""
+    size = len(dr.zeros(mi.UnpolarizedSpectrum))
+    more = size - len(lines.shares)
+    # Opaque numbers keep the compiled kernel the same for all lines.
+    wavelengths = (dr.opaque(mi.Float, value) for value in (*lines.wavelengths_nm, *lines.wavelengths_nm[:1] * more))
+    weights = np.array([*lines.shares, *[0.0] * more]) * size
+    return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), weights
+
+
+def wavelength_sets(lines: Lines | None = None) -> list[mi.Color0f | None]:
+    """Wavelengths [nm] at which spectra are taken: none but for spectral variants, there the ``lines``, or without any
+    evenly over the range."""
     if not mi.is_spectral:
         return [None]
+    if lines is not None:
+        return [line_wavelengths(lines)[0]]
     size = len(dr.zeros(mi.UnpolarizedSpectrum))
     step = (mi.MI_CIE_MAX - mi.MI_CIE_MIN) / (_WAVELENGTH_SETS * size)
     even = mi.MI_CIE_MIN + step * (np.arange(_WAVELENGTH_SETS * size) + 0.5)
@@ -224,6 +246,8 @@ class PinholeRays:
         self.area = self._map.pixel_area(projector.canvas)
         centre = np.stack(np.divmod(np.arange(n * n), n), axis=1) + 0.5
         self.power = np.concatenate([self._irradiance(centre, chosen) for chosen in wavelengths], axis=1)
+        if mi.is_spectral and projector.lines is not None:
+            self.power *= line_wavelengths(projector.lines)[1]
 
     def directions(self, points: FloatArray) -> FloatArray:
         """(k, 3) world directions of unit length through window ``points`` (row, column) (k, 2) in projector pixels."""

@@ -23,10 +23,12 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.anchors import anchor_positions
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Lines
 from mitsim.transport.coordinates import rows_columns, x_y
 from mitsim.transport.histogram import Sightings
 from mitsim.transport.panes import refracted_way
 from mitsim.transport.passage import Passage
+from mitsim.transport.projector import line_wavelengths
 
 
 @dataclass(frozen=True)
@@ -129,9 +131,19 @@ class Reception:
         squared = 1 + dr.square(self.row - row * inverse) + dr.square(self.column - column * inverse)
         return dr.square(inverse) / (squared * dr.sqrt(squared))
 
-    def sightings(self, value: mi.Float, pixel: mi.UInt32) -> Sightings:
-        """Light ``value`` [W m^-2] of projector pixels ``pixel``, seen from here."""
-        return Sightings(value, pixel, self.row, self.column, self.inverse_depth)
+    def sightings(self, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, by_line: bool = False) -> Sightings:
+        """Light seen from here.
+
+        Parameters
+        ----------
+        light
+            [W m^-2] at the path's wavelengths.
+        pixel
+            of the projector.
+        by_line
+            whether it is told apart by line.
+        """
+        return Sightings.of(light, by_line, pixel, self.row, self.column, self.inverse_depth)
 
 
 class Receiver:
@@ -221,7 +233,25 @@ class Receiver:
         return Reception(irradiance, way.row, way.column, way.inverse_depth, pdf, way.direction)
 
 
-def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
-    """Wavelengths of a path to ``camera``, drawn by ``rng``, and its weight; but in spectral variants, none and 1."""
+def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:
+    """Wavelengths of a path, and their weights; but in spectral variants, none and 1.
+
+    Light by the weights has a mean over the wavelengths that is the mean over 360-830 nm, where a flat spectrum of 1
+    counts as 1; or the sum over given lines, each with its share.
+
+    Parameters
+    ----------
+    camera
+        that the path comes to.
+    rng
+        draws the wavelengths; it draws as many numbers where ``lines`` are given.
+    lines
+        wavelengths that are taken instead, four at most, in spectral variants.
+    """
     wavelengths, weight = camera.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_float32(), True)
-    return wavelengths, weight
+    if not mi.is_spectral:
+        return wavelengths, weight
+    if lines is None:
+        return wavelengths, weight / (mi.MI_CIE_MAX - mi.MI_CIE_MIN)
+    wavelengths, weights = line_wavelengths(lines)
+    return wavelengths, mi.Spectrum(*(dr.opaque(mi.Float, float(weight)) for weight in weights))

@@ -80,10 +80,6 @@ def _unit(bits: mi.UInt32) -> mi.Float:
 
 
 def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
-    """One number for a spectrum of ``radiance``, by a flat response: the mean over channels, or over 360-830 nm.
-
-    In spectral variants the radiance has been divided by the density of its sampled wavelengths, so the mean over
-    samples is an integral; dividing by the range makes a flat spectrum of 1 count as 1, as in the other variants.
-    """
-    mean = dr.mean(radiance)
-    return mean / (mi.MI_CIE_MAX - mi.MI_CIE_MIN) if mi.is_spectral else mean
+    """One number for a spectrum of ``radiance``, by a flat response: the mean over channels, or over wavelengths that
+    have the weights of :func:`mitsim.transport.receiver.sampled_wavelengths`."""
+    return dr.mean(radiance)

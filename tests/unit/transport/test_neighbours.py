@@ -154,7 +154,7 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
     bundle, labels = Bundle(grid, 1, depths), np.arange(N * N) % 5
     tracer = tracers(bench)[1]
     ledger = Ledger(bundle, labels, tracer.board)
-    own = tracer.trace_into(ledger, 3, 0, 512)
+    own = tracer.trace_into([ledger], 3, 0, 512)
     matrix, received, outside = ledger.filed()
     every = tracer.trace(3, 0, 512)
     expected = bundle.file(every, labels).toarray()
@@ -177,7 +177,7 @@ def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Calla
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
     bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
     ledger = Ledger(bundle, labels, tracer.board)
-    rest = tracer.trace_into(ledger, 3, 0, 64)
+    rest = tracer.trace_into([ledger], 3, 0, 64)
     matrix, received, outside = ledger.filed()
     every = tracer.trace(3, 0, 64)
     indirect = every.where(every.kind == INDIRECT)
@@ -199,7 +199,7 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
     parameters.update()
     with pytest.raises(MitsimError, match="NaN"):
         tracer.trace(0, 0, 256)
-    tracer.trace_into(ledger, 0, 0, 256)
+    tracer.trace_into([ledger], 0, 0, 256)
     with pytest.raises(MitsimError, match="NaN"):
         ledger.filed()
 
@@ -216,7 +216,7 @@ dr.set_thread_count(int(sys.argv[2]))
 tracer = tracers(bench)[1]
 bundle = Bundle(aligned_grid(*bench.windows, 16, 1, bench.geometry.tan_half_fov), 1, (450.0, 300.0))
 ledger = Ledger(bundle, np.arange(256) % 5, tracer.board)
-tracer.trace_into(ledger, 3, 0, 256)
+tracer.trace_into([ledger], 3, 0, 256)
 print(hashlib.sha256(ledger.filed()[0].toarray().tobytes()).hexdigest())
 """
 
