@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.reconstruction import reconstruct
     from mitsim.reconstruct.result import Reconstruction
     from mitsim.rig.recipe import load_recipe
+    from mitsim.study.calibration_plan import CalibrationPlan, plan_calibration
     from mitsim.study.metrics import psnr, ssim
 
 __version__ = "0.4.0"
@@ -42,6 +43,7 @@ _HOMES = {
     "load_calibration": "reconstruct.factors",
     "load_recipe": "rig.recipe",
     "calibrate_frames": "reconstruct.measured",
+    "plan_calibration": "study.calibration_plan",
     "reconstruct": "reconstruct.reconstruction",
     "psnr": "study.metrics",
     "ssim": "study.metrics",
@@ -50,6 +52,7 @@ _HOMES = {
     "Request": "capture.request",
     "Light": "capture.light",
     "Capture": "core.runs",
+    "CalibrationPlan": "study.calibration_plan",
     "Factors": "reconstruct.factors",
     "Reconstruction": "reconstruct.result",
     "Rendered": "capture.render",
@@ -62,6 +65,7 @@ _HOMES = {
 __all__ = [
     "ArgumentError",
     "Bench",
+    "CalibrationPlan",
     "Capture",
     "Clock",
     "Factors",
@@ -78,6 +82,7 @@ __all__ = [
     "load_recipe",
     "load_run",
     "open_bench",
+    "plan_calibration",
     "psnr",
     "reconstruct",
     "ssim",

@@ -3,8 +3,9 @@
 Noise of a session's frames is independent from pixel to pixel and shot to shot, and factors are linear in responses:
 u_i = Y_i v / |v|^2, Phi_L = U H^T / N. With V[k, l] the variance of a response at a pixel, a number of row k of Phi_L
 has variance sum_l V[k, l] v_l^2 / (N |v|^4), and numbers are uncorrelated, since the rows of H are orthogonal. So
-factors are drawn without drawing a frame. Where each +-1 pattern is taken from one shot and a uniform one that all share, the
-noise of the latter comes into column p of Phi_L by sum_i H[p, i] / N: all of it into the column whose signs are all +1.
+factors are drawn without drawing a frame. Where each +-1 pattern is taken from one shot and a uniform one that all
+share, the noise of the latter comes into column p of Phi_L by sum_i H[p, i] / N: all of it into the column whose signs
+are all +1.
 
 The noise of v enters at second order and is left out, as are noise that a sensor row shares, and speckle.
 """

@@ -23,6 +23,8 @@ LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 worth its name."""
 LONGEST_S = 1e6
 """Seconds that may be asked for: eleven days, far beyond what any accuracy takes."""
+PSNR_DB = 1.0, 100.0
+"""PSNR that may be asked of an image: below, its error is its whole range; above, the truth is not known."""
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
 
@@ -69,6 +71,13 @@ def check_accuracy(accuracy: float) -> float:
             "accuracy", f"{accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
         )
     return accuracy
+
+
+def check_psnr(psnr: float) -> float:
+    """``psnr`` [dB], or ArgumentError when no image of worth has it."""
+    if not PSNR_DB[0] <= psnr <= PSNR_DB[1]:
+        raise ArgumentError("psnr", f"{psnr:g}: give {PSNR_DB[0]:g} to {PSNR_DB[1]:g} dB")
+    return psnr
 
 
 class Request(BaseModel):

@@ -18,6 +18,7 @@ import typer
 
 import mitsim
 from mitsim.cli import exchange, sensor
+from mitsim.cli.calibration import Wanted, check_no_plan
 from mitsim.cli.options import (
     DAY,
     Accuracy,
@@ -62,7 +63,7 @@ app = typer.Typer(
 
 _OF_FRAMES = {"frames", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
-_SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files"}
+_SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
 """Options that are not called like their parameter."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -254,7 +255,10 @@ def capture(
 @app.command()
 def calibrate(
     context: typer.Context,
-    output: Annotated[Path, typer.Option("-o", "--output", help="calibration folder to make", metavar="CAL")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="calibration folder to make; of --plan, recipe to write", metavar="CAL"),
+    ] = None,
     scene: SceneOrFrames = None,
     frames: Annotated[
         Path | None, typer.Option(help="folder with the frames of a real session, instead of a scene", metavar="DIR")
@@ -263,6 +267,11 @@ def calibrate(
     camera: Camera = None,
     projector: Projector = None,
     recipe: Annotated[Path | None, typer.Option(help="session recipe, TOML", metavar="FILE.toml")] = None,
+    planning: Annotated[
+        bool, typer.Option("--plan", help="find the light that an image of --psnr needs; calibrates nothing")
+    ] = False,
+    psnr: Annotated[float | None, typer.Option(help="wanted of --plan's image [dB]", metavar="DB")] = None,
+    patterns: Annotated[str | None, typer.Option(help="of --plan's capture", show_default="dots:7")] = None,
     seed: Seed = 0,
     define: Defines = None,
     outside: Outside = False,
@@ -277,7 +286,8 @@ def calibrate(
     factors."""
     if frames is not None:
         given = (name for name in context.params if _is_given(context, name))
-        return _calibrate_frames(frames, output, sorted({*given} - _OF_FRAMES), as_json, quiet)
+        others = sorted({*given} - _OF_FRAMES)
+        return _calibrate_frames(frames, check_no_plan(None, None, output), others, as_json, quiet)
     if scene is None:
         raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
     from mitsim.core.resources import memory_from_here, peak_memory
@@ -285,21 +295,28 @@ def calibrate(
 
     request = request_of(accuracy=accuracy, seed=seed)
     session = load_recipe(recipe)
+    if planning:
+        wanted = Wanted.of(psnr, patterns, output, resume)
+        with job_of(quiet or as_json, max_seconds, max_memory) as job:
+            with job.clock.stage("open scene"):
+                bench = bench_of(scene, variant, camera, projector, define, outside)
+            return wanted.planned(bench, session, request, job, as_json)
+    folder = check_no_plan(psnr, patterns, output)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
         held = memory_from_here()
-        factors = bench.calibrate(**request, recipe=session, output=output, resume=resume, job=job)
+        factors = bench.calibrate(**request, recipe=session, output=folder, resume=resume, job=job)
     taken = max(peak_memory() - held, 0.0)
-    payload = {**factors.manifest.result, "memory_bytes": taken, "output": str(output)}
+    payload = {**factors.manifest.result, "memory_bytes": taken, "output": str(folder)}
     # JSON has no numbers beyond the finite ones.
     residual, clean, error, condition = (
         math.inf if payload[name] is None else payload[name]
         for name in ("separability_residual", "noise_free_residual", "phi_error", "condition")
     )
     lines = [
-        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
+        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {folder}",
         f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
         f"{condition:.2e}",
         f"memory {taken / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",

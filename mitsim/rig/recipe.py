@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Literal
 
@@ -32,3 +33,13 @@ class SessionRecipe(BaseModel):
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:
     """The recipe in the TOML file at ``path``, or the shipped one; MitsimError names the field that breaks a rule."""
     return load_model(Path(path) if path is not None else shipped("calibration", "session.toml"), SessionRecipe)
+
+
+def recipe_text(recipe: SessionRecipe) -> str:
+    """The ``recipe`` as TOML that :func:`load_recipe` reads."""
+    fields = recipe.model_dump(mode="json", exclude_defaults=True)
+    tables = {name: value for name, value in fields.items() if isinstance(value, dict)}
+    lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items() if name not in tables]
+    for name, table in tables.items():
+        lines += ["", f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,85 @@
+"""What `mitsim calibrate --plan` promises against what sessions by its recipe come to.
+
+    python benchmarks/plan_promise.py [-o promise.json] [--scenes NAME[:PATTERNS] ...] [--psnr DB ...] [--seeds N]
+
+For each scene and wanted PSNR: the plan (seed 0), then N captures and sessions by the planned recipe, each with seeds
+of its own (light, noise of the capture, noise of every frame of the session), calibrated and reconstructed. Prints a
+row of Markdown for each: predicted PSNR, the mean of the N images with its standard error, and their difference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mitsim as ms
+from mitsim.capture.calibrate import estimate
+from mitsim.capture.run import digital_scale
+from mitsim.capture.session import Session
+from mitsim.core.job import Job
+from mitsim.core.manifests import CalibrationManifest
+from mitsim.reconstruct.factors import Factors
+
+HEAD = (
+    "| scene, patterns | asked | fraction, repeats | predicted [dB] | mean of {seeds} sessions | minus predicted |\n"
+    "|---|---|---|---|---|---|"
+)
+
+
+def session_psnr(bench: Any, patterns: str, recipe: Any, seed: int) -> float:
+    """PSNR [dB] of a capture and a session of this ``seed``, as `mitsim capture`, `calibrate` and `reconstruct` make
+    them; responses without noise, which `calibrate` forms for its report alone, are left out."""
+    shots = bench.capture(patterns, seed=seed)
+    session = Session(bench, recipe, seed)
+    lit = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
+    found, _ = estimate(lit, Job())
+    manifest = CalibrationManifest(
+        camera=bench.identity(),
+        centre=session.centre,
+        board_reflectance=recipe.board_reflectance,
+        digital=digital_scale(bench, lit.exposure_s),
+    )
+    return ms.psnr(ms.reconstruct(shots, Factors.of(found, manifest)).image, shots.truth)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--scenes", nargs="+", default=["photograph", "colour_chart", "resolution_target:dots:5"])
+    parser.add_argument("--psnr", nargs="+", type=float, default=[30.0, 40.0])
+    parser.add_argument("--seeds", type=int, default=4)
+    asked = parser.parse_args()
+    print(HEAD.format(seeds=asked.seeds), flush=True)
+    rows = []
+    for name in asked.scenes:
+        scene, _, patterns = name.partition(":")
+        patterns = patterns or "dots:7"
+        bench = ms.open_bench(scene)
+        for wanted in asked.psnr:
+            plan = ms.plan_calibration(bench, wanted, patterns)
+            seeds = range(101, 101 + asked.seeds)
+            found = [session_psnr(bench, patterns, plan.recipe, seed) for seed in seeds] if plan.reached else []
+            rows.append({**plan.payload(), "scene": scene, "found": found, "seeds": list(seeds)})
+            if asked.output:
+                asked.output.write_text(json.dumps(rows, indent=1, default=str), encoding="utf-8")
+            print(_row(scene, plan, found), flush=True)
+
+
+def _row(scene: str, plan: ms.CalibrationPlan, found: list[float]) -> str:
+    """A row of the table."""
+    if not found:
+        return f"| {scene}, {plan.patterns} | {plan.psnr_asked:g} | - | ceiling {plan.ceiling.psnr_db:.1f} | - | - |"
+    mean, error = np.mean(found), np.std(found, ddof=1) / np.sqrt(len(found)) if len(found) > 1 else np.nan
+    recipe = plan.recipe
+    return (
+        f"| {scene}, {plan.patterns} | {plan.psnr_asked:g} | {recipe.exposure_fraction:g}, {recipe.repeats} | "
+        f"{plan.trial.psnr_db:.2f} | {mean:.2f} +- {error:.2f} | {mean - plan.trial.psnr_db:+.2f} |"
+    )
+
+
+if __name__ == "__main__":
+    main()
