@@ -159,8 +159,8 @@ def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str
         )
     if sensor.prnu_pixel:
         yield (
-            f"response nonuniformity: pixels differ by {sensor.response_parts[0]:.2%} of their light, which is no product of "
-            "a row's and a column's; factors hold none of it, and an image takes it for light"
+            f"response nonuniformity: pixels differ by {sensor.response_parts[0]:.2%} of their light, which is no "
+            "product of a row's and a column's; factors hold none of it, and an image takes it for light"
         )
     if sensor.row_noise_e:
         yield (

@@ -77,7 +77,15 @@ class Wanted:
 
 
 def check_no_plan(psnr: float | None, patterns: str | None, output: Path | None) -> Path:
-    """The ``output`` of a calibration; MitsimError without one, and for ``psnr`` or ``patterns``, options of --plan."""
+    """The output of a calibration that is no plan.
+
+    Parameters
+    ----------
+    psnr, patterns
+        options of --plan; MitsimError where one is given.
+    output
+        the folder; MitsimError without one.
+    """
     for name, value in (("--psnr", psnr), ("--patterns", patterns)):
         if value is not None:
             raise MitsimError(f"{name} {value}: is for --plan; a calibration serves all patterns, so leave it out")

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 PLANES = ((0, 0), (0, 1), (1, 0), (1, 1))
 """First row and column of each plane of 2 x 2 filters, row by row."""
 _TOLERANCE = 1e-7
-"""Residual of the normal equations, relative to their right side, at which an image has moved its last visible digit."""
+"""Residual of the normal equations, relative to their right side, at which an image's last visible digit is still."""
 _MOST_STEPS = 1000
 """Of conjugate gradients; some hundred are taken at the best lambda."""
 
@@ -100,7 +100,9 @@ class JointMosaic:
                     f"{lines} factors of an even number of sensor pixels, a column for each scene pixel"
                 )
         if self.weights.shape != (len(PLANES), lines):
-            raise MitsimError(f"mosaic: weights are {self.weights.shape}; give one for each of 4 planes and {lines} lines")
+            raise MitsimError(
+                f"mosaic: weights are {self.weights.shape}; give one for each of 4 planes and {lines} lines"
+            )
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -121,7 +123,9 @@ class JointMosaic:
 
         def adjoint(frames: FloatArray) -> FloatArray:
             each = frames.reshape(size)
-            return sum((self.gathered(each[index], *index) for index in np.ndindex(size[:2])), np.zeros(self.shape)).ravel()
+            return sum(
+                (self.gathered(each[index], *index) for index in np.ndindex(size[:2])), np.zeros(self.shape)
+            ).ravel()
 
         count = int(np.prod(size)), int(np.prod(self.shape))
         return LinearOperator(count, matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64))

@@ -69,5 +69,5 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         with pytest.raises(MitsimError, match=words):
             JointMosaic(**{**parts, name: wrong})
-    with pytest.raises(MitsimError, match="lambda is 0.0; give a finite number above 0"):
+    with pytest.raises(MitsimError, match=r"lambda is 0\.0; give a finite number above 0"):
         good.solve(np.zeros(good.shape), 0.0)
