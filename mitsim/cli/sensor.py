@@ -36,8 +36,8 @@ def characterise(
     from mitsim.rig.sensor import load_sensor
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
-    from mitsim.study.characterise import Procedure
     from mitsim.study.characterise import characterise as run_characterise
+    from mitsim.study.procedure import Procedure
 
     with job_of(quiet or as_json) as job:
         done = run_characterise(sensor, Procedure(pixels, steps, frames, seed, wavelength), output, job)

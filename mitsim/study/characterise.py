@@ -9,46 +9,25 @@ thousand sessions of such statistics are evaluated as that of the frames is (GUM
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.jsonfile import write_json
 from mitsim.core.output import whole_file
-from mitsim.core.parallel import in_threads
-from mitsim.core.seeds import stream
 from mitsim.core.versions import versions
-from mitsim.rig.sensor import EXPOSURE_S, SensorModel
-from mitsim.sensor.chain import expose
-from mitsim.sensor.emva import SPLIT, Pair, Session, Stack, figures, pair_of, pairs_of, stack_of
-from mitsim.sensor.moments import frame_moments
-from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
-from mitsim.study.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
+from mitsim.rig.sensor import SensorModel
+from mitsim.sensor.emva import SPLIT, Session, figures
+from mitsim.sensor.specimen import mean_dark_current
+from mitsim.study.characterise_plots import MOST_OFF, figures_of
+from mitsim.study.procedure import Frames, Procedure, capacity_of, drawn, efficiency_of
 from mitsim.study.runner import DPI, study_folder
 
-MOST_OFF = 5.0
-"""Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
-_TO = 1.15
-"""Light of the brightest step over what saturates: 7 steps of 50 are saturated, so the largest variance is inside."""
-_DARK_STEPS = 6
-"""Exposures of the dark series: the least that EMVA 1288 4.0 takes."""
-_DARK_FILL, _DARK_ELECTRONS = 0.4, 2000.0
-"""Dark electrons at the longest of them: a part of saturation, or as many as tell the current to a permille."""
-_LONGEST_S = 10.0
-"""Of a camera without dark current [s]."""
-_FILLED_BY_DARK = 0.01
-"""Part of saturation that dark current may fill at the ladder's exposure."""
-_SESSIONS = 1000
-"""Drawn statistics of sessions: they tell a standard error to 2 %."""
-_PIXELS, _STEPS, _FRAMES = (32, 4096), (20, 1000), (2, 10_000)
-"""Least and most. Below 32 rows a row's part is known to a quarter; 50 steps and 16 frames are EMVA's own least."""
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
     "quantum_efficiency": ("eta", "e-/photon"),
@@ -70,37 +49,6 @@ _DITHERED = 0.5
 """Dark noise [DN] from which rounding adds its 1/12 DN^2, to 1 %: below, it hides part of the noise."""
 _BY_METHOD = ("saturation_capacity", "linearity_min", "linearity_max")
 """Figures that depend on the steps of light and on their noise, and have no value that a camera file sets."""
-
-
-@dataclass(frozen=True)
-class Procedure:
-    """How a camera is characterised.
-
-    Attributes
-    ----------
-    pixels
-        rows and columns of the frames, of binned pixels.
-    steps
-        of the light.
-    frames
-        of each stack.
-    seed
-        root of every draw; the camera's fixed pattern has its own.
-    wavelength_nm
-        of the light, where the camera has a curve of quantum efficiency.
-    """
-
-    pixels: int = 256
-    steps: int = 50
-    frames: int = 100
-    seed: int = 0
-    wavelength_nm: float = 550.0
-
-    def __post_init__(self) -> None:
-        for name, (least, most) in (("pixels", _PIXELS), ("steps", _STEPS), ("frames", _FRAMES)):
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ArgumentError(name, f"{value}: give a whole number from {least} to {most}")
 
 
 @dataclass(frozen=True)
@@ -190,12 +138,7 @@ class Characterisation:
 
     def figures(self) -> Mapping[str, Figure]:
         """Plots by file name."""
-        return {
-            "photon_transfer.png": _photon_transfer(self),
-            "linearity.png": _linearity(self),
-            "dark_current.png": _dark_current(self),
-            "deviations.png": _deviations(self),
-        }
+        return figures_of(self)
 
 
 def characterise(
@@ -220,8 +163,8 @@ def characterise(
         for a camera that light never saturates, a wavelength outside its curve, or a folder that holds something else.
     """
     procedure, job = procedure or Procedure(), job or Job()
-    capacity = _capacity(sensor)
-    _efficiency(sensor, procedure)
+    capacity = capacity_of(sensor)
+    efficiency_of(sensor, procedure)
     if output is None:
         return _characterised(sensor, procedure, capacity, job)
     with study_folder(output, "characterise", ("*.png",)) as folder:
@@ -233,278 +176,39 @@ def characterise(
     return done
 
 
-def _efficiency(sensor: SensorModel, procedure: Procedure) -> float:
-    """Electrons per photon; 1 where the camera states none, or has colour filters: light is counted in electrons."""
-    return sensor.efficiency(procedure.wavelength_nm) if sensor.states_efficiency else 1.0
-
-
-def _capacity(sensor: SensorModel) -> float:
-    """Electrons that saturate a pixel: its full well, or the ADC's end."""
-    full = sensor.superpixel_full_well_e
-    if sensor.largest_dn is not None:
-        full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
-    if not math.isfinite(full):
-        raise MitsimError(
-            f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it; "
-            "give full_well_e or bits"
-        )
-    return full
-
-
 def _characterised(
     sensor: SensorModel, procedure: Procedure, capacity: float, job: Job, output: str | None = None
 ) -> Characterisation:
-    plan = _Plan.of(sensor, procedure, capacity)
-    expected = plan.expected()
-    drawn = figures(_drawn(plan, expected))
-    session = plan.measured(job)
+    frames = Frames.of(sensor, procedure, capacity)
+    expected = frames.expected()
+    spread = figures(drawn(frames, expected))
+    session = frames.measured(job)
     found = figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     names = [name for name in UNITS if sensor.states_efficiency or name != "quantum_efficiency"]
-    rows = tuple(_row(plan, name, found[name], drawn[name]) for name in names)
-    return Characterisation(sensor, procedure, plan.exposure_s, session, expected, rows, output)
+    rows = tuple(_row(frames, name, found[name], spread[name]) for name in names)
+    return Characterisation(sensor, procedure, frames.exposure_s, session, expected, rows, output)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Which frames are taken: electrons of light of each, and exposures [s]."""
-
-    sensor: SensorModel
-    procedure: Procedure
-    electrons: FloatArray
-    half: float
-    beyond: float
-    exposure_s: float
-    dark_times: FloatArray
-
-    @classmethod
-    def of(cls, sensor: SensorModel, procedure: Procedure, capacity: float) -> _Plan:
-        steps = capacity * _TO * np.arange(1, procedure.steps + 1) / procedure.steps
-        hottest = (
-            sensor.binning**2 * sensor.dark_factor * (sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s)
-        )
-        mean = mean_dark_current(sensor)
-        longest = min(_DARK_FILL * capacity / hottest, _DARK_ELECTRONS / mean) if hottest else _LONGEST_S
-        longest = min(max(longest, EXPOSURE_S[0] * _DARK_STEPS), EXPOSURE_S[1])
-        exposure_s = min(0.01, _FILLED_BY_DARK * capacity / hottest) if hottest else 0.01
-        times = longest * np.arange(_DARK_STEPS) / (_DARK_STEPS - 1)
-        return cls(sensor, procedure, steps, capacity / 2, 2 * capacity + 20 * math.sqrt(capacity), exposure_s, times)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.procedure.pixels, self.procedure.pixels
-
-    @property
-    def photons(self) -> FloatArray:
-        return self.electrons / _efficiency(self.sensor, self.procedure)
-
-    def frame(self, electrons: float, exposure_s: float, *names: str | int) -> FloatArray:
-        shot, read = (stream(self.procedure.seed, "characterise", noise, *names) for noise in ("shot", "read"))
-        return np.asarray(expose(np.full(self.shape, electrons), exposure_s, self.sensor, shot, read), dtype=np.float64)
-
-    def pair(self, electrons: float, exposure_s: float, name: str, index: int = 0) -> Pair:
-        return pair_of(*(self.frame(electrons, exposure_s, name, index, side) for side in (0, 1)))
-
-    def measured(self, job: Job) -> Session:
-        """The frames, taken and looked at."""
-        job.progress("light", 0.0)
-        steps = in_threads(
-            lambda step: self.pair(step[1], self.exposure_s, "ladder", step[0]), [*enumerate(self.electrons)]
-        )
-        job.progress("dark", 0.4)
-        dark = in_threads(lambda step: self.pair(0.0, step[1], "dark series", step[0]), [*enumerate(self.dark_times)])
-        job.progress("stacks", 0.5)
-        stacks = in_threads(
-            lambda light: stack_of(self._frames(*light)), [(0.0, "dark stack"), (self.half, "bright stack")]
-        )
-        return Session(
-            shape=self.shape,
-            photons=self.photons,
-            ladder=pairs_of(steps),
-            dark=self.pair(0.0, self.exposure_s, "dark"),
-            overexposed=np.asarray(self.frame(self.beyond, self.exposure_s, "overexposed").mean()),
-            dark_times=self.dark_times,
-            dark_series=pairs_of(dark),
-            dark_stack=stacks[0],
-            bright_stack=stacks[1],
-            rounded=self.sensor.bits is not None,
-        )
-
-    def _frames(self, electrons: float, name: str) -> Iterator[FloatArray]:
-        for index in range(self.procedure.frames):
-            yield self.frame(electrons, self.exposure_s, name, index)
-
-    def expected(self) -> Session:
-        """The same statistics as closed forms expect them of all specimens; nonuniformity as it was set."""
-        ladder, dark = self._expected_pair(self.electrons), self._expected_pair(0.0)
-        series = [self._expected_pair(0.0, time) for time in self.dark_times]
-        return Session(
-            shape=self.shape,
-            photons=self.photons,
-            ladder=ladder,
-            dark=dark,
-            overexposed=self._expected_pair(self.beyond).mean,
-            dark_times=self.dark_times,
-            dark_series=pairs_of(series),
-            dark_stack=self._expected_stack(dark.mean, 0.0),
-            bright_stack=self._expected_stack(self._expected_pair(self.half).mean, self.half),
-            rounded=self.sensor.bits is not None,
-        )
-
-    def _expected_pair(self, electrons: FloatArray | float, exposure_s: float | None = None) -> Pair:
-        """Means over all pixels: undamaged ones, and dead ones, which see the dark."""
-        time = self.exposure_s if exposure_s is None else exposure_s
-        (lit, noise), (dark, still) = (
-            frame_moments(np.atleast_1d(light), time, self.alike) for light in (electrons, np.zeros_like(electrons))
-        )
-        dead = self.sensor.dead_pixels
-        mean, variance = (1 - dead) * lit + dead * dark, (1 - dead) * noise + dead * still
-        rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
-        pair = mean, variance, np.minimum(rows, variance)
-        return Pair(*(part if np.ndim(electrons) else part[0] for part in pair))
-
-    def _expected_stack(self, mean: FloatArray, electrons: float) -> Stack:
-        rows, columns, pixel = (self.slope(electrons) ** 2 * part for part in self.parts(electrons))
-        m, n = self.shape
-        parts = rows + columns + pixel, rows + pixel / n, columns + pixel / m
-        return Stack(mean, *(np.asarray(part) for part in parts))
-
-    @property
-    def alike(self) -> SensorModel:
-        """The sensor with pixels that are all alike, of the same mean dark current, lit evenly."""
-        names = (
-            *(f"dsnu_{part}_e" for part in SPLIT[1:]),
-            *(f"prnu_{part}" for part in SPLIT[1:]),
-            *("dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s", "dead_pixels", "crosstalk"),
-        )
-        mean = self.sensor.dark_current_e_per_s + self.sensor.hot_pixels * self.sensor.hot_dark_current_e_per_s
-        return self.sensor.model_copy(update={**dict.fromkeys(names, 0.0), "dark_current_e_per_s": mean})
-
-    def slope(self, electrons: float) -> float:
-        """Digital numbers for another electron, around that many."""
-        if not self.sensor.linearity:
-            return self.sensor.gain_dn_per_e
-        around = np.array([electrons * 0.999, electrons * 1.001 + 1])
-        mean, _ = frame_moments(around, self.exposure_s, self.alike)
-        return float(np.diff(mean)[0] / np.diff(around)[0])
-
-    def parts(self, electrons: float) -> tuple[float, float, float]:
-        """Set spatial variances by row, column and pixel [e-^2] under light of so many ``electrons``."""
-        pixel, row, column = (part**2 for part in self.sensor.offset_parts)
-        dark = dark_current_variance(self.sensor) * self.exposure_s**2
-        _, row_response, column_response = (part**2 for part in self.sensor.response_parts)
-        own = response_variance(self.sensor) - row_response - column_response
-        light = electrons**2
-        return row + row_response * light, column + column_response * light, pixel + dark + own * light
-
-
-def _drawn(plan: _Plan, expected: Session) -> Session:
-    """Statistics of :data:`_SESSIONS` sessions, each as far off the ``expected`` ones as noise and specimen make them.
-
-    A variance of n pixels whose rows share v_r of v has the variance (2 v_o^2 + k_4 / 2)/n + 4 v_o v_r/n + 2 v_r^2/M,
-    v_o = v - v_r, k_4 = K^4 mu the fourth cumulant of the counts.
-    """
-    sensor, rng = plan.sensor, stream(plan.procedure.seed, "characterise", "sessions")
-    m, n = plan.shape
-    gain, (pixel, row, column) = sensor.gain_dn_per_e, sensor.response_parts
-    response = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(row**2 / m + column**2 / n + pixel**2 / m / n)
-    leak = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(dark_current_variance(sensor) / m / n)
-
-    def pairs(pair: Pair, electrons: FloatArray, times: FloatArray | float) -> Pair:
-        mean, variance, rows = (np.atleast_1d(part)[None, :] for part in (pair.mean, pair.variance, pair.rows))
-        own = variance - rows
-        z = rng.standard_normal((3, _SESSIONS, mean.shape[1]))
-        specimen = gain * (electrons * response + np.asarray(times) * leak) * (own > 0)
-        mean = mean + specimen + z[0] * np.sqrt((own / m / n + rows / m) / 2)
-        fourth = gain**4 * electrons / 2
-        spread = (2 * own**2 + fourth + 4 * own * rows) / m / n
-        shared = np.sqrt(2.0 / m) * rows * z[2]
-        alone = np.sqrt(2.0 / m) * own / n * rng.standard_normal(z[2].shape)
-        return Pair(mean, variance + np.sqrt(spread) * z[1] + shared, rows + shared + alone)
-
-    ladder = pairs(expected.ladder, plan.electrons, plan.exposure_s)
-    dark = pairs(expected.dark, np.zeros(1), plan.exposure_s)
-    series = pairs(expected.dark_series, np.zeros(_DARK_STEPS), plan.dark_times)
-    stacks = _drawn_stacks(plan, expected, rng)
-    beyond = expected.overexposed + np.sqrt(expected.dark.variance / m / n) * rng.standard_normal(_SESSIONS)
-    return Session(
-        plan.shape,
-        plan.photons,
-        ladder,
-        Pair(*(part[:, 0] for part in (dark.mean, dark.variance, dark.rows))),
-        beyond,
-        plan.dark_times,
-        series,
-        *stacks,
-        expected.rounded,
-    )
-
-
-def _drawn_stacks(plan: _Plan, expected: Session, rng: np.random.Generator) -> tuple[Stack, Stack]:
-    """Dark and bright stacks as they may come out: sums of squares of offsets, responses and what is left of noise.
-
-    By row, column and pixel these are independent; of f degrees of freedom, squares are chi-square and products of two
-    parts normal. Offsets are the same in both stacks.
-    """
-    m, n = plan.shape
-    frames = plan.procedure.frames
-    noise = [
-        float(np.interp(light, [0, *plan.electrons], [expected.dark.variance, *expected.ladder.variance]))
-        for light in (0.0, plan.half)
-    ]
-    shared = min(float(expected.dark.rows), min(noise))
-    sizes = {"row": (m - 1, n), "column": (n - 1, m), "pixel": ((m - 1) * (n - 1), 1)}
-    squares: dict[str, list[FloatArray]] = {}
-    dark, bright = plan.parts(0.0), plan.parts(plan.half)
-    for index, (name, (freedom, averaged)) in enumerate(sizes.items()):
-        of_pixel = dark[2] / averaged if averaged > 1 else 0.0
-        offset = (dark[index] + of_pixel) * plan.slope(0.0) ** 2
-        light = bright[index] - dark[index] + ((bright[2] - dark[2]) / averaged if averaged > 1 else 0.0)
-        light *= plan.slope(plan.half) ** 2
-        left = [((each - shared) / averaged + (shared if name == "row" else 0.0)) / frames for each in noise]
-        parts = np.sqrt([offset, light, *left])
-        products = _products(freedom, len(parts), rng)
-        squares[name] = [
-            freedom * np.einsum("i,ijs,j->s", parts[used], products[np.ix_(used, used)], parts[used])
-            for used in ([0, 2], [0, 1, 3])
-        ]
-    stacks = []
-    for side, (stack, each) in enumerate(zip((expected.dark_stack, expected.bright_stack), noise, strict=True)):
-        row, column, pixel = (squares[name][side] for name in ("row", "column", "pixel"))
-        total = (row * n + column * m + pixel) / (m * n - 1)
-        mean = np.full(_SESSIONS, float(stack.mean))
-        taken = each / frames
-        stacks.append(Stack(mean, total - taken, row / m - taken / n, column / n - taken / m))
-    return stacks[0], stacks[1]
-
-
-def _products(freedom: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """(count, count, sessions) mean products of as many independent normal samples of some degrees of ``freedom``."""
-    products = rng.standard_normal((count, count, _SESSIONS)) / math.sqrt(freedom)
-    products = (products + products.transpose(1, 0, 2)) / math.sqrt(2)
-    products[np.arange(count), np.arange(count)] = rng.chisquare(freedom, (count, _SESSIONS)) / freedom
-    return np.asarray(products)
-
-
-def _set(plan: _Plan, name: str) -> float:
+def _set(frames: Frames, name: str) -> float:
     """What the camera's file sets of a figure ``name``; squares of those that are found as variances."""
-    sensor, time = plan.sensor, plan.exposure_s
+    sensor, time = frames.sensor, frames.exposure_s
     kind, _, part = name.partition("_")
     if kind in ("dsnu", "prnu"):
-        row, column, pixel = plan.parts(0.0)
+        row, column, pixel = frames.parts(0.0)
         if kind == "prnu":
-            lit = plan.parts(plan.half)
-            alive = plan.half * (1 - sensor.dead_pixels)
+            lit = frames.parts(frames.half)
+            alive = frames.half * (1 - sensor.dead_pixels)
             row, column, pixel = ((on - off) / alive**2 for on, off in zip(lit, (row, column, pixel), strict=True))
         return {"total": row + column + pixel, "row": row, "column": column, "pixel": pixel}[part]
     dark = mean_dark_current(sensor)
     return {
         "system_gain": sensor.gain_dn_per_e,
-        "quantum_efficiency": _efficiency(sensor, plan.procedure) * (1 - sensor.dead_pixels),
+        "quantum_efficiency": efficiency_of(sensor, frames.procedure) * (1 - sensor.dead_pixels),
         "dark_noise": math.sqrt(sensor.superpixel_reading_noise_e**2 + dark * time),
         "row_noise": sensor.superpixel_row_noise_e**2,
-        "saturation_capacity": _capacity(sensor),
-        "full_well": _capacity(sensor) - dark * time,
+        "saturation_capacity": capacity_of(sensor),
+        "full_well": capacity_of(sensor) - dark * time,
         "linearity_min": 0.0,
         "linearity_max": 0.0,
         "dark_current": dark,
@@ -512,17 +216,17 @@ def _set(plan: _Plan, name: str) -> float:
     }[name]
 
 
-def _row(plan: _Plan, name: str, found: FloatArray, drawn: FloatArray) -> Row:
-    """A figure ``name`` as it is shown, of what was ``found`` and what sessions ``drawn`` (count,) say of its error."""
-    sensor = plan.sensor
-    value, spread, centre = float(found), float(drawn.std()), float(drawn.mean())
-    given = _set(plan, name)
+def _row(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> Row:
+    """A figure ``name`` as it is shown, of what was ``found`` and what drawn ``sessions`` (count,) say of its error."""
+    sensor = frames.sensor
+    value, spread, centre = float(found), float(sessions.std()), float(sessions.mean())
+    given = _set(frames, name)
     # What the linear method makes of a camera that is not linear, and of rows that share noise, is not what is set.
     method = name in _BY_METHOD or bool(sensor.linearity)
     method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
     method |= name == "dark_noise" and sensor.bits is not None and given * sensor.gain_dn_per_e < _DITHERED
     if name == "saturation_capacity":
-        spread = math.hypot(spread, float(plan.electrons[0]) / math.sqrt(12))
+        spread = math.hypot(spread, float(frames.electrons[0]) / math.sqrt(12))
     against = centre if method else given
     off = (value - against) / spread if spread else 0.0 if value == against else math.inf
     symbol, unit = UNITS[name]
@@ -533,75 +237,3 @@ def _row(plan: _Plan, name: str, found: FloatArray, drawn: FloatArray) -> Row:
         given, value, centre = (math.copysign(math.sqrt(abs(square)), square) for square in (given, value, centre))
     expected = scale * centre if method else None
     return Row(name, symbol, unit, scale * given, expected, scale * value, scale * spread, off)
-
-
-# ---- plots
-
-
-def _photon_transfer(done: Characterisation) -> Figure:
-    """Variance over signal, as found and as closed forms have it, and the line whose slope is the gain."""
-    figure, axes = figure_of(0.5 * WIDTH)
-    session, expected = done.session, done.expected
-    signal = session.ladder.mean - session.dark.mean
-    axes.plot(
-        expected.ladder.mean - expected.dark.mean, expected.ladder.variance, color=GREY, lw=1.5, label="closed form"
-    )
-    axes.plot(signal, session.ladder.variance, "o", color=BLUE, ms=5, label="pairs of frames")
-    (gain,) = (row.found for row in done.rows if row.name == "system_gain")
-    full = float(signal[int(session.ladder.variance.argmax())])
-    line = np.array([0.0, 0.7 * full])
-    label = f"fit to 70 % of saturation: K = {gain:.5g} DN/e-"
-    axes.plot(line, session.dark.variance + gain * line, color=VERMILION, lw=2, ls="--", label=label)
-    axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="largest variance: saturation")
-    label_axes(axes, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left")
-    return figure
-
-
-def _linearity(done: Characterisation) -> Figure:
-    """Relative deviation of the signal from a line, over the photons."""
-    figure, axes = figure_of(0.42 * WIDTH)
-    for session, style, label in (
-        (done.expected, {"color": GREY, "lw": 1.5}, "closed form"),
-        (done.session, {"color": BLUE, "lw": 0, "marker": "o", "ms": 5}, "pairs of frames"),
-    ):
-        signal = session.ladder.mean - session.dark.mean
-        full = signal[int(session.ladder.variance.argmax())]
-        used = (signal >= 0.05 * full) & (signal <= 0.95 * full)
-        slope, start = np.polyfit(session.photons[used], signal[used], 1, w=1 / signal[used])
-        line = start + slope * session.photons[used]
-        axes.plot(session.photons[used], 100 * (signal[used] / line - 1), label=label, **style)
-    axes.axhline(0, color=BLACK, lw=1)
-    light = "photons on a pixel" if done.sensor.states_efficiency else "photoelectrons of a pixel"
-    label_axes(axes, light, "deviation from a line [%]")
-    axes.legend(fontsize=FONT - 1, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
-    return figure
-
-
-def _dark_current(done: Characterisation) -> Figure:
-    """Dark signal over exposure time."""
-    figure, axes = figure_of(0.42 * WIDTH)
-    gain = next(row.found for row in done.rows if row.name == "system_gain")
-    for session, style, label in (
-        (done.expected, {"color": GREY, "lw": 1.5}, "closed form"),
-        (done.session, {"color": BLUE, "lw": 0, "marker": "o", "ms": 5}, "pairs of frames"),
-    ):
-        dark = (session.dark_series.mean - done.sensor.superpixel_black_level_dn) / gain
-        axes.plot(session.dark_times, dark, label=label, **style)
-    label_axes(axes, "exposure time [s]", "dark signal less black level [e$^-$]")
-    axes.legend(fontsize=FONT - 1, frameon=False)
-    return figure
-
-
-def _deviations(done: Characterisation) -> Figure:
-    """By how many standard errors each figure is off."""
-    figure, axes = figure_of(0.6 + 0.26 * len(done.rows))
-    place = np.arange(len(done.rows))[::-1]
-    off = np.clip([row.deviations for row in done.rows], -2 * MOST_OFF, 2 * MOST_OFF)
-    axes.axvspan(-MOST_OFF, MOST_OFF, color="#eef2f7", zorder=0)
-    axes.axvline(0, color=BLACK, lw=1)
-    axes.plot(off, place, "o", color=BLUE, ms=7)
-    axes.set_yticks(place, [row.name for row in done.rows], fontsize=FONT - 1)
-    axes.set_xlim(-1.2 * max(MOST_OFF, float(np.abs(off).max())), 1.2 * max(MOST_OFF, float(np.abs(off).max())))
-    label_axes(axes, "found less set [predicted standard errors]; shaded: within 5", "", grid="x")
-    return figure

@@ -10,7 +10,8 @@ import pytest
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.rig.sensor import SensorModel, load_sensor
-from mitsim.study.characterise import Procedure, characterise
+from mitsim.study.characterise import characterise
+from mitsim.study.procedure import Procedure
 from tests.invented import sensor
 
 SMALL = Procedure(pixels=64, steps=25, frames=16)
@@ -80,7 +81,7 @@ def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> 
 
 
 def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mitsim.study import characterise as module
+    from mitsim.study import procedure as module
 
     frames = module.expose
     monkeypatch.setattr(module, "expose", lambda light, *rest: np.rint(60 + 1.2 * (frames(light, *rest) - 60.0)))
