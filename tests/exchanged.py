@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -96,3 +98,13 @@ def made(folder: Path, signed: bool = False, ambient: bool = False, real_output:
 def bytes_of(folder: Path) -> dict[str, bytes]:
     """All files of a folder."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def frame_of(path: Path, pattern: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the function of this name in docs/exchange.md makes of a file of `mitsim transport` and a ``pattern``."""
+    page = (Path(__file__).parents[1] / "docs" / "exchange.md").read_text(encoding="utf-8")
+    (lines,) = (block for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "def frame_of" in block)
+    names: dict[str, Any] = {}
+    exec(lines.split("\nwith h5py")[0], names)
+    frame, error = names["frame_of"](path, pattern)
+    return frame, error

@@ -24,6 +24,7 @@ import pytest
 
 import mitsim
 from mitsim.core.configuration import shipped
+from tests.conftest import write_small_scene
 from tests.exchanged import made
 from tests.robustness import Recorder, Row, page_of
 
@@ -178,11 +179,13 @@ def measured_responses() -> dict[str, object]:
 
 
 def exchanged_file() -> dict[str, object]:
-    """The file that docs/exchange.md reads."""
+    """The files that docs/exchange.md reads."""
+    from mitsim.capture.bench import open_bench
     from mitsim.exchange.export import export_run
 
     bench = made(Path())
     export_run(bench.run, "hdf5", "all.h5", bench.calibration)
+    open_bench(write_small_scene(Path("scenes"))).light("dots:4", accuracy=0.1).save("light.h5")
     return {}
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
-from mitsim.capture.filing import FiledLight
+from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
 from mitsim.capture.simulation import Simulation, Stage
@@ -177,6 +177,13 @@ class Light:
         )
 
     @property
+    def unreached(self) -> tuple[str, ...]:
+        """That sampling stopped before the accuracy was reached, if it did."""
+        if self.reached:
+            return ()
+        return (f"sampling stopped at {self.sampling_error:.1e}; the accuracy {self.plan.accuracy:g} was not reached",)
+
+    @property
     def bench(self) -> Bench:
         """Where it shines."""
         return self.simulation.bench
@@ -237,6 +244,35 @@ class Light:
 
         own = replace(self.plan, request=request_of(self.plan, {}).changed(patterns=patterns))
         return capture(self.bench, request_of(own, request), job, output, light=self)
+
+    def save(self, path: Path | str) -> Path:
+        """Write the light to the HDF5 file ``path``, which is replaced; returns it. Frames are formed of it without
+        mitsim, as docs/exchange.md shows.
+
+        MitsimError for light that was traced by class, or where the file cannot be written.
+        """
+        from mitsim.capture.lightfile import write_light
+
+        write_light(Path(path), self)
+        return Path(path)
+
+    def summary(self) -> dict[str, Any]:
+        """What the command line reports, but for the file's name."""
+        from mitsim.capture.lightfile import error_bound
+
+        return {
+            "n": self.bench.n,
+            "shape": [self.bench.geometry.pixels] * 2,
+            "entries": sum(getattr(group, tray).nnz for group in self.groups for tray in TRAYS),
+            "accuracy": self.plan.accuracy,
+            "mc_error": self.sampling_error,
+            "total_error_bound": error_bound(self),
+            "lost_light": self.lost,
+            "paths": self.paths,
+            "seed": self.seed,
+            "variant": self.bench.variant,
+            "warnings": [*self.warnings, *self.unreached],
+        }
 
     def behind(self, bench: Bench) -> Light:
         """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up

@@ -257,7 +257,7 @@ def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
     foretold = set(light.plan.warnings) - set(known_losses(light.bench.loaded, request.effects))
     if not light.reached:
-        yield f"sampling stopped at {light.sampling_error:.1e}; the accuracy {accuracy:g} was not reached"
+        yield from light.unreached
     elif total.bound > accuracy and not foretold and request.noise_fraction is None:
         reason = _foreign(light, totals, request)
         yield (

@@ -1,4 +1,5 @@
-"""Verbs that exchange runs with other programs and real cameras: words of a command line in, files or folders out."""
+"""Verbs that exchange runs and light with other programs and real cameras: words of a command line in, files or
+folders out."""
 
 from __future__ import annotations
 
@@ -7,7 +8,27 @@ from typing import Annotated, Any
 
 import typer
 
-from mitsim.cli.options import Json, Projector, Quiet, Seed, Variant
+from mitsim.cli.options import (
+    DAY,
+    AccuracyOrSeconds,
+    Camera,
+    Defines,
+    Effects,
+    Json,
+    MaxMemory,
+    MaxSeconds,
+    Outside,
+    Patterns,
+    Projector,
+    Quiet,
+    Scene,
+    Seconds,
+    Seed,
+    Variant,
+    bench_of,
+    job_of,
+    request_of,
+)
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -116,4 +137,47 @@ def import_(
         lines.append("The file holds a calibration too; give --calibration-output to have it")
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
+    return finish(as_json, payload, lines, payload["warnings"])
+
+
+@app.command()
+def transport(
+    scene: Scene,
+    output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
+    patterns: Patterns = "dots:7",
+    accuracy: AccuracyOrSeconds = None,
+    seconds: Seconds = None,
+    camera: Camera = None,
+    projector: Projector = None,
+    effects: Effects = "",
+    seed: Seed = 0,
+    define: Defines = None,
+    outside: Outside = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+    variant: Variant = DEFAULT_VARIANT,
+    max_seconds: MaxSeconds = DAY,
+    max_memory: MaxMemory = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
+    from mitsim.core.output import prepare_output
+
+    request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
+    prepare_output(output, overwrite, "file")
+    with job_of(quiet or as_json, max_seconds, max_memory) as job:
+        with job.clock.stage("open scene"):
+            bench = bench_of(scene, variant, camera, projector, define, outside)
+        light = bench.light(request.pop("patterns"), job, **request)
+        with job.clock.stage("write"):
+            light.save(output)
+    size = output.stat().st_size
+    payload = {**light.summary(), "bytes": size, "seconds": job.clock.seconds(), "output": str(output)}
+    shape, taken = payload["shape"], payload["seconds"]
+    lines = [
+        f"Light of {payload['n']}x{payload['n']} projector pixels to {shape[0]}x{shape[1]} of the sensor in "
+        f"{taken['total']:.1f} s, {payload['entries']} numbers, {size / 2**20:.3g} MiB: {output}",
+        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {patterns}, total error up to "
+        f"{payload['total_error_bound']:.1e}",
+    ]
     return finish(as_json, payload, lines, payload["warnings"])

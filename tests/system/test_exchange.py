@@ -1,4 +1,5 @@
-"""export and import on the command line: keys, sentences, statuses; the image of a run that went out and came back."""
+"""export, import and transport on the command line: keys, sentences, statuses; the image of a run that went out and
+came back, and its frames formed of a file of its light."""
 
 from __future__ import annotations
 
@@ -6,10 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
+import mitsim as ms
 from mitsim.core.framefile import read_frame
+from tests.exchanged import frame_of
 from tests.system.refusals import mentions
 
 EXPORTED = {"format", "frames", "calibration", "notes", "output"}
@@ -63,3 +67,36 @@ def test_refusals(refused: Callable[..., str], lab: Any) -> None:
     mentions(refused(*frames, "-o", "new", *given, "--exposure", 1, "--shape", "3"), "--shape '3'")
     mentions(refused("import", "none.h5", "-o", "new"), "none.h5", "cannot be read")
     mentions(refused("import", "none.h5", "-o", "new", "--exposure", 1), "leave the options of frames out")
+
+
+def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """By the lines of docs/exchange.md: of the same seed to single precision, as capture traces the same paths; of
+    another seed within the error that both files state. 16 frames, each lit by its own 16 of 256 projector pixels,
+    whose 8 groups tell 1792 degrees of freedom: the ratio of variances deviates by sqrt(4 / 1792), 5 %. (Planted: the
+    error of one group, other electrons a joule.)"""
+    shots = ms.load_run(lab.run)
+    for seed in (0, 1):
+        options = "--patterns", "dots:4", "-o", tmp_path / f"{seed}.h5", "--seed", seed, "--json"
+        done = call("transport", *lab.rig, *options)
+        assert done.code == 0, done.err
+        payload = done.payload
+        assert payload.keys() == {
+            *("n", "shape", "entries", "accuracy", "mc_error", "total_error_bound", "lost_light", "paths", "seed"),
+            *("variant", "bytes", "seconds", "warnings", "output"),
+        }
+        assert payload["shape"] == [64, 64] and payload["mc_error"] < payload["total_error_bound"] <= 0.005
+    with h5py.File(tmp_path / "0.h5") as file:
+        unit = file.attrs["electrons_per_j_m2"]
+        assert file.attrs["mc_error"] == pytest.approx(payload["mc_error"], rel=0.5)
+    square = error = energy = apart = 0.0
+    for shot in shots.manifest.patterns.captures:
+        left, right = shots.patterns
+        pattern = np.outer(left[:, shot.row], right[:, shot.column])
+        (frame, own), (other, others) = (frame_of(tmp_path / f"{seed}.h5", pattern) for seed in (0, 1))
+        expected = shots.read(shot.file)[0]["electrons"] / shots.manifest.digital.exposure_s
+        energy += float(np.square(expected).sum())
+        apart += float(np.square(frame * unit - expected).sum())
+        square += float(np.square(frame - other).sum())
+        error += float((own**2 + others**2).sum())
+    assert np.sqrt(apart / energy) < 1e-6
+    assert square / error == pytest.approx(1, abs=0.25), "five standard deviations"
