@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -145,6 +145,75 @@ class Bench:
 
         known = None if isinstance(plan, str) else plan
         return capture(self, request_of(plan, request), job, output, resume, known)
+
+    def capture_lines(
+        self,
+        patterns: str = "dots:7",
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+        **request: Any,
+    ) -> dict[str, Capture]:
+        """Sequential colour: a capture of each spectral line of the projector, by its name, as ``638nm``.
+
+        All lines are traced on the same paths; each capture is what a projector of this line alone would give, and has
+        the accuracy. Needs a spectral variant.
+
+        Parameters
+        ----------
+        patterns
+            name of the family.
+        output
+            folder that holds a run's folder for each line, and colour.json; None keeps them in memory.
+        resume, job
+            as for :meth:`capture`.
+        **request
+            other fields of :class:`mitsim.capture.request.Request`, but for ``seconds``.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture`; for another variant, a projector of more than four lines, and scenes with lamps.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.capture.colour import capture_lines
+            from mitsim.capture.request import Request
+
+        return capture_lines(self, Request.of(patterns=patterns, **request), job, output, resume)
+
+    def calibrate_lines(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> dict[str, Factors]:
+        """Sequential colour: the camera's factors at each spectral line of the projector, by its name.
+
+        Parameters
+        ----------
+        seed, accuracy, recipe, resume, job
+            as for :meth:`calibrate`.
+        output
+            folder that holds a calibration's folder for each line, and colour.json; None keeps them in memory.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate`, for a variant that is not spectral, and a projector of more than four lines.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.capture.colour import calibrate_lines
+
+        return calibrate_lines(self, seed, accuracy, recipe, output, resume, job)
 
     def calibrate(
         self,
@@ -350,6 +419,7 @@ class Bench:
             "scene_files": {str(path): checksum(path) for path in self.loaded.files[1:]},
             "defines": self.defines,
             "variant": self.variant,
+            **({} if self.lines is None else {"lines": asdict(self.lines)}),
             "projector_model": {
                 **self.projector.model_dump(mode="json", exclude={"contrast_ratio"}),
                 "black_level": self.projector.black_level,

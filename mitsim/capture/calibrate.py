@@ -62,14 +62,31 @@ def calibrate(
     MitsimError
         as there.
     """
-    recipe, job = recipe or load_recipe(), job or Job()
+    return calibrate_session(Session(bench, recipe or load_recipe(), seed), accuracy, output, resume, job or Job())
+
+
+def calibrate_session(session: Session, accuracy: float, output: Path | str | None, resume: bool, job: Job) -> Factors:
+    """Run a ``session`` and estimate the camera's factors.
+
+    Parameters
+    ----------
+    session
+        which bench, recipe and seed.
+    accuracy, output, resume, job
+        as for :func:`calibrate`.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    bench, recipe = session.bench, session.recipe
     Exposure(None, recipe.exposure_fraction).check(bench.rig)
-    session = Session(bench, recipe, seed)
     configuration = {
         **bench.provenance(),
         **bench.identity(),
         "accuracy": accuracy,
-        "seed": seed,
+        "seed": session.seed,
         "recipe": recipe.model_dump(exclude_defaults=True),
         "versions": {name: version for name, version in versions().items() if name in DECIDING},
     }

@@ -25,11 +25,11 @@ from mitsim.capture.shooting import Shooting, Totals
 from mitsim.core.errors import ArgumentError
 from mitsim.core.framefile import Channel
 from mitsim.core.job import Job
+from mitsim.core.manifests import MANIFEST, Patterns, RunHead, RunManifest
 from mitsim.core.manifests import Digital as DigitalScale
-from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.output import FRAMES
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.recorders import AMBIENT, Recorder, RunMemory, claimed, frame_name
+from mitsim.core.recorders import AMBIENT, Recorder, RunMemory, check_same, claimed, frame_name
 from mitsim.core.runs import Capture
 from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import ExpectedFrames
@@ -164,7 +164,7 @@ def capture(
         cost = frames_cost(bench, plan.settings, lighting, seconds, on_disk)
         cost.check(request.patterns, job.limits, place)
         with job.clock.stage("transport"):
-            light = light or trace_light(bench, plan, lighting, request.seed, _sampling(bench, request), job.progress)
+            light = light or trace_light(bench, plan, lighting, request.seed, sampling_of(bench, request), job.progress)
         with job.clock.stage("truth"):
             truth = light.apparent
         with job.clock.stage("optics"):
@@ -214,6 +214,24 @@ def capture(
         return Capture.recorded(recorder, manifest)
 
 
+def check_run(bench: Bench, request: Request, output: Path | None, resume: bool) -> None:
+    """Refuse, before any work, to go on with a run of another configuration; the rest is for :func:`capture`.
+
+    Parameters
+    ----------
+    bench, request, output, resume
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        for another configuration, and an exposure that the camera cannot have.
+    """
+    request.timing.check(bench.rig)
+    if output is not None and resume and (output / MANIFEST).is_file():
+        check_same(output, RunHead.of(_configuration(bench, request)))
+
+
 def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
     """All that decides the frames."""
     deciding = {name: version for name, version in versions().items() if name in DECIDING}
@@ -229,7 +247,8 @@ def _recorder(output: Path | None, head: RunHead, resume: bool) -> Iterator[Reco
         yield folder
 
 
-def _sampling(bench: Bench, request: Request) -> Sampling:
+def sampling_of(bench: Bench, request: Request) -> Sampling:
+    """How light of a ``bench`` is sampled for one family's frames by a ``request``."""
     fraction = request.noise_fraction
     return Sampling(by_pixel=False, target=NoiseTarget(bench.rig, request.timing, fraction) if fraction else None)
 

@@ -7,7 +7,7 @@ noise. When n is no Hadamard order the next one is used and its first n rows: ro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -18,7 +18,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.board import missed_pixels
 from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import Exposer, camera_warnings, in_chunks
-from mitsim.capture.light import Light, Sampling, trace_light
+from mitsim.capture.light import Light, Sampling, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Exposure
@@ -141,9 +141,23 @@ class Session:
 
     def trace(self, plan: Plan, job: Job) -> Light:
         """The board's light, by projector pixel, sampled as the ``plan`` says; ``job`` is told how far it is."""
+        (light,) = self.trace_lines((self.board,), plan, job)
+        return light
+
+    def trace_lines(self, boards: Sequence[Bench], plan: Plan, job: Job) -> list[Light]:
+        """The same of every line of the board's light.
+
+        Parameters
+        ----------
+        boards
+            this session's with each line alone; the board itself where light is not told apart.
+        plan, job
+            as for :meth:`trace`.
+        """
         with job.clock.stage("transport"):
-            sampling = Sampling(purpose="calibration")
-            return trace_light(self.board, plan, _lines(self.bench.n), self.seed, sampling, job.progress).merged()
+            sampling, lighting = Sampling(purpose="calibration"), _lines(self.bench.n)
+            lights = trace_lines(self.board, boards, plan, lighting, self.seed, sampling, job.progress)
+        return [light.merged() for light in lights]
 
     def lit(self, light: Light, job: Job) -> LitSession:
         """The session in the ``light`` that :meth:`trace` gave; ``job`` takes the time of choosing the exposure."""

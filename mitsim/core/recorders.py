@@ -220,13 +220,16 @@ def claimed(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
     known: Mapping[str, str] = {}
     again = resume and (path / MANIFEST).is_file()
     if again:
-        known = _checked(path, head)
+        known = check_same(path, head)
     with output_folder(path, overwrite=again) as folder:
         yield RunFolder(folder, head, known)
 
 
-def _checked(path: Path, head: RunHead) -> Mapping[str, str]:
-    """Checksums of the frames of a finished run of the same configuration; none of an interrupted one."""
+def check_same(path: Path, head: RunHead) -> Mapping[str, str]:
+    """Checksums of the frames in ``path`` of a finished run that ``head`` begins; none of an interrupted one.
+
+    MitsimError for a run of another configuration.
+    """
     before = read_head(path)
     if before.configuration_sha256 != head.configuration_sha256:
         changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]

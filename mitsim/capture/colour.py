@@ -1,0 +1,229 @@
+"""Sequential colour: a bench of several spectral lines in; a run, or a calibration, for each line alone out.
+
+A camera without colours sees one line of the projector at a time. Light of all lines is traced on the same paths
+(:func:`mitsim.capture.light.trace_lines`), which carry a wavelength for each; from there on every line is a bench of
+its own, with the line's power, diffraction and photons, and what is made of it is an ordinary run or calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mitsim.capture.calibrate import calibrate_session
+from mitsim.capture.light import Light, trace_lines
+from mitsim.capture.plan import Plan
+from mitsim.capture.run import capture, check_run, plan_request, sampling_of
+from mitsim.capture.session import Session
+from mitsim.core.colours import CALIBRATION, COLOUR, RUN, ColourManifest, Line, write_colours
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.job import Job
+from mitsim.core.output import output_folder
+from mitsim.rig.projector import Lines
+from mitsim.rig.recipe import SessionRecipe, load_recipe
+
+if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench
+    from mitsim.capture.request import Request
+    from mitsim.core.runs import Capture
+    from mitsim.reconstruct.factors import Factors
+
+_WAVELENGTHS = 4
+"""Wavelengths that a path carries in Mitsuba's spectral variants."""
+
+
+@dataclass(frozen=True)
+class ColourBench:
+    """A bench by the lines of its projector.
+
+    Attributes
+    ----------
+    whole
+        all lines, which paths carry together.
+    manifest
+        names of the lines.
+    """
+
+    whole: Bench
+    manifest: ColourManifest
+
+    @classmethod
+    def of(cls, bench: Bench, kind: str) -> ColourBench:
+        """Of a ``bench``, for folders of a ``kind``. MitsimError where its light cannot be traced by line."""
+        if not bench.variant.endswith("_spectral"):
+            spectral = f"{bench.variant.rpartition('_')[0]}_spectral"
+            raise ArgumentError("variant", f"{bench.variant}: knows no wavelengths; open the bench with {spectral}")
+        lines = bench.projector.lines
+        if len(lines.shares) > _WAVELENGTHS:
+            raise MitsimError(
+                f"colour: projector {bench.projector.name} has {len(lines.shares)} lines, and a path carries "
+                f"{_WAVELENGTHS}; give a projector of {_WAVELENGTHS} or fewer, or leave colour out"
+            )
+        named = [
+            Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
+            for wavelength, share in zip(lines.wavelengths_nm, lines.shares, strict=True)
+        ]
+        manifest = ColourManifest.model_validate({"kind": kind, "channels": tuple(named)})
+        return cls(replace(bench, lines=lines), manifest)
+
+    @cached_property
+    def benches(self) -> tuple[Bench, ...]:
+        """The bench of each line alone."""
+        assert self.whole.lines is not None, "of the projector"
+        return tuple(map(self._alone, self.whole.lines.single))
+
+    def _alone(self, line: Lines) -> Bench:
+        rig = self.whole.rig
+        alone = replace(rig, projector=rig.projector.at(line.wavelengths_nm[0]))
+        return replace(self.whole, rig=alone, lines=line)
+
+    def boards(self, recipe: SessionRecipe) -> tuple[Bench, ...]:
+        """The same before one board of a ``recipe``."""
+        board = Session(self.whole, recipe).board
+        return tuple(replace(bench, loaded=board.loaded) for bench in self.benches)
+
+
+def capture_lines(
+    bench: Bench, request: Request, job: Job | None = None, output: Path | str | None = None, resume: bool = False
+) -> dict[str, Capture]:
+    """A run for each line, by its name; see :meth:`mitsim.capture.bench.Bench.capture_lines`.
+
+    Parameters
+    ----------
+    bench, request, job, output, resume
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    job = job or Job()
+    colours = ColourBench.of(bench, RUN)
+    _refuse(colours.whole, request)
+    with _claimed(output, colours.manifest, resume) as places:
+        for each, place in zip(colours.benches, places, strict=True):
+            check_run(each, request, place, resume)
+        with job.clock.stage("plan"):
+            plan = plan_request(colours.whole, request)
+        if plan.cost:
+            plan.cost.check(request.patterns, job.limits)
+        lighting = bench.family(request.patterns, request.seed).lighting
+        with job.clock.stage("transport"):
+            sampling = sampling_of(colours.whole, request)
+            lights = trace_lines(colours.whole, colours.benches, plan, lighting, request.seed, sampling, job.progress)
+        runs = zip(colours.manifest.names, colours.benches, lights, places, strict=True)
+        return {name: capture(each, request, job, place, resume, light=light) for name, each, light, place in runs}
+
+
+def calibrate_lines(
+    bench: Bench,
+    seed: int = 0,
+    accuracy: float = 1e-3,
+    recipe: SessionRecipe | None = None,
+    output: Path | str | None = None,
+    resume: bool = False,
+    job: Job | None = None,
+) -> dict[str, Factors]:
+    """Factors at each line, by its name; see :meth:`mitsim.capture.bench.Bench.calibrate_lines`.
+
+    Parameters
+    ----------
+    bench, seed, accuracy, recipe, output, resume, job
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    colours, recipe, job = ColourBench.of(bench, CALIBRATION), recipe or load_recipe(), job or Job()
+    shared = _SharedLight(colours, Session(colours.whole, recipe, seed))
+    with _claimed(output, colours.manifest, resume) as places:
+        lines = zip(colours.manifest.names, colours.benches, places, strict=True)
+        return {
+            name: calibrate_session(_LineSession(each, recipe, seed, shared, number), accuracy, place, resume, job)
+            for number, (name, each, place) in enumerate(lines)
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _SharedLight:
+    """Light of the board by line, traced when it is first asked for."""
+
+    colours: ColourBench
+    session: Session
+    _found: dict[str, Any] = field(default_factory=dict)
+
+    def plan(self, accuracy: float, job: Job) -> Plan:
+        """As :meth:`Session.plan`, of all lines together."""
+        if "plan" not in self._found:
+            self._found["plan"] = self.session.plan(accuracy, job)
+        plan: Plan = self._found["plan"]
+        return plan
+
+    def light(self, line: int, plan: Plan, job: Job) -> Light:
+        """As :meth:`Session.trace`.
+
+        Parameters
+        ----------
+        line
+            its number.
+        plan, job
+            as there.
+        """
+        if "lights" not in self._found:
+            boards = self.colours.boards(self.session.recipe)
+            self._found["lights"] = self.session.trace_lines(boards, plan, job)
+        light: Light = self._found["lights"][line]
+        return light
+
+
+@dataclass(frozen=True)
+class _LineSession(Session):
+    """A session whose light is traced with that of other lines."""
+
+    shared: _SharedLight | None = None
+    line: int = 0
+
+    @cached_property
+    def board(self) -> Bench:
+        assert self.shared is not None
+        return self.shared.colours.boards(self.recipe)[self.line]
+
+    def plan(self, accuracy: float, job: Job) -> Plan:
+        assert self.shared is not None
+        return self.shared.plan(accuracy, job)
+
+    def trace(self, plan: Plan, job: Job) -> Light:
+        assert self.shared is not None
+        return self.shared.light(self.line, plan, job)
+
+
+def _refuse(bench: Bench, request: Request) -> None:
+    """MitsimError for what is not simulated in colour."""
+    if bench.loaded.lamps and request.effects.get("ambient", True):
+        raise MitsimError(
+            f"{bench.loaded.path}: colour: ambient light is not simulated in colour; switch it off with "
+            "effects -ambient, or leave colour out"
+        )
+    if request.seconds is not None:
+        raise ArgumentError("seconds", f"{request.seconds:g}: runs in colour are not planned by time; give an accuracy")
+
+
+@contextmanager
+def _claimed(output: Path | str | None, manifest: ColourManifest, resume: bool) -> Iterator[Sequence[Path | None]]:
+    """Places for the lines' folders, None in memory; colour.json is written when all of them are finished."""
+    if output is None:
+        yield [None] * len(manifest.names)
+        return
+    path = Path(output)
+    known = {COLOUR, *manifest.names}
+    again = resume and path.is_dir() and all(item.name in known or item.name.startswith(".") for item in path.iterdir())
+    with output_folder(path, overwrite=again) as folder:
+        yield [folder / name for name in manifest.names]
+        write_colours(folder, manifest)
