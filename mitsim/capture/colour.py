@@ -19,7 +19,7 @@ from mitsim.capture.light import Light, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
 from mitsim.capture.session import Session
-from mitsim.core.colours import CALIBRATION, COLOUR, RUN, ColourManifest, Line, write_colours
+from mitsim.core.colours import CALIBRATION, RUN, ColourManifest, Line, write_colours
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.output import output_folder
@@ -222,8 +222,7 @@ def _claimed(output: Path | str | None, manifest: ColourManifest, resume: bool) 
         yield [None] * len(manifest.names)
         return
     path = Path(output)
-    known = {COLOUR, *manifest.names}
-    again = resume and path.is_dir() and all(item.name in known or item.name.startswith(".") for item in path.iterdir())
+    again = resume and any((path / name).is_dir() for name in manifest.names)
     with output_folder(path, overwrite=again) as folder:
         yield [folder / name for name in manifest.names]
         write_colours(folder, manifest)

@@ -1,0 +1,86 @@
+"""`mitsim capture --colour` and `mitsim calibrate --colour`: runs and calibrations of a projector's lines in, what the
+terminal shows of them out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsim.core.colours import CALIBRATION, RUN, read_colours
+from mitsim.core.errors import MitsimError
+
+if TYPE_CHECKING:
+    from mitsim.core.runs import Capture
+    from mitsim.reconstruct.factors import Factors
+
+_CHOICES = ("no", "lines")
+
+
+def _choice(name: str) -> str:
+    if name not in _CHOICES:
+        raise MitsimError(f"--colour {name!r}: use {' or '.join(_CHOICES)}")
+    return name
+
+
+Colour = Annotated[
+    str,
+    typer.Option(
+        help="lines: sequential colour, each line of the projector in a folder of its own; no: one, of all light",
+        metavar="no|lines",
+        callback=_choice,
+    ),
+]
+
+
+def spectral(variant: str) -> str:
+    """The ``variant`` of the same backend that knows wavelengths."""
+    return f"{variant.rpartition('_')[0]}_spectral"
+
+
+def of_capture(runs: Mapping[str, Capture], output: Path) -> tuple[dict[str, Any], list[str]]:
+    """JSON and lines of text of a coloured capture: its ``runs`` by line, in the folder ``output``."""
+    payload = _payload(RUN, {name: run.summary() for name, run in runs.items()}, output)
+    lines = [
+        f"{part['name']}: {part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}, Monte Carlo error "
+        f"{part['mc_error']:.1e}, total error up to {part['total_error_bound']:.1e}, exposure {part['exposure_s']:.3g} "
+        "s a frame"
+        for part in payload["channels"]
+    ]
+    return payload, [*lines, _last(payload)]
+
+
+def of_calibration(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, Any], list[str]]:
+    """The same of a coloured calibration: its ``factors`` by line, in the folder ``output``."""
+    results = {
+        name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
+        for name, each in factors.items()
+    }
+    payload = _payload(CALIBRATION, results, output)
+    lines = [
+        f"{part['name']}: {part['frames']} frames of {part['n']} stripes, separability residual "
+        f"{_percent(part['separability_residual'])}, factor error {part['phi_error']:.1e}"
+        for part in payload["channels"]
+    ]
+    return payload, [*lines, _last(payload)]
+
+
+def _percent(part: float | None) -> str:
+    return "unknown" if part is None else f"{part:.2%}"
+
+
+def _payload(kind: str, results: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
+    colours = read_colours(output, kind)
+    return {
+        "kind": colours.kind,
+        "channels": [{**line.model_dump(), **results[line.name]} for line in colours.channels],
+        "seconds": results[colours.names[-1]]["seconds"],
+        "warnings": tuple(f"{name}: {text}" for name, result in results.items() for text in result["warnings"]),
+        "output": str(output),
+    }
+
+
+def _last(payload: Mapping[str, Any]) -> str:
+    return f"{len(payload['channels'])} lines in {payload['seconds']['total']:.1f} s: {payload['output']}"
