@@ -32,7 +32,10 @@ from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, decibels
+from mitsim.reconstruct.ladder import Chosen, Ladder
 from mitsim.rig.board import BoardShape
+from mitsim.rig.digital import digital_of
+from mitsim.rig.order import Half, taken
 from mitsim.rig.patterns import SIDES, Lighting, stripe_signs
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
@@ -118,8 +121,14 @@ class Session:
     @property
     def shots(self) -> int:
         """Frames of the whole session."""
-        count = int(self.signs.shape[1])
-        return 2 * (2 * count if self.pairs else count + 1) * self.recipe.repeats
+        lit = len(self.order) * self.recipe.repeats
+        return (lit + self.recipe.dark_frames) * len(self.recipe.exposure_ladder)
+
+    @property
+    def order(self) -> list[Half]:
+        """What the lit frames show, as they are taken; each with all exposures, one after the other, and of each all
+        repeats. Dark frames come last."""
+        return taken(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
         """What to simulate for responses of this relative ``accuracy``, and what the session takes.
@@ -129,13 +138,14 @@ class Session:
         n, count, starting = self.bench.n, self.signs.shape[1], job.clock.seconds()["total"]
         first = Settings(self.bench.geometry.scene_distance)
         seconds = session_seconds(self.board, count, self.shots, first)
-        session_cost(self.board, count, first, sum(seconds.values())).check("calibration", job.limits)
+        exposures = len(self.recipe.exposure_ladder)
+        session_cost(self.board, count, first, sum(seconds.values()), exposures).check("calibration", job.limits)
         with job.clock.stage("plan"):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
         seconds = session_seconds(self.board, count, self.shots, plan.settings)
         # There is no truth to be traced, and other frames are formed than those that the plan looks at.
         plan = plan.taking(start=starting, truth=0.0, **seconds)
-        cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds)
+        cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds, exposures)
         cost.check("calibration", job.limits)
         return replace(plan, cost=cost)
 
@@ -189,7 +199,7 @@ class LitSession:
     white
         expected frame of the uniform shot.
     exposure_s
-        of every shot [s].
+        of every shot [s], the shortest where there are several.
     speckle
         contrast of laser speckle in the frames.
     """
@@ -204,18 +214,29 @@ class LitSession:
     def response_noise(self) -> float:
         """Root mean square noise of a +-1 response [electrons / s], from the sensor's closed form.
 
-        Its two shots share the uniform light: variance (mean electrons + dark + 2 read noise^2) / t^2 for a pair; with
-        one shot and a uniform one, 2 Y(positive) - Y(uniform), it is three times the light and 5/2 of the read noise.
-        Means of repeated shots have their number's part of it.
+        Its two shots share the uniform light L: variance (L + 2 D) / t + 2 read^2 / t^2 with dark electrons D for a
+        pair; with one shot of a part p of the lines, about half, and a uniform one, 2 Y(positive) - Y(uniform), it is
+        (4 p L + L + 5 D) / t + 5 read^2 / t^2, and that of a dark frame's mean is added. Means of repeated shots have
+        their number's part of it. Of several exposures each pixel has the sum of these by the squares of its weights.
         """
-        sensor, time = self.session.bench.sensor, self.exposure_s
-        light = float(self._white_rate.mean()) + 2 * sensor.superpixel_dark_current_e_per_s
-        read = sensor.superpixel_reading_noise_e**2
-        if self.session.pairs:
-            variance = light / time + 2 * read / time**2
-        else:
-            variance = 3 * light / time + 5 * read / time**2
-        return float(np.sqrt(variance / self.session.recipe.repeats))
+        sensor, recipe = self.session.bench.sensor, self.session.recipe
+        dark, read = sensor.superpixel_dark_current_e_per_s, sensor.superpixel_reading_noise_e**2
+        lit_lines = float((1 + self.session.signs).mean()) / 2
+        light_parts, shots = (1.0, 2) if self.session.pairs else (4 * lit_lines + 1, 5)
+        variance = 0.0
+        for ladder in self.ladders.values():
+            for number, exposer in enumerate(self._exposers):
+                squares = 1.0 if ladder.weights is None else np.square(ladder.weights[number])
+                lit, part, time = (
+                    float(np.mean(squares * self._white_rate)),
+                    float(np.mean(squares)),
+                    exposer.exposure_s,
+                )
+                charge = light_parts * lit + part * shots * dark
+                variance += (charge / time + part * shots * read / time**2) / recipe.repeats / len(SIDES)
+                if recipe.dark_frames:
+                    variance += part * (dark / time + read / time**2) / recipe.dark_frames / len(SIDES)
+        return float(np.sqrt(variance))
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
         """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.
@@ -278,22 +299,18 @@ class LitSession:
         """
         if not self.session.pairs:
             shot, uniform = self._exposed(frame.irradiance, side, number + 1), self._uniform[side]
-            return Response(
-                self._rates(lambda rows: 2 * self._exposer.rate(shot.digital[rows]) - uniform.rate[rows], shot),
-                shot.saturated + (uniform.saturated if number == 0 else 0),
-            )
+            rate = self._rates(lambda rows: 2 * self._rate(shot, rows) - uniform.rate[rows], shot)
+            if self._dark is not None:
+                rate -= self._dark[side]
+            return Response(rate, shot.saturated + (uniform.saturated if number == 0 else 0))
         negative = self._both - frame.irradiance
         shots = (
             self._exposed(frame.irradiance, side, 2 * number),
             # Rounding leaves pixels that see the +1 stripes alone a little below zero.
             self._exposed(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
         )
-
-        def difference(rows: slice) -> FloatArray:
-            positive, negative = (self._exposer.rate(shot.digital[rows]) for shot in shots)
-            return positive - negative
-
-        return Response(self._rates(difference, shots[0]), sum(shot.saturated for shot in shots))
+        rate = self._rates(lambda rows: self._rate(shots[0], rows) - self._rate(shots[1], rows), shots[0])
+        return Response(rate, sum(shot.saturated for shot in shots))
 
     def noise_free(self, frame: Frame) -> FloatArray:
         """(pixels, pixels) the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
@@ -307,9 +324,44 @@ class LitSession:
         """An exposure of one second, whose electrons are rates."""
         return Exposer(self.session.bench.rig, 1.0, self.session.seed)
 
-    @property
-    def _exposer(self) -> Exposer:
-        return Exposer(self.session.bench.rig, self.exposure_s, self.session.seed, self.speckle)
+    @cached_property
+    def exposures_s(self) -> tuple[float, ...]:
+        """Every exposure of a frame [s]."""
+        return tuple(self.exposure_s * factor for factor in self.session.recipe.exposure_ladder)
+
+    @cached_property
+    def _exposers(self) -> tuple[Exposer, ...]:
+        bench = self.session.bench
+        return tuple(Exposer(bench.rig, time, self.session.seed, self.speckle) for time in self.exposures_s)
+
+    @cached_property
+    def ladders(self) -> Mapping[str, Ladder]:
+        """How frames of several exposures of a side are merged: by the first uniform frame of the other one, which
+        shares no noise with them."""
+        digitals = tuple(digital_of(self.session.bench.sensor, time) for time in self.exposures_s)
+        if len(digitals) == 1:
+            return {side: Ladder(digitals) for side in SIDES}
+        recipe, found = self.session.recipe, dict[str, Ladder]()
+        for side, other in zip(SIDES, reversed(SIDES), strict=True):
+            uniform, _ = self._repeated(self._lit(self.white.irradiance, 0, other, 0), 0, True, other, 0)
+            rate = self._exposers[0].rate(uniform)
+            found[side] = Ladder.of(digitals, rate, recipe.repeats, recipe.ladder_merge)
+        return found
+
+    @cached_property
+    def _dark(self) -> Mapping[str, FloatArray] | None:
+        """(pixels, pixels) rate of the mean dark frame, as each side's frames are merged; None where none is taken."""
+        number = self.session.recipe.dark_frames
+        if not number:
+            return None
+        still = np.zeros(self.white.irradiance.shape)
+        rates = []
+        for exposure, exposer in enumerate(self._exposers):
+            total = np.zeros(still.shape)
+            for index in range(number):
+                total += exposer.digital(still, "calibration", "dark", exposure, index)
+            rates.append(exposer.rate(total / number))
+        return {side: ladder.merged(rates) for side, ladder in self.ladders.items()}
 
     @cached_property
     def _white_rate(self) -> FloatArray:
@@ -327,30 +379,62 @@ class LitSession:
     def _uniform(self) -> Mapping[str, Response]:
         """Noisy uniform frames, from which each side's responses are taken where they are no pairs."""
         shots = {side: self._exposed(self.white.irradiance, side, 0) for side in SIDES}
-        return {side: Response(self._exposer.rate(shot.digital), shot.saturated) for side, shot in shots.items()}
+        return {side: Response(self._rate(shot, slice(None)), shot.saturated) for side, shot in shots.items()}
 
     def _exposed(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
-        """The noisy frame of shot number ``index`` of a ``side``, of expected ``irradiance`` (pixels, pixels)."""
-        names = "calibration", side, index
-        # Speckle of a board at rest is the same in all repeats.
-        lit = self._exposer.lit(Frame(irradiance, 0.0, 0.0, 0.0), *names)
-        digital = self._exposer.digital(lit, *names)
-        saturated = int(self._exposer.saturated(digital, lit))
-        repeats = self.session.recipe.repeats
+        """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (pixels, pixels)."""
+        ladder = self.ladders[side]
+        found = [
+            self._repeated(self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index)
+            for exposure in range(len(self._exposers))
+        ]
+        return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
+
+    def _lit(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
+        """Expected electrons of a shot. Speckle of a board at rest is the same in all repeats and exposures."""
+        return self._exposers[exposure].lit(Frame(irradiance, 0.0, 0.0, 0.0), "calibration", *names)
+
+    def _repeated(self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int) -> tuple[Digital, int]:
+        """The mean of all repeats of a shot at one exposure, and how many have saturated pixels that are used.
+
+        Parameters
+        ----------
+        lit
+            expected electrons.
+        exposure, side, index
+            numbers of the exposure and of the shot.
+        used
+            pixels that count.
+        """
+        exposer, repeats = self._exposers[exposure], self.session.recipe.repeats
+        names: tuple[str | int, ...] = ("calibration", side, index)
+        names += ("exposure", exposure) if exposure else ()
+
+        def saturated(digital: Digital) -> bool:
+            if used is True:
+                return exposer.saturated(digital, lit)
+            return exposer.saturated(np.where(used, digital, 0), np.where(used, lit, 0.0))
+
+        digital = exposer.digital(lit, *names)
         if repeats == 1:
-            return _Shot(digital, saturated)
-        mean = digital.astype(np.float64)
+            return digital, int(saturated(digital))
+        count, mean = int(saturated(digital)), digital.astype(np.float64)
         for repeat in range(1, repeats):
-            digital = self._exposer.digital(lit, *names, "repeat", repeat)
-            saturated += self._exposer.saturated(digital, lit)
+            digital = exposer.digital(lit, *names, "repeat", repeat)
+            count += saturated(digital)
             mean += digital
         mean /= repeats
-        return _Shot(mean, saturated)
+        return mean, count
+
+    def _rate(self, shot: _Shot, rows: slice) -> FloatArray:
+        """Rates of some ``rows`` of a ``shot``."""
+        each = zip(self._exposers, shot.digital, strict=True)
+        return shot.ladder.merged((exposer.rate(digital[rows]) for exposer, digital in each), rows)
 
     @staticmethod
     def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
         """(pixels, pixels) rates of all rows by those ``of`` some, a few at a time: their arrays stay in the cache."""
-        rates: FloatArray = np.empty(shot.digital.shape)
+        rates: FloatArray = np.empty(shot.digital[0].shape)
         step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
         for start in range(0, len(rates), step):
             rows = slice(start, start + step)
@@ -360,9 +444,11 @@ class LitSession:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """A noisy frame (pixels, pixels), the mean of its repeats, and how many of them have ``saturated`` pixels."""
+    """Noisy frames (pixels, pixels), of each exposure the mean of its repeats, which a ``ladder`` merges; how many of
+    all have ``saturated`` pixels."""
 
-    digital: Digital
+    ladder: Ladder
+    digital: tuple[Digital, ...]
     saturated: int
 
 

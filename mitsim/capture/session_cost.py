@@ -26,6 +26,8 @@ _MIXED_S, _FORMED_S = 3e-8, 1e-8
 _HELD, _AT_WORK = 5.0, 5.0
 """Frames in double precision: those that a session holds (the uniform one, its rate, a pair's both shots together, two
 noisy uniform ones), and what each response takes that is worked on (light of two shots, their numbers, rates)."""
+_OF_AN_EXPOSURE = 2.0
+"""Frames more of a response for each exposure beyond the first: numbers of two shots, and one shot's electrons."""
 _SUMS = 8.0
 """Numbers of a side's sums for each pattern and pixel of a side of the sensor: of two sides and two kinds of responses,
 and once more while they are saved."""
@@ -61,7 +63,7 @@ def session_seconds(board: Bench, count: int, shots: int, settings: Settings) ->
     return {"optics": seconds + 2 * count * pixels**2 * each, "sensor": frame_seconds(board, shots)["sensor"]}
 
 
-def session_cost(board: Bench, count: int, settings: Settings, seconds: float) -> Cost:
+def session_cost(board: Bench, count: int, settings: Settings, seconds: float, exposures: int = 1) -> Cost:
     """Memory, an upper estimate, and time of a session.
 
     Parameters
@@ -70,10 +72,13 @@ def session_cost(board: Bench, count: int, settings: Settings, seconds: float) -
         as for :func:`session_seconds`.
     seconds
         that it takes.
+    exposures
+        of every frame.
     """
     n, pixels = board.n, board.geometry.pixels
-    frames = (
-        (n if lines_held(n, count, pixels) else 0) + 3 * at_once(pixels) + _HELD + _AT_WORK * frames_at_once(pixels**2)
-    )
-    held = 8.0 * (frames * pixels**2 + _SUMS * count * pixels)
-    return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + held)
+    lines = n if lines_held(n, count, pixels) else 0
+    at_work = _AT_WORK + _OF_AN_EXPOSURE * (exposures - 1)
+    held = _HELD + (exposures if exposures > 1 else 0)  # and a pixel's weights
+    frames = lines + 3 * at_once(pixels) + held + at_work * frames_at_once(pixels**2)
+    memory_bytes = 8.0 * (frames * pixels**2 + _SUMS * count * pixels)
+    return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + memory_bytes)

@@ -5,7 +5,7 @@ Numbers are those of a simulated session: frames of one, written to such a folde
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -17,14 +17,16 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, verify
 from mitsim.core.imagefile import image_size, own_end, read_image
 from mitsim.core.job import Job
-from mitsim.core.manifests import CalibrationManifest, Digital
+from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.output import output_folder
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.resources import workers
 from mitsim.core.versions import versions
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
-from mitsim.rig.framelist import UNIFORM, DarkFile, SessionFrames, StripeFile, load_frames
+from mitsim.reconstruct.ladder import Chosen, Ladder
+from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
+from mitsim.rig.order import UNIFORM, Half
 from mitsim.rig.patterns import SIDES, Side, stripe_signs
 
 
@@ -145,11 +147,21 @@ def _check_sizes(session: SessionFrames) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """Mean of ``shots`` frames: electrons a second, and the :class:`Digital` of their exposure."""
+    """Mean of ``shots`` frames of each exposure: electrons a second, and how they were read."""
 
     rate: FloatArray
-    digital: Digital
+    ladder: Ladder
     shots: int
+
+    @property
+    def exposure_s(self) -> float:
+        """The shortest exposure [s]."""
+        return self.ladder.digitals[0].exposure_s
+
+    @property
+    def variance(self) -> float:
+        """Mean noise variance, of all shots [(electrons/s)^2]."""
+        return max(self.ladder.variance(self.rate), 0.0) / self.shots
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,57 +182,85 @@ class _Readings:
         side, index
             of the pattern.
         """
-        positive = self._read(*self.session.repeated(side, index, 1))
+        positive = self._merged((side, index, 1))
         if self.session.pairs:
-            negative = self._read(*self.session.repeated(side, index, -1))
-            light = float(positive.rate.mean() + negative.rate.mean())
-            return positive.rate - negative.rate, float(positive.digital.variance(light, 2)) / positive.shots
+            negative = self._merged((side, index, -1))
+            light = positive.rate + negative.rate
+            return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots
         uniform = self._uniform[side]
         response = 2 * positive.rate - uniform.rate
-        variance = 4 * _variance(positive) + _variance(uniform)
+        variance = 4 * positive.variance + uniform.variance
         if self.session.dark:
             # 2 (Y - D) - (U - D), where both are exposed alike.
-            both = (positive.digital.exposure_s, 2), (uniform.digital.exposure_s, -1)
+            both = (positive.exposure_s, 2), (uniform.exposure_s, -1)
             parts: dict[float, int] = {}
             for exposure, weight in both:
                 parts[exposure] = parts.get(exposure, 0) + weight
             for exposure, weight in parts.items():
-                dark, own = self._dark[exposure]
-                response -= weight * dark
-                variance += weight**2 * own
+                dark = self._dark_of[side][exposure]
+                response -= weight * dark.rate
+                variance += weight**2 * dark.variance
         return response, variance
 
     @cached_property
     def _uniform(self) -> dict[Side, _Reading]:
-        return {side: self._read(*self.session.repeated(side, 0, UNIFORM)) for side in SIDES}
+        return {side: self._merged((side, 0, UNIFORM)) for side in SIDES}
 
     @cached_property
-    def _dark(self) -> dict[float, tuple[FloatArray, float]]:
-        """Mean dark frame (rows, columns) [electrons/s] by exposure, and its noise variance."""
+    def _ladders(self) -> dict[Side, Ladder] | None:
+        """How several exposures of a side's frames are merged, by a uniform frame of the other; None for one."""
+        listed = self.session.listed
+        if len(listed.exposure_ladder) == 1:
+            return None
+        digitals = [
+            listed.digital.model_copy(update={"exposure_s": listed.digital.exposure_s * factor})
+            for factor in listed.exposure_ladder
+        ]
+        found = {}
+        for side, other in zip(SIDES, reversed(SIDES), strict=True):
+            frames = self.session.repeated((other, 0, 1 if self.session.pairs else UNIFORM))
+            uniform = self._read(frames, True)
+            found[side] = Ladder.of(digitals, uniform.rate, uniform.shots, listed.ladder_merge)
+        return found
+
+    @cached_property
+    def _dark_of(self) -> dict[Side, dict[float, _Reading]]:
+        """Mean dark frame of a side by exposure; of several, by the shortest, merged."""
         found = {}
         for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
             frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
-            mean = self._read(*frames)
-            found[exposure] = mean.rate, _variance(mean)
-        return found
+            found[exposure] = self._read(frames, True)
+        if self._ladders is None:
+            return dict.fromkeys(SIDES, found)
+        each = [found[digital.exposure_s] for digital in self._ladders[SIDES[0]].digitals]
+        return {
+            side: {each[0].exposure_s: _Reading(ladder.merged(own.rate for own in each), ladder, each[0].shots)}
+            for side, ladder in self._ladders.items()
+        }
 
-    def _read(self, *frames: StripeFile | DarkFile) -> _Reading:
-        """The mean of ``frames`` of one exposure."""
+    def _merged(self, half: Half) -> _Reading:
+        """What shows a ``half`` of a pattern, of all exposures and repeats."""
+        if self._ladders is None:
+            return self._read(self.session.repeated(half), True)
+        ladder = self._ladders[half[0]]
+        each = (
+            self._read(self.session.repeated(half, number), ladder.used(number))
+            for number in range(len(ladder.digitals))
+        )
+        return _Reading(ladder.merged(reading.rate for reading in each), ladder, self.session.listed.repeats)
+
+    def _read(self, frames: Sequence[StripeFile | DarkFile], used: Chosen) -> _Reading:
+        """The mean of ``frames`` of one exposure; ``used`` are the pixels that may not be saturated."""
         digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
         total: FloatArray | None = None
         for frame in frames:
             values = read_image(self.session.folder / frame.file, self.session.wanted)
             end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
-            if end is not None and (values >= end).any():
+            if end is not None and ((values >= end) & used).any():
                 self.saturated.add(frame.file)
             total = values.astype(np.float64) if total is None else total + values
         assert total is not None
-        return _Reading(digital.rate(total / len(frames)), digital, len(frames))
-
-
-def _variance(reading: _Reading) -> float:
-    """Mean noise variance of a ``reading``, of all its shots [(electrons/s)^2]."""
-    return max(float(reading.digital.variance(float(reading.rate.mean()))), 0.0) / reading.shots
+        return _Reading(digital.rate(total / len(frames)), Ladder((digital,)), len(frames))
 
 
 @single_threaded_blas()

@@ -12,24 +12,23 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, model_validator
 
 from mitsim.core.configuration import Positive, read_toml, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagefile import Raw, Wanted, image_files
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
-from mitsim.rig.patterns import SIDES, Side, stripe_count
-from mitsim.rig.recipe import MOST_REPEATS
+from mitsim.rig.order import UNIFORM, Half, taken
+from mitsim.rig.patterns import Side, stripe_count
+from mitsim.rig.recipe import MOST_REPEATS, MOST_RUNGS, Exposures, Merge
 
 LISTS = ("session.toml", "session.json")
 """Names of the list."""
 DARK = "dark"
 """What names of dark frames begin with, where no list names them."""
-UNIFORM = 0
-"""Sign of a frame under uniform light."""
-Key = tuple[Side, int, int, int]
-"""Side, number of the pattern, sign and repeat of a frame."""
+Key = tuple[Side, int, int, int, int]
+"""Side, number of the pattern, sign, number of the exposure and repeat of a frame."""
 
 
 class _Part(BaseModel):
@@ -44,14 +43,18 @@ class StripeFile(_Part):
     index: int = Field(ge=0, lt=2 * MOST_PIXELS, description="column of H; 0 of a uniform frame")
     sign: int = Field(ge=-1, le=1, description="half (1 + P)/2 or (1 - P)/2 of a pattern P; 0: uniform frame")
     repeat: int = Field(default=0, ge=0, lt=MOST_REPEATS, description="which one of `repeats`")
-    exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as in `digital`")
+    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS, description="which one of `exposure_ladder`")
+    exposure_s: Positive | None = Field(
+        default=None, description="its exposure [s]; none: as in `digital`, times that of `exposure_ladder`"
+    )
 
 
 class DarkFile(_Part):
     """One frame with the projector off."""
 
     file: FileName = Field(description="name of the frame in the folder, without a path")
-    exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as in `digital`")
+    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS, description="which one of `exposure_ladder`")
+    exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as for other frames")
 
 
 def _named(camera: Any) -> Any:
@@ -67,6 +70,10 @@ class FrameList(_Part):
     n: int = Field(ge=1, le=MOST_PIXELS, description="projector pixels a side")
     signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern was captured")
     repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="frames of each half, whose mean is taken")
+    exposure_ladder: Exposures = Field(
+        default=(1.0,), description="exposures of every frame, over the shortest, which `digital` states"
+    )
+    ladder_merge: Merge = Field(default="weighted", description="how they make one: by variance, or the longest alone")
     digital: Digital = Field(description="how digital numbers become electrons a second, as in a run's manifest")
     centre: bool = Field(default=False, description="frames lose row and column means (FlatCam masks)")
     board_reflectance: float | None = Field(
@@ -82,6 +89,14 @@ class FrameList(_Part):
     dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field(
         default=(), strict=False, max_length=MOST_SHOTS, description="frames with the projector off"
     )
+
+    @model_validator(mode="after")
+    def _saturation_is_known(self) -> FrameList:
+        if len(self.exposure_ladder) > 1 and self.digital.saturation_dn is None:
+            raise ValueError(
+                "digital.saturation_dn: is not given; an exposure_ladder needs it, to leave out what is saturated"
+            )
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +130,9 @@ class SessionFrames:
         """Whether a +-1 pattern is the difference of two frames, and not taken from one and a uniform one."""
         return self.listed.signed_capture == "pair"
 
-    def repeated(self, side: Side, index: int, sign: int) -> tuple[StripeFile, ...]:
-        """All repeats of one frame.
-
-        Parameters
-        ----------
-        side, index, sign
-            what it shows.
-        """
-        return tuple(self.shots[side, index, sign, repeat] for repeat in range(self.listed.repeats))
+    def repeated(self, half: Half, exposure: int = 0) -> tuple[StripeFile, ...]:
+        """All repeats of one ``half`` of a pattern, at one ``exposure`` of the ladder."""
+        return tuple(self.shots[(*half, exposure, repeat)] for repeat in range(self.listed.repeats))
 
     @cached_property
     def files(self) -> tuple[str, ...]:
@@ -132,7 +141,7 @@ class SessionFrames:
 
     def exposure_s(self, frame: StripeFile | DarkFile) -> float:
         """Exposure of a ``frame`` [s]."""
-        return frame.exposure_s or self.listed.digital.exposure_s
+        return frame.exposure_s or self.listed.digital.exposure_s * self.listed.exposure_ladder[frame.exposure]
 
 
 def load_frames(folder: Path | str) -> SessionFrames:
@@ -165,8 +174,8 @@ def load_frames(folder: Path | str) -> SessionFrames:
                 f"frame in {lists[0].name}"
             )
         frames = tuple(
-            StripeFile(file=name, side=side, index=index, sign=sign, repeat=repeat)
-            for name, (side, index, sign, repeat) in zip(names, wanted, strict=True)
+            StripeFile(file=name, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
+            for name, (side, index, sign, exposure, repeat) in zip(names, wanted, strict=True)
         )
     shots = _each_once(folder, frames, wanted)
     session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
@@ -175,17 +184,16 @@ def load_frames(folder: Path | str) -> SessionFrames:
 
 
 def _wanted(listed: FrameList) -> Iterator[Key]:
-    """Frames of a session in the order in which they are taken."""
-    uniform, signs = listed.signed_capture == "uniform", (1, -1) if listed.signed_capture == "pair" else (1,)
-    for side in SIDES:
-        halves = [(index, sign) for index in range(stripe_count(listed.n)) for sign in signs]
-        for index, sign in [(0, UNIFORM), *halves] if uniform else halves:
+    """Frames of a session in the order in which they are listed."""
+    for half in taken(stripe_count(listed.n), listed.signed_capture == "pair"):
+        for exposure in range(len(listed.exposure_ladder)):
             for repeat in range(listed.repeats):
-                yield side, index, sign, repeat
+                yield *half, exposure, repeat
 
 
 def _times(listed: FrameList) -> str:
-    return f", repeats {listed.repeats}" if listed.repeats > 1 else ""
+    times = f", repeats {listed.repeats}" if listed.repeats > 1 else ""
+    return times + (f", {len(listed.exposure_ladder)} exposures" if len(listed.exposure_ladder) > 1 else "")
 
 
 def _each_once(folder: Path, frames: Sequence[StripeFile], wanted: Sequence[Key]) -> dict[Key, StripeFile]:
@@ -193,7 +201,7 @@ def _each_once(folder: Path, frames: Sequence[StripeFile], wanted: Sequence[Key]
     shots: dict[Key, StripeFile] = {}
     known = set(wanted)
     for frame in frames:
-        key = frame.side, frame.index, frame.sign, frame.repeat
+        key = frame.side, frame.index, frame.sign, frame.exposure, frame.repeat
         if key not in known:
             raise MitsimError(
                 f"frames {folder}: {frame.file} is {_words(key)}, which no such session has; it has "
@@ -224,8 +232,9 @@ def _check_files(session: SessionFrames) -> None:
         if not (folder / name).is_file():
             raise MitsimError(f"frames {folder}: {name} is listed, but no file of that name is there; copy it there")
     exposures = {session.exposure_s(shot) for shot in session.shots.values()}
-    for (side, index, sign, repeat), shot in session.shots.items():
-        other = session.shots[side, index, sign if repeat or not session.pairs else -sign, 0]
+    _check_ladder(session)
+    for (side, index, sign, exposure, repeat), shot in session.shots.items():
+        other = session.shots[side, index, sign if repeat or not session.pairs else -sign, exposure, 0]
         if session.exposure_s(shot) != session.exposure_s(other):
             raise MitsimError(
                 f"frames {folder}: {shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one "
@@ -241,7 +250,25 @@ def _check_files(session: SessionFrames) -> None:
         )
 
 
+def _check_ladder(session: SessionFrames) -> None:
+    """Frames of several exposures state their numbers, and no seconds; MitsimError otherwise."""
+    rungs = len(session.listed.exposure_ladder)
+    frames: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
+    for frame in frames:
+        if frame.exposure >= rungs:
+            raise MitsimError(
+                f"frames {session.folder}: {frame.file} is of exposure {frame.exposure}, but exposure_ladder has "
+                f"{rungs}; give 0 to {rungs - 1}"
+            )
+        if rungs > 1 and frame.exposure_s is not None:
+            raise MitsimError(
+                f"frames {session.folder}: {frame.file} states exposure_s, and exposure_ladder as well; leave it out, "
+                "and give the number `exposure`"
+            )
+
+
 def _words(key: Key) -> str:
-    side, index, sign, repeat = key
+    side, index, sign, exposure, repeat = key
     words = f"the uniform frame of {side} stripes" if sign == UNIFORM else f"{side} stripes {index} of sign {sign:+d}"
+    words += f", exposure {exposure}" if exposure else ""
     return f"{words}, repeat {repeat}" if repeat else words

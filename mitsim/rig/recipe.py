@@ -2,18 +2,38 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from mitsim.core.configuration import load_model, shipped
 from mitsim.rig.board import BoardShape
+from mitsim.rig.order import Order
 from mitsim.rig.sensor import ExposureFraction
 
 MOST_REPEATS = 1024
 """Shots of one frame: 30 dB less noise, where a session of 512 frames takes days."""
+MOST_RUNGS, LONGEST = 8, 1e6
+"""Exposures of one frame, and the longest over the shortest: 120 dB, more than any scene on a sensor has."""
+MOST_SEED = 2**32 - 1
+"""As of every random stream."""
+Merge = Literal["weighted", "longest"]
+
+
+def _rising(exposures: tuple[float, ...]) -> tuple[float, ...]:
+    if exposures[0] != 1 or any(later <= earlier for earlier, later in itertools.pairwise(exposures)):
+        raise ValueError(f"got {', '.join(f'{value:g}' for value in exposures)}; give 1, and rising numbers after it")
+    return exposures
+
+
+Exposures = Annotated[
+    tuple[Annotated[float, Field(ge=1, le=LONGEST)], ...],
+    Field(strict=False, min_length=1, max_length=MOST_RUNGS),
+    AfterValidator(_rising),
+]
 
 
 class SessionRecipe(BaseModel):
@@ -27,7 +47,21 @@ class SessionRecipe(BaseModel):
     exposure_fraction: ExposureFraction = Field(description="brightest pixel's mean, as a part of the full well")
     signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern is captured")
     repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="shots of every frame, whose mean is taken")
+    exposure_ladder: Exposures = Field(default=(1.0,), description="exposures of every frame, over the shortest")
+    ladder_merge: Merge = Field(default="weighted", description="how they make one: by variance, or the longest alone")
+    dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS, description="frames without light, of each exposure")
+    order: Order = Field(default="listed", description="order in which patterns are taken")
+    order_seed: int = Field(default=0, ge=0, le=MOST_SEED, description="of a random order")
     source: str = Field(description="where the numbers come from")
+
+    @model_validator(mode="after")
+    def _dark_frames_are_of_use(self) -> SessionRecipe:
+        if self.dark_frames and self.signed_capture == "pair":
+            raise ValueError(
+                f"dark_frames: got {self.dark_frames}, but a pair's difference has no dark signal; set 0, or "
+                "signed_capture 'uniform'"
+            )
+        return self
 
 
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:

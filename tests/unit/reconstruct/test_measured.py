@@ -202,3 +202,36 @@ def test_one_uniform_exposure_without_a_dark_frame_is_refused(tmp_path: Path) ->
     write_list(folder, **{**data, "dark": [{"file": "dark.png", "exposure_s": 0.5}]})
     with pytest.raises(MitsimError, match=r"no dark frame is exposed for 0\.02 s"):
         load_frames(folder)
+
+
+@pytest.mark.parametrize(
+    ("listed", "change", "words"),
+    [
+        ({}, {"exposure": 1}, "which no such session has"),
+        ({"exposure_ladder": [1, 2]}, {"exposure_s": 0.5}, "exposure_ladder as well; leave it out"),
+        ({"exposure_ladder": [1, 2], "digital": {**DIGITAL, "saturation_dn": None}}, {}, "saturation_dn: is not given"),
+        ({"exposure_ladder": [1, 1]}, {}, "rising numbers"),
+    ],
+)
+def test_exposures_that_contradict_each_other_are_refused(
+    tmp_path: Path, listed: dict[str, Any], change: dict[str, Any], words: str
+) -> None:
+    rungs = range(len(listed.get("exposure_ladder", [1])))
+    entries = []
+    for number, (side, index, sign, _) in enumerate(RealSession().shown("pair")):
+        for rung in rungs:
+            name = f"{number}_{rung}.png"
+            write_image(tmp_path / name, np.zeros((2, 2)))
+            entries.append({"file": name, "side": side, "index": index, "sign": sign, "exposure": rung})
+    entries[0].update(change)
+    write_list(tmp_path, frames=entries, **listed)
+    with pytest.raises(MitsimError, match=words):
+        load_frames(tmp_path)
+
+
+def test_dark_frames_of_no_exposure_are_refused(tmp_path: Path) -> None:
+    folder = RealSession().write(tmp_path / "frames", "uniform")
+    write_image(folder / "dark_0.png", np.zeros((ROWS, COLUMNS)))
+    write_list(folder, signed_capture="uniform", dark=[{"file": "dark_0.png", "exposure": 1}])
+    with pytest.raises(MitsimError, match="of exposure 1, but exposure_ladder has 1; give 0 to 0"):
+        load_frames(folder)
