@@ -254,6 +254,33 @@ class Bench:
 
         return calibrate(self, seed, accuracy, recipe, output, resume, job)
 
+    def calibrate_depths(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> dict[float, Factors]:
+        """The camera's two factors at each of a recipe's depths, by depth [mm].
+
+        Parameters
+        ----------
+        seed, accuracy, recipe, resume, job
+            as :meth:`calibrate`.
+        output
+            folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate`, and for a recipe without depths, or with one at which the mask is.
+        """
+        from mitsim.capture.calibrate import calibrate_depths
+
+        return calibrate_depths(self, seed, accuracy, recipe, output, resume, job)
+
     def render(
         self,
         estimator: Literal["reference", "factored"] = "reference",
@@ -362,20 +389,23 @@ class Bench:
 
     @property
     def parallax(self) -> Parallax:
-        """How a calibration's factors move with depth, as its manifest states it."""
+        """How the factors of a calibration on the aligned plane move with depth, as its manifest states it."""
+        return self.parallax_from(self.geometry.scene_distance)
+
+    def parallax_from(self, depth: float) -> Parallax:
+        """The same of a calibration at ``depth`` [mm]."""
         from mitsim.core.manifests import Parallax
 
-        depth = self.geometry.scene_distance
+        window = self.windows_at(depth)
         farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
         shift = 1 / (2 * depth) - 1 / depth
         rows, columns = (
-            ((far[0] - near[0]) / shift, (far[1] - near[1]) / shift)
-            for near, far in zip(self.windows, farther, strict=True)
+            ((far[0] - near[0]) / shift, (far[1] - near[1]) / shift) for near, far in zip(window, farther, strict=True)
         )
         return Parallax(
             depth_mm=depth,
-            row_tan=self.windows[0],
-            column_tan=self.windows[1],
+            row_tan=window[0],
+            column_tan=window[1],
             row_mm=rows,
             column_mm=columns,
             pixel_pitch_mm=self.geometry.pixel_pitch,
@@ -426,8 +456,8 @@ class Bench:
             },
         }
 
-    def with_board(self, reflectance: float, shape: BoardShape | None = None) -> Bench:
-        """The same rig before a diffuse board on the aligned plane.
+    def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Bench:
+        """The same rig before a diffuse board.
 
         Parameters
         ----------
@@ -435,6 +465,8 @@ class Bench:
             of the board.
         shape
             its size, bow and tilt; None: flat, and larger than the view.
+        depth
+            distance of its middle [mm]; None: on the aligned plane.
         """
         import mitsuba as mi
 
@@ -442,7 +474,7 @@ class Bench:
         from mitsim.rig.board import BoardShape
         from mitsim.scene.guard.estimators import Unfit
 
-        board = board_object(self, reflectance, shape or BoardShape())
+        board = board_object(self, reflectance, shape or BoardShape(), depth or self.geometry.scene_distance)
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )

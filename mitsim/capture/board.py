@@ -22,7 +22,7 @@ _INSIDE = 1e-3
 """Projector pixels from a pixel's corners to the rays that are tried: more than rounding moves a board's edge."""
 
 
-def board_object(bench: Bench, reflectance: float, shape: BoardShape) -> Any:
+def board_object(bench: Bench, reflectance: float, shape: BoardShape, depth: float) -> Any:
     """A diffuse board before the camera, as Mitsuba loads it.
 
     Parameters
@@ -31,13 +31,15 @@ def board_object(bench: Bench, reflectance: float, shape: BoardShape) -> Any:
         whose camera it faces.
     reflectance, shape
         of the board.
+    depth
+        of its middle [mm].
     """
-    half = shape.half_side(bench.geometry)
+    half = shape.half_side(bench.geometry, depth)
     bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
     turned, camera = np.eye(4), np.eye(4)
     turned[:3, :3] = shape.turn
     camera[:3, :3], camera[:3, 3] = camera_place(bench)
-    middle = mi.ScalarAffineTransform4f().translate([0, 0, bench.geometry.scene_distance])
+    middle = mi.ScalarAffineTransform4f().translate([0, 0, depth])
     place = middle @ mi.ScalarAffineTransform4f(turned.tolist())
     world = mi.ScalarAffineTransform4f(camera.tolist())
     if shape.bow_mm:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.checkpoint import Checkpoint, claimed_session
+from mitsim.capture.checkpoint import Checkpoint, claimed_session, is_finished
 from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
@@ -21,13 +22,16 @@ from mitsim.capture.run import digital_scale
 from mitsim.capture.session import LitSession, Response, Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
-from mitsim.core.job import Job
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Clock, Job
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.output import output_folder
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer
 from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.rig.patterns import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
@@ -50,6 +54,8 @@ def calibrate(
 ) -> Factors:
     """Run a calibration session and estimate the camera's factors; see :meth:`mitsim.capture.bench.Bench.calibrate`.
 
+    Where the recipe has ``depths``, see :func:`calibrate_depths`.
+
     Parameters
     ----------
     bench
@@ -62,7 +68,58 @@ def calibrate(
     MitsimError
         as there.
     """
-    return calibrate_session(Session(bench, recipe or load_recipe(), seed), accuracy, output, resume, job or Job())
+    session = Session(bench, of_one_depth(recipe or load_recipe()), seed)
+    return calibrate_session(session, accuracy, output, resume, job or Job())
+
+
+def of_one_depth(recipe: SessionRecipe) -> SessionRecipe:
+    """The ``recipe`` of one calibration; MitsimError where it has depths."""
+    if recipe.depths:
+        raise MitsimError(
+            f"recipe: has {len(recipe.depths)} depths, and this makes one calibration; use calibrate_depths, or leave "
+            "depths out"
+        )
+    return recipe
+
+
+def calibrate_depths(
+    bench: Bench,
+    seed: int = 0,
+    accuracy: float = 1e-3,
+    recipe: SessionRecipe | None = None,
+    output: Path | str | None = None,
+    resume: bool = False,
+    job: Job | None = None,
+) -> dict[float, Factors]:
+    """The camera's factors at each of a recipe's ``depths``, by depth [mm].
+
+    Parameters
+    ----------
+    bench, seed, accuracy, recipe, resume, job
+        as for :func:`calibrate`. Each depth has light and noise of its own, whatever others there are.
+    output
+        folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
+
+    Raises
+    ------
+    MitsimError
+        as :func:`calibrate`, for a recipe without depths, and for one at which the mask or no light is.
+    """
+    recipe, job = recipe or load_recipe(), job or Job()
+    if not recipe.depths:
+        raise MitsimError("recipe: has no depths; give depths = [350, 400, 450], or use calibrate")
+    nearest = bench.geometry.mask_distance + bench.geometry.mask_thickness
+    if min(recipe.depths) <= nearest:
+        raise MitsimError(
+            f"recipe: depths has {min(recipe.depths):g}, and the mask ends {nearest:g} mm from the sensor; give more"
+        )
+    found = {}
+    with nullcontext() if output is None else output_folder(output, overwrite=resume) as folder:
+        for depth in recipe.depths:
+            session = Session(bench, recipe, integer(seed, "depth", f"{depth:g}"), depth)
+            place = None if folder is None else folder / f"{depth:g}"
+            found[depth] = calibrate_session(session, accuracy, place, resume, replace(job, clock=Clock()))
+    return found
 
 
 def calibrate_session(session: Session, accuracy: float, output: Path | str | None, resume: bool, job: Job) -> Factors:
@@ -71,14 +128,9 @@ def calibrate_session(session: Session, accuracy: float, output: Path | str | No
     Parameters
     ----------
     session
-        which bench, recipe and seed.
+        what is shown.
     accuracy, output, resume, job
         as for :func:`calibrate`.
-
-    Raises
-    ------
-    MitsimError
-        as there.
     """
     bench, recipe = session.bench, session.recipe
     Exposure(None, recipe.exposure_fraction).check(bench.rig)
@@ -87,9 +139,12 @@ def calibrate_session(session: Session, accuracy: float, output: Path | str | No
         **bench.identity(),
         "accuracy": accuracy,
         "seed": session.seed,
-        "recipe": recipe.model_dump(exclude_defaults=True),
+        **({} if session.depth is None else {"depth_mm": session.depth}),
+        "recipe": recipe.model_dump(exclude_defaults=True, exclude={"depths"}),
         "versions": {name: version for name, version in versions().items() if name in DECIDING},
     }
+    if session.depth is not None and resume and output is not None and is_finished(output, configuration):
+        return load_calibration(output)
     with claimed_session(output, configuration, resume) as checkpoint:
         plan = session.plan(accuracy, job)
         checkpoint.begin()
@@ -103,6 +158,7 @@ def calibrate_session(session: Session, accuracy: float, output: Path | str | No
             )
         result = {
             "n": bench.n,
+            "depth_mm": session.distance,
             "frames": session.shots,
             "separability_residual": noisy.separability_residual,
             "unexplained_residual": noisy.unexplained,
@@ -122,7 +178,7 @@ def calibrate_session(session: Session, accuracy: float, output: Path | str | No
             centre=session.centre,
             board_reflectance=recipe.board_reflectance,
             digital=digital_scale(bench, lit.exposure_s),
-            parallax=bench.parallax,
+            parallax=bench.parallax_from(session.distance),
             result=result,
             warnings=warnings,
             versions=versions(),

@@ -106,6 +106,15 @@ def claimed_session(
         yield Checkpoint(folder, configuration)
 
 
+def is_finished(output: Path | str, configuration: Mapping[str, Any]) -> bool:
+    """Whether the folder ``output`` holds a finished session; MitsimError when its ``configuration`` is another."""
+    path = Path(output)
+    if not (path / MANIFEST).is_file():
+        return False
+    _check_same(path, plain(configuration))
+    return bool(read_json(path / MANIFEST).get("status") == "complete")
+
+
 def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
     manifest = read_json(path / MANIFEST)
     if not isinstance(manifest, dict) or manifest.get("kind") != KIND:

@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsim.capture.calibrate import calibrate_session
+from mitsim.capture.calibrate import calibrate_session, of_one_depth
 from mitsim.capture.light import Light, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
@@ -141,12 +141,15 @@ def calibrate_lines(
     MitsimError
         as there.
     """
-    colours, recipe, job = ColourBench.of(bench, CALIBRATION), recipe or load_recipe(), job or Job()
+    colours, job = ColourBench.of(bench, CALIBRATION), job or Job()
+    recipe = of_one_depth(recipe or load_recipe())
     shared = _SharedLight(colours, Session(colours.whole, recipe, seed))
     with _claimed(output, colours.manifest, resume) as places:
         lines = zip(colours.manifest.names, colours.benches, places, strict=True)
         return {
-            name: calibrate_session(_LineSession(each, recipe, seed, shared, number), accuracy, place, resume, job)
+            name: calibrate_session(
+                _LineSession(each, recipe, seed, shared=shared, line=number), accuracy, place, resume, job
+            )
             for number, (name, each, place) in enumerate(lines)
         }
 

@@ -50,16 +50,32 @@ _LINES = 4
 
 @dataclass(frozen=True)
 class Session:
-    """What a calibration session shows, of a ``bench`` by a ``recipe``; its noise and light come from ``seed``."""
+    """What a calibration session shows, of a ``bench`` by a ``recipe``, at one depth.
+
+    Attributes
+    ----------
+    bench, recipe
+        what is calibrated, and how.
+    seed
+        of its noise and light.
+    depth
+        of the board [mm]; None: on the aligned plane.
+    """
 
     bench: Bench
     recipe: SessionRecipe
     seed: int = 0
+    depth: float | None = None
+
+    @property
+    def distance(self) -> float:
+        """From the sensor to the board's middle [mm]."""
+        return self.depth or self.bench.geometry.scene_distance
 
     @cached_property
     def board(self) -> Bench:
         """The bench with the white board instead of its scene."""
-        return self.bench.with_board(self.recipe.board_reflectance, self.recipe.board)
+        return self.bench.with_board(self.recipe.board_reflectance, self.recipe.board, self.depth)
 
     @property
     def centre(self) -> bool:
@@ -82,11 +98,11 @@ class Session:
         missed = 0 if shape == BoardShape() else missed_pixels(self.board)
         if not missed:
             return ()
-        z = self.bench.geometry.scene_distance
-        rows, columns = (z * (last - first) for first, last in self.bench.windows)
+        z = self.distance
+        rows, columns = (z * (last - first) for first, last in self.bench.windows_at(z))
         return (
             f"board: {missed} of {self.bench.n**2} projector pixels do not fall whole on it ({shape.words}), and "
-            f"their light is missing in the factors; the window is {rows:.4g} x {columns:.4g} mm on the aligned plane: "
+            f"their light is missing in the factors; the window is {rows:.4g} x {columns:.4g} mm there: "
             "take a larger board, or hang it straight",
         )
 
@@ -136,7 +152,7 @@ class Session:
         MitsimError when that is more memory or time than the ``job`` allows: before the look at the board, or after it.
         """
         n, count, starting = self.bench.n, self.signs.shape[1], job.clock.seconds()["total"]
-        first = Settings(self.bench.geometry.scene_distance)
+        first = Settings(self.distance)
         seconds = session_seconds(self.board, count, self.shots, first)
         exposures = len(self.recipe.exposure_ladder)
         session_cost(self.board, count, first, sum(seconds.values()), exposures).check("calibration", job.limits)

@@ -320,25 +320,40 @@ def calibrate(
             bench = bench_of(scene, spectral(variant) if by_line else variant, camera, projector, define, outside)
         held = memory_from_here()
         if by_line:
-            found = bench.calibrate_lines(**request, recipe=session, output=folder, resume=resume, job=job)
-            payload, lines = of_calibration(found, folder)
+            colours = bench.calibrate_lines(**request, recipe=session, output=folder, resume=resume, job=job)
+            payload, lines = of_calibration(colours, folder)
             payload["memory_bytes"] = max(peak_memory() - held, 0.0)
             return finish(as_json, payload, lines, payload["warnings"])
-        factors = bench.calibrate(**request, recipe=session, output=folder, resume=resume, job=job)
+        whole: dict[str, Any] = {**request, "recipe": session, "output": folder, "resume": resume, "job": job}
+        found = [*bench.calibrate_depths(**whole).values()] if session.depths else [bench.calibrate(**whole)]
     taken = max(peak_memory() - held, 0.0)
-    payload = {**factors.manifest.result, "memory_bytes": taken, "output": str(folder)}
+    places = [str(folder / f"{depth:g}") for depth in session.depths] or [str(folder)]
+    payloads = [
+        {**factors.manifest.result, "memory_bytes": taken, "output": place}
+        for factors, place in zip(found, places, strict=True)
+    ]
+    lines = [line for payload in payloads for line in _session_lines(payload)]
+    warnings = [text for factors in found for text in factors.warnings]
+    if not session.depths:
+        return finish(as_json, payloads[0], lines, warnings)
+    return finish(as_json, {"depths": payloads, "output": str(folder), "warnings": warnings}, lines, warnings)
+
+
+def _session_lines(payload: dict[str, Any]) -> list[str]:
+    """What is said of a simulated session, by its ``payload``."""
     # JSON has no numbers beyond the finite ones.
     residual, clean, error, condition = (
         math.inf if payload[name] is None else payload[name]
         for name in ("separability_residual", "noise_free_residual", "phi_error", "condition")
     )
-    lines = [
-        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {folder}",
+    return [
+        f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: "
+        f"{payload['output']}",
         f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
         f"{condition:.2e}",
-        f"memory {taken / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
+        f"memory {payload['memory_bytes'] / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} "
+        "predicted",
     ]
-    return finish(as_json, payload, lines, factors.warnings)
 
 
 def _is_given(context: typer.Context, name: str) -> bool:

@@ -77,7 +77,7 @@ class Ladder:
         return cls(tuple(digitals), weights)
 
     def merged(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
-        """Rates (rows, columns) of one frame at each exposure, as one; ``rows`` are those that they are of."""
+        """``rates`` (rows, columns) of one frame at each exposure as one; ``rows`` are those that they are of."""
         each = iter(rates)
         if self.weights is None:
             return next(each)

@@ -23,7 +23,7 @@ CELLS = 64
 
 
 class BoardShape(BaseModel):
-    """Size, bow and tilt of the white board; its middle stays on the aligned plane."""
+    """Size, bow and tilt of the white board; its middle stays on the camera's axis."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -80,11 +80,11 @@ class BoardShape(BaseModel):
         cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
         return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)
 
-    def half_side(self, geometry: CameraGeometry) -> float:
-        """Half of the board's side [mm]; without a size, beyond what a camera of that ``geometry`` sees of it."""
+    def half_side(self, geometry: CameraGeometry, z: float) -> float:
+        """Half of the board's side [mm] at a distance ``z`` [mm] from a camera of that ``geometry``; without a size,
+        beyond what the camera sees of it."""
         if self.size_mm is not None:
             return self.size_mm / 2
-        z = geometry.scene_distance
         half = _BEYOND * (geometry.tan_half_fov * z + geometry.half_width)
         steep = math.hypot(*(math.tan(math.radians(tilt)) for tilt in (self.tilt_row_deg, self.tilt_column_deg)))
         if steep == 0:

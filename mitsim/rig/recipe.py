@@ -29,11 +29,25 @@ def _rising(exposures: tuple[float, ...]) -> tuple[float, ...]:
     return exposures
 
 
+def _different(depths: tuple[float, ...]) -> tuple[float, ...]:
+    names = [f"{depth:g}" for depth in depths]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"{twice} is there twice, to the six digits that its folder's name has; give each depth once")
+    return depths
+
+
 Exposures = Annotated[
     tuple[Annotated[float, Field(ge=1, le=LONGEST)], ...],
     Field(strict=False, min_length=1, max_length=MOST_RUNGS),
     AfterValidator(_rising),
 ]
+Depths = Annotated[
+    tuple[Annotated[float, Field(ge=1e-6, le=1e10)], ...],
+    Field(strict=False, max_length=64),
+    AfterValidator(_different),
+]
+"""As `scene_distance`; 64 sessions of the shipped scenes take ten minutes."""
 
 
 class SessionRecipe(BaseModel):
@@ -47,6 +61,7 @@ class SessionRecipe(BaseModel):
     exposure_fraction: ExposureFraction = Field(description="brightest pixel's mean, as a part of the full well")
     signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern is captured")
     repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="shots of every frame, whose mean is taken")
+    depths: Depths = Field(default=(), description="of the board [mm], a CAL folder each; none: on the aligned plane")
     exposure_ladder: Exposures = Field(default=(1.0,), description="exposures of every frame, over the shortest")
     ladder_merge: Merge = Field(default="weighted", description="how they make one: by variance, or the longest alone")
     dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS, description="frames without light, of each exposure")

@@ -29,7 +29,7 @@ from mitsim.core.job import Job
 from mitsim.optics.frames import mixes
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Estimate
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.patterns import SIDES, Lighting
 from mitsim.rig.recipe import SessionRecipe, load_recipe
@@ -69,6 +69,50 @@ def session(
         return made[key]
 
     return run
+
+
+def test_each_depth_has_factors_of_its_own(
+    shared_scene: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At each depth those of the geometric shadow there: rows from the axis, columns from 60 mm beside it, off
+    by their predicted error. In folders called by depth, which stay as they are when resumed; with the
+    parallax from there. (Planted: the board always on the aligned plane, one seed for all depths.)"""
+    monkeypatch.setattr("mitsim.capture.session.make_plan", geometric_plan)
+    bench = open_bench(shared_scene("depths16", n=16))
+    depths = recipe("pair").model_copy(update={"depths": (350.0, 450.0)})
+    found = bench.calibrate_depths(2, recipe=depths, output=tmp_path / "cal")
+    geometry = bench.geometry
+    code = geometry.build_mask().terms[-1][1]
+    for depth, factors in found.items():
+        assert factors.estimate is not None and factors.status.ok
+        half, centre = 60 * depth / 400, 60 * (1 - depth / 400)
+        errors = factors.estimate.predicted_error
+        for side, middle, error in zip((factors.left, factors.right), (0.0, centre), errors, strict=True):
+            # Columns run down -x, and the projector stands at +x.
+            edges = np.linspace(-half, half, N + 1) - middle
+            shadow = scene_factor(
+                code, geometry.mask_feature, geometry.pixel_edges, edges, geometry.mask_distance, depth
+            )
+            scale = (side * shadow).sum(axis=0) / np.square(shadow).sum(axis=0)
+            rest = np.linalg.norm(side - scale * shadow) / np.linalg.norm(side)
+            assert rest == pytest.approx(error, rel=0.3)
+        result, parallax = factors.manifest.result, factors.manifest.parallax
+        assert result["depth_mm"] == depth and parallax is not None and parallax.depth_mm == depth
+        assert parallax.column_tan == pytest.approx(np.array([-half - centre, half - centre]) / depth, abs=1e-5)
+        assert parallax.column_mm == pytest.approx((-60, -60), abs=1e-3)
+        folder = tmp_path / "cal" / f"{depth:g}"
+        assert np.array_equal(load_calibration(folder).left, factors.left)
+    assert len({factors.manifest.configuration["seed"] for factors in found.values()}) == 2
+    stamp = (tmp_path / "cal" / "350" / "manifest.json").stat().st_mtime_ns
+    again = bench.calibrate_depths(2, recipe=depths, output=tmp_path / "cal", resume=True)
+    assert np.array_equal(again[450.0].right, found[450.0].right)
+    assert (tmp_path / "cal" / "350" / "manifest.json").stat().st_mtime_ns == stamp
+    with pytest.raises(MitsimError, match="use calibrate_depths"):
+        bench.calibrate(recipe=depths)
+    with pytest.raises(MitsimError, match="has no depths"):
+        bench.calibrate_depths()
+    with pytest.raises(MitsimError, match="the mask ends 2 mm"):
+        bench.calibrate_depths(recipe=depths.model_copy(update={"depths": (1.5,)}))
 
 
 def geometric(bench: Bench) -> np.ndarray:
