@@ -32,13 +32,13 @@ from mitsim.rig.chart import ChartPlace
 from mitsim.rig.efficiency import EfficiencyCurve
 from mitsim.rig.framelist import DarkFile, FrameList, StripeFile
 from mitsim.rig.profile import MaskProfile
-from mitsim.rig.projector import ProjectorModel
+from mitsim.rig.projector import Coherence, ProjectorModel
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.rig.sensor import SensorModel
 
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
-    *(CameraGeometry, MaskProfile, ProjectorModel),
+    *(CameraGeometry, MaskProfile, ProjectorModel, Coherence),
     *(SensorModel, EfficiencyCurve),
     *(SessionRecipe, BoardShape),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
@@ -68,9 +68,8 @@ def _default(value: Any) -> str:
 
 def _allowed(rules: dict[str, Any]) -> str:
     """What a field takes, from its JSON schema."""
-    for choice in rules.get("anyOf", ()):
-        if choice.get("type") != "null":
-            return f"{_allowed(choice)}, null"
+    if "anyOf" in rules:
+        return ", ".join("null" if choice.get("type") == "null" else _allowed(choice) for choice in rules["anyOf"])
     if "const" in rules or "enum" in rules:
         return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
     if "$ref" in rules or rules.get("type") == "object":

@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 _PITCH_TOLERANCE = 1e-3
 """Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
 
+_SPECKLED_SHOTS = 8
+"""Shots whose contrast stands for a family's: those of dots differ by less than a percent, by where the window ends."""
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -424,6 +427,29 @@ class Bench:
         from mitsim.rig.patterns import parse_patterns
 
         return parse_patterns(patterns, self.n, seed)
+
+    def speckle(self, family: PatternFamily | None = None) -> float:
+        """Contrast of laser speckle in a sensor pixel: as the projector states it, or, computed, under the patterns of
+        a ``family`` (rms over some of its shots; None: a white picture)."""
+        if self.projector.speckle is None:
+            return self.projector.speckle_contrast
+        import numpy as np
+
+        from mitsim.optics.speckle import contrast_of
+
+        key = None if family is None else (family.left.tobytes(), family.right.tobytes())
+        if key not in self._contrasts:
+            rows, columns = ((far - near) * self.geometry.scene_distance / self.n for near, far in self.windows)
+            shots = () if family is None else family.shots[:: -(-len(family.shots) // _SPECKLED_SHOTS)]
+            lit = [family.light(shot) for shot in shots] if family else [np.ones((self.n, self.n))]
+            each = [contrast_of(self.rig, (rows, columns), light) for light in lit if light.any()]
+            self._contrasts[key] = float(np.sqrt(np.mean(np.square(each))))
+        return self._contrasts[key]
+
+    @cached_property
+    def _contrasts(self) -> dict[tuple[bytes, bytes] | None, float]:
+        """Those that were computed, by their family's patterns."""
+        return {}
 
     def identity(self) -> dict[str, Any]:
         """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid."""

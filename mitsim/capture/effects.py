@@ -70,7 +70,7 @@ class Physics:
             projector=bench.projector_optics,
             spectrum=bench.spectrum if bench.geometry.diffracts else None,
             black_level=bench.projector.black_level,
-            speckle=bench.projector.speckle_contrast,
+            speckle=bench.speckle(),
             lamps=bench.loaded.lamps,
             mirrors=bench.loaded.mirrors,
             interreflection=True,

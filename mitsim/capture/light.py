@@ -27,7 +27,7 @@ from mitsim.core.job import Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, bound_of
-from mitsim.rig.patterns import Lighting
+from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.ledger import Ledger
 
@@ -278,6 +278,10 @@ class Light:
         """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up
         to it."""
         return replace(self, simulation=Simulation(bench, self.simulation.settings))
+
+    def speckle(self, family: PatternFamily | None = None) -> float:
+        """Contrast of speckle in frames of a ``family`` (None: of a white picture); 0 where it is left out."""
+        return self.bench.speckle(family) if self.simulation.physics.speckle else 0.0
 
     def merged(self) -> Light:
         """The same light as one group: frames come without a variance, and faster."""

@@ -172,7 +172,7 @@ def capture(
             # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
             totals = Totals.of(expected)
         exposure_s = request.timing.choose(bench.rig, totals.peak)
-        exposer = Exposer(bench.rig, exposure_s, request.seed, light.simulation.physics.speckle)
+        exposer = Exposer(bench.rig, exposure_s, request.seed, light.speckle(family))
         digital = digital_scale(bench, exposure_s)
         with job.clock.stage("write"):
             recorder.begin()

@@ -36,7 +36,7 @@ from mitsim.reconstruct.ladder import Chosen, Ladder
 from mitsim.rig.board import BoardShape
 from mitsim.rig.digital import digital_of
 from mitsim.rig.order import Half, taken
-from mitsim.rig.patterns import SIDES, Lighting, stripe_signs
+from mitsim.rig.patterns import SIDES, Lighting, PatternFamily, stripe_signs
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
 
@@ -191,7 +191,8 @@ class Session:
             white = next(iter(light.frames(Lighting.uniform(self.bench.n), self.seed)))
             exposure = Exposure(None, self.recipe.exposure_fraction)
             exposure_s = exposure.choose(self.bench.rig, float(white.irradiance.max()))
-        return LitSession(self, light, white, exposure_s, light.simulation.physics.speckle)
+        stripes = PatternFamily("stripes", self.signs[:, 1:2].astype(np.int8), np.ones((self.bench.n, 1), np.int8))
+        return LitSession(self, light, white, exposure_s, light.speckle(stripes))
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,43 @@
-"""Laser speckle on the sensor: from irradiance to one realisation of what coherent light makes of it.
+"""Laser speckle on the sensor: from irradiance to one realisation of what coherent light makes of it; and its contrast.
 
 Integrated speckle after Goodman (Speckle Phenomena in Optics, section 4.6): light that averages over M independent
 modes (polarisations, laser lines, grains within a pixel, moments of a scanned beam) follows a gamma distribution of
 mean 1 and standard deviation C = M^(-1/2), the speckle contrast. Sensor pixels are independent: a grain lambda z / D of
 an illuminated patch D = 120 mm is 2 um at 400 mm, below a pixel. Contrast 0 passes light through unchanged.
+
+The contrast of a pixel of width p follows from what it sees. Points u of a rough surface at distance z shine with
+independent phases, B(u) of their light reaches the pixel through the mask, and a beam that is scanned over them lights
+some together. With <> the mean over pairs of points u, u', each weighed by B, and over the sensor's pixels,
+
+    C^2 = (1 + P^2) / 2  sum_kl w_k w_l mu_kl^2  < g(u - u') sinc^2(p dx / lambda z) sinc^2(p dy / lambda z) >.
+
+- P is the degree of polarisation of the scattered light: two polarisations speckle apart (Goodman, 3.3).
+- w_k are the lines' shares of the photons. Over heights of standard deviation h their fields have a coherence mu_kl =
+  exp(-(4 pi h (1/lambda_k - 1/lambda_l))^2 / 2) (Goodman, chapter 6; light falls and leaves near the normal). Within a
+  line of standard deviation s the same leaves mu_kk^2 = (1 + (8 pi h s / lambda^2)^2)^(-1/2).
+- sinc^2 is what a pixel's area leaves of the grains of two points: the van Cittert-Zernike theorem, with Goodman's
+  number of grains in an aperture (4.4). Light through a fraction of the mask's openings comes from fewer points.
+- g is how coherently the beam lights two points: 1 where all is lit at once, exp(-|u - u'|^2 / r^2) for a Gaussian beam
+  of 1/e^2 radius r, whose places add up in one exposure as intensities.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Coherence
+from mitsim.rig.rig import Rig
+
+_NODES = 16
+"""Of Gauss and Legendre's rule over half a triangle that two projector pixels' points are apart: six digits of the
+widest kernel's bend, four of a beam as narrow as a tenth of a pixel."""
+Kernel = Callable[[FloatArray], FloatArray]
+"""Of distances along one axis [mm]."""
 
 
 def speckled(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
@@ -36,3 +62,128 @@ def speckled(irradiance: FloatArray, contrast: float, rng: np.random.Generator) 
     if contrast == 0:
         return irradiance
     return np.asarray(irradiance * rng.gamma(contrast**-2, contrast**2, size=irradiance.shape))
+
+
+def contrast_of(rig: Rig, pixels_mm: tuple[float, float], lit: FloatArray) -> float:
+    """The contrast of speckle in one sensor pixel, by the formula above, mean over the sensor.
+
+    Parameters
+    ----------
+    rig
+        camera and projector, whose table ``speckle`` says how coherent its light is; its defaults where there is none.
+    pixels_mm
+        height and width of a projector pixel on the aligned plane [mm].
+    lit
+        (n, n) light of each projector pixel, any unit.
+
+    Raises
+    ------
+    MitsimError
+        where no pixel is lit.
+    """
+    if not lit.any():
+        raise MitsimError("speckle contrast: no projector pixel is lit; light makes it")
+    coherence, spectrum = rig.projector.speckle or Coherence(), rig.projector.spectrum
+    inverse = 1 / spectrum.wavelengths_nm
+    pairs = _coherences(spectrum.wavelengths_nm, coherence.roughness_um, coherence.linewidth_nm)
+    pairs *= np.outer(spectrum.weights, spectrum.weights)
+    spaces = {
+        wavelength: _space(rig, pixels_mm, lit, wavelength * 1e-6)
+        for wavelength in np.unique(2 / (inverse[:, None] + inverse)[pairs > 0])
+    }
+    # Of two lines, grains at their mean wave number; where lines are coherent at all they are close to it.
+    both = np.array([[spaces.get(2 / (k + other), 0.0) for other in inverse] for k in inverse])
+    return float(np.sqrt((1 + coherence.polarisation**2) / 2 * (pairs * both).sum()))
+
+
+def _coherences(wavelengths_nm: FloatArray, roughness_um: float | None, linewidth_nm: float) -> FloatArray:
+    """(lines, lines) mu_kl^2; lines are independent where the roughness is not known.
+
+    Parameters
+    ----------
+    wavelengths_nm
+        (lines,).
+    roughness_um
+        standard deviation of the surface's height, or None.
+    linewidth_nm
+        standard deviation of each line.
+    """
+    if roughness_um is None:
+        return np.eye(len(wavelengths_nm))
+    height = 1e3 * roughness_um
+    phase = 4 * np.pi * height * (1 / wavelengths_nm[:, None] - 1 / wavelengths_nm)
+    found = np.exp(-np.square(phase))
+    within = 1 / np.sqrt(1 + np.square(8 * np.pi * height * linewidth_nm / np.square(wavelengths_nm)))
+    np.fill_diagonal(found, within)
+    return np.asarray(found)
+
+
+def _space(rig: Rig, pixels_mm: tuple[float, float], lit: FloatArray, wavelength_mm: float) -> float:
+    """The mean over pairs of points, for one wavelength [mm]; other parameters as for :func:`contrast_of`.
+
+    Of speckle's variance over all pixels, relative to the sum of their light's squares: the mask's shadow has pixels of
+    more light and of less.
+    """
+    camera, radius = rig.camera, (rig.projector.speckle or Coherence()).beam_radius_mm
+    width = camera.pixel_pitch * np.sqrt(camera.pixel_fill_factor)
+
+    def grains(distance: FloatArray) -> FloatArray:
+        kernel = np.square(np.sinc(width * distance / (wavelength_mm * camera.scene_distance)))
+        return np.asarray(kernel if radius is None else kernel * np.exp(-np.square(distance / radius)))
+
+    sizes = [2 * side for side in lit.shape]
+    spectrum = np.square(np.abs(np.fft.rfft2(lit, sizes)))
+    apart = np.fft.irfft2(spectrum, sizes)  # light of pairs of pixels, by how many rows and columns they are apart
+
+    def mean(kernel: Kernel) -> float:
+        total = 0.0
+        for weight, seen in _pairs_seen(camera):
+            rows, columns = (
+                _between_pixels((kernel, seen), size, side) for size, side in zip(pixels_mm, lit.shape, strict=True)
+            )
+            total += weight * float(rows @ apart @ columns)
+        return total
+
+    return mean(grains) / mean(np.ones_like)
+
+
+def _between_pixels(kernels: tuple[Kernel, Kernel], size: float, count: int) -> FloatArray:
+    """(2 count,) mean of two kernels' product over pairs of points of two pixels, by how many pixels these are apart: 0
+    to count - 1, then -count to -1.
+
+    Parameters
+    ----------
+    kernels
+        of the points' distance [mm].
+    size
+        of a pixel [mm].
+    count
+        of pixels.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    part, share = (nodes + 1) / 2, weights / 2 * (1 - (nodes + 1) / 2)
+    lags = np.fft.fftfreq(2 * count, 1 / (2 * count))[:, None]
+    places = np.stack([(lags + part) * size, (lags - part) * size])
+    return np.asarray((share * kernels[0](places) * kernels[1](places)).sum(axis=(0, 2)))
+
+
+def _pairs_seen(camera: CameraGeometry) -> tuple[tuple[float, Kernel], ...]:
+    """How much more often than by chance a pixel sees both of two points, as a sum of weights times kernels of rows and
+    of columns: codes whose features are open independently, each half of them or as many as are."""
+    apart = camera.mask_distance / (camera.scene_distance * camera.mask_feature)
+
+    def always(distance: FloatArray) -> FloatArray:
+        return np.ones_like(distance)
+
+    def one_feature(distance: FloatArray) -> FloatArray:
+        return np.asarray(np.maximum(1 - np.abs(distance) * apart, 0))
+
+    if camera.mask == "separable":
+        return ((1.0, lambda distance: 1 + one_feature(distance)),)
+    open_part = {"open": 1.0, "flatcam": 0.5}.get(camera.mask) or _open_part(camera)
+    return ((1.0, always), (1 / open_part - 1, one_feature))
+
+
+def _open_part(camera: CameraGeometry) -> float:
+    """Mean transmission of a camera file's mask."""
+    return float(sum(weight * rows.mean() * columns.mean() for weight, rows, columns in camera.build_mask().terms))

@@ -85,6 +85,36 @@ Share = Annotated[float, Field(ge=0, le=1e6)]
 """Power beside the other lines' power: a millionth is none."""
 
 
+class Coherence(BaseModel):
+    """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.speckle.contrast_of`)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    beam_radius_mm: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e3,
+        description="1/e^2 radius of a scanned beam's spot [mm]; none: all is lit at once",
+    )
+    """A micrometre, less than any grain, to a metre, which is all at once."""
+    polarisation: float = Field(
+        default=0.0, ge=0, le=1, description="degree of polarisation of the scattered light; 0: paper, paint; 1: metal"
+    )
+    roughness_um: float | None = Field(
+        default=None, ge=0, le=1e6, description="surface's height, standard deviation [um]; none: lines speckle apart"
+    )
+    linewidth_nm: float = Field(
+        default=0.0, ge=0, le=1e3, description="standard deviation of each line [nm]; needs roughness_um"
+    )
+    """Laser diodes have some 1."""
+
+    @model_validator(mode="after")
+    def _a_linewidth_needs_a_roughness(self) -> Coherence:
+        if self.linewidth_nm and self.roughness_um is None:
+            raise ValueError(f"linewidth_nm: got {self.linewidth_nm:g} without roughness_um; give both")
+        return self
+
+
 class ProjectorModel(BaseModel):
     """A projector's light and lens, and where their numbers come from.
 
@@ -115,6 +145,9 @@ class ProjectorModel(BaseModel):
     """A millimetre, for microscopes, to 10 km."""
     speckle_contrast: float = Field(0.0, ge=0, le=1, description="of one sensor pixel's light; see docs/physics.md")
     """1 is speckle fully developed; more needs light that is not laser light."""
+    speckle: Coherence | None = Field(
+        None, description="table, in place of a number: what the contrast is computed from"
+    )
     blur_pixels: float = Field(0.0, ge=0, le=16, description="spot's standard deviation [pixels]")
     """16 leaves 0.7 % of the contrast of stripes of 16 pixels: a projector with fewer pixels than it says."""
     luminous_flux_lm: float | None = Field(None, ge=1e-3, le=1e6, description="light of a white picture [lm]")
@@ -143,6 +176,12 @@ class ProjectorModel(BaseModel):
             )
         if self.radiant_shares and not sum(self.radiant_shares) > 0:
             raise ValueError("radiant_shares are all 0; at least one line must have power")
+        return self
+
+    @model_validator(mode="after")
+    def _one_contrast(self) -> ProjectorModel:
+        if self.speckle is not None and "speckle_contrast" in self.model_fields_set:
+            raise ValueError(f"got speckle_contrast {self.speckle_contrast:g} and the table speckle; give one of them")
         return self
 
     @model_validator(mode="after")

@@ -212,7 +212,7 @@ class _Trials:
             known = {ASSUMED: assumed, CALIBRATED: (fitted.left, fitted.right)}
             for family in self.families:
                 expected = scene.frames(family.lighting, self.seed)
-                speckle = scene.simulation.physics.speckle
+                speckle = scene.speckle(family)
                 exposer = Exposer(bench.rig, peak_time(bench, expected), self.seed, speckle)
                 yield from self._rows(("rendered", mask, name), exposer, family, expected, known)
 

@@ -203,7 +203,7 @@ class Unexposed:
 
     def exposer(self, seconds: float) -> Exposer:
         """The camera, at an exposure time of so many ``seconds``."""
-        speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
+        speckle = self.lit.light.speckle(self.family) if self.model == RENDERED else 0.0
         return Exposer(self.lit.bench.rig, seconds, self.seed, speckle)
 
     def noise(self, seconds: float) -> float:

@@ -199,3 +199,16 @@ def test_a_new_effect_is_an_entry_and_its_physics(small_scene: Callable[..., Pat
 
 def electrons(run: Path) -> Any:
     return mitsim.load_run(run).electrons
+
+
+def test_computed_speckle_is_that_of_the_shots(small_scene: Callable[..., Path], tmp_path: Path, variant: str) -> None:
+    """A scanned beam averages over fewer places under dots; frames have the family's contrast, and none without it."""
+    projector = tmp_path / "laser.toml"
+    projector.write_text(IDEAL + "[speckle]\nbeam_radius_mm = 0.5\n", encoding="utf-8")
+    bench = open_bench(small_scene(), variant, None, projector)
+    white, dots = bench.speckle(), bench.speckle(bench.family("dots:4"))
+    assert 0 < white < dots < 1 and Physics.of(bench).speckle == white and "speckle" in effects.present(bench)
+    assert bench.speckle(bench.family("uniform")) == pytest.approx(white)
+    light = bench.light("dots:4", accuracy=1e-2, effects={"speckle": True})
+    assert light.speckle(bench.family("dots:4")) == dots
+    assert bench.light("dots:4", accuracy=1e-2, effects={"speckle": False}).speckle(bench.family("dots:4")) == 0

@@ -78,3 +78,19 @@ def test_a_spectrum_is_of_photons_and_some_line_has_power() -> None:
 def test_arrays_that_are_no_spectrum_are_refused(wavelengths: list[float], weights: list[float]) -> None:
     with pytest.raises(MitsimError, match=r"^spectrum [^\n]+$"):
         Spectrum(np.array(wavelengths), np.array(weights))
+
+
+def test_speckle_is_a_number_or_a_table(tmp_path: Path) -> None:
+    path = tmp_path / "laser.toml"
+    head = 'name = "laser"\neffective_wavelength_nm = 562.0\n'
+    path.write_text(head + "[speckle]\nroughness_um = 20.0\nlinewidth_nm = 1.0\n")
+    model = load_model(path, ProjectorModel)
+    assert model.speckle and model.speckle.linewidth_nm == 1.0
+    for text, words in (
+        ("speckle_contrast = 0.0\n[speckle]\n", "got speckle_contrast 0 and the table speckle; give one"),
+        ("[speckle]\nlinewidth_nm = 1.0\n", "got 1 without roughness_um; give both"),
+        ("[speckle]\npolarization = 1.0\n", "did you mean polarisation"),
+    ):
+        path.write_text(head + text)
+        with pytest.raises(MitsimError, match=words):
+            load_model(path, ProjectorModel)
