@@ -12,7 +12,8 @@ import numpy as np
 from PIL import Image
 
 from mitsim.core.framefile import write_frame
-from mitsim.rig.patterns import SIDES, stripe_signs
+from mitsim.rig.order import SIDES
+from mitsim.rig.patterns import stripe_signs
 
 DIGITAL = {
     "exposure_s": 0.02,

@@ -32,7 +32,7 @@ from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.rig.patterns import SIDES
+from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 NOISY, NOISE_FREE = "noisy", "noise_free"

@@ -29,7 +29,7 @@ from mitsim.core.seeds import stream
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
-from mitsim.rig.patterns import SIDES
+from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.moments import frame_moments
 

@@ -35,8 +35,8 @@ from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, decibels
 from mitsim.reconstruct.ladder import Chosen, Ladder
 from mitsim.rig.board import BoardShape
 from mitsim.rig.digital import digital_of
-from mitsim.rig.order import Half, taken
-from mitsim.rig.patterns import SIDES, Lighting, PatternFamily, stripe_signs
+from mitsim.rig.order import SIDES, Half, taken
+from mitsim.rig.patterns import Lighting, PatternFamily, stripe_signs
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
 

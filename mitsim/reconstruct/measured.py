@@ -26,8 +26,8 @@ from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_o
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.ladder import Chosen, Ladder
 from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
-from mitsim.rig.order import UNIFORM, Half
-from mitsim.rig.patterns import SIDES, Side, stripe_signs
+from mitsim.rig.order import SIDES, UNIFORM, Half, Side
+from mitsim.rig.patterns import stripe_signs
 
 
 def calibrate_frames(

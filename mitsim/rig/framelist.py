@@ -19,8 +19,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.imagefile import Raw, Wanted, image_files
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
-from mitsim.rig.order import UNIFORM, Half, taken
-from mitsim.rig.patterns import Side, stripe_count
+from mitsim.rig.order import UNIFORM, Half, Side, taken
+from mitsim.rig.patterns import stripe_count
 from mitsim.rig.recipe import MOST_REPEATS, MOST_RUNGS, Exposures, Merge
 
 LISTS = ("session.toml", "session.json")

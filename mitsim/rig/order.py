@@ -6,8 +6,9 @@ import random
 from collections.abc import Iterator
 from typing import Literal
 
-from mitsim.rig.patterns import SIDES, Side
-
+Side = Literal["horizontal", "vertical"]
+SIDES: tuple[Side, Side] = ("horizontal", "vertical")
+"""Stripes of a calibration: h_i 1^T, and 1 h_i^T."""
 Order = Literal["listed", "reversed", "interleaved", "random"]
 UNIFORM = 0
 """Sign of a frame under uniform light."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +21,6 @@ from mitsim.rig.families import read_name
 
 PatternFactor = npt.NDArray[np.int8]
 """(n, K) of 0/1 or +-1: one side of K separable patterns."""
-Side = Literal["horizontal", "vertical"]
-SIDES: tuple[Side, Side] = ("horizontal", "vertical")
-"""Stripes of a calibration: h_i 1^T, and 1 h_i^T."""
 
 
 @dataclass(frozen=True)

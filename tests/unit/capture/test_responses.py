@@ -27,7 +27,8 @@ from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate
 from mitsim.reconstruct.ladder import Ladder
 from mitsim.reconstruct.measured import calibrate_frames
-from mitsim.rig.patterns import SIDES, Lighting
+from mitsim.rig.order import SIDES
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import load_recipe
 from mitsim.rig.rig import Rig
 from mitsim.rig.sensor import SensorModel

@@ -31,7 +31,8 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Estimate
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.rig.camera import centred_edges
-from mitsim.rig.patterns import SIDES, Lighting
+from mitsim.rig.order import SIDES
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -413,7 +414,7 @@ def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path]
 def test_describing_a_session_traces_nothing(
     shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("make_plan", "trace_light"):
+    for name in ("make_plan", "trace_lines"):
         monkeypatch.setattr(f"mitsim.capture.session.{name}", lambda *_: pytest.fail("work was done"))
     session = Session(open_bench(shared_scene("separable16", n=16)), recipe("pair"))
     assert session.shots == 64 and session.signs.shape == (16, 16)
