@@ -9,7 +9,6 @@ least light that reaches the wanted PSNR is found between two sessions of which 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,6 +23,7 @@ from mitsim.capture.request import Exposure, check_psnr
 from mitsim.capture.session import Session
 from mitsim.capture.session_cost import session_seconds
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.factors import Factors
@@ -198,7 +198,7 @@ def plan_calibration(
         for another PSNR than 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.capture.bench.Bench.capture`.
     """
     check_psnr(psnr)
-    recipe, job = of_one_depth(recipe or load_recipe()), job or Job()
+    recipe, job = _foreseeable(of_one_depth(recipe or load_recipe())), job or Job()
     Exposure(None, recipe.exposure_fraction).check(bench.rig)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
@@ -226,11 +226,21 @@ def plan_calibration(
         frames=lit.session.shots,
         exposure_s=lit.exposure_s,
         electrons=electrons,
-        photons=electrons / (bench.sensor.quantum_efficiency or math.nan),
+        photons=electrons / bench.sensor.efficiency(bench.projector.effective_wavelength_nm),
         simulation_s=plan.taking(start=0.0, **taken).predicted_seconds,
         seconds=job.clock.seconds(),
         flags=(*shots.warnings, *session.warnings, *_unknown(foreseen)),
     )
+
+
+def _foreseeable(recipe: SessionRecipe) -> SessionRecipe:
+    """The ``recipe``; MitsimError where it has what a plan does not know."""
+    if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
+        raise MitsimError(
+            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
+            "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
+        )
+    return recipe
 
 
 def _unknown(foreseen: Foreseen) -> tuple[str, ...]:

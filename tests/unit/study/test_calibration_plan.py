@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.rig.recipe import MOST_REPEATS, SessionRecipe, load_recipe, recipe_text
 from mitsim.study.calibration_plan import least_dose
 
@@ -66,6 +66,13 @@ def test_a_recipe_is_written_as_it_is_read(tmp_path: Path) -> None:
     fields = {name: field.default for name, field in SessionRecipe.model_fields.items() if not field.is_required()}
     file.write_text(recipe_text(recipe.model_copy(update=fields)), encoding="utf-8")
     assert load_recipe(file) == recipe.model_copy(update=fields)
+
+
+@pytest.mark.parametrize("change", [{"exposure_ladder": (1.0, 4.0)}, {"dark_frames": 8}, {"depths": (350.0, 450.0)}])
+def test_a_recipe_that_a_plan_does_not_know_is_refused(bench: Any, change: dict[str, Any]) -> None:
+    recipe = load_recipe().model_copy(update={"signed_capture": "uniform", **change})
+    with pytest.raises(MitsimError, match=r"^recipe: has .*leave"):
+        ms.plan_calibration(bench, 30.0, recipe=recipe)
 
 
 def test_a_quality_that_no_image_has_is_refused() -> None:
