@@ -133,14 +133,14 @@ class Deposits:
         """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
         by_line = [part.lines for part in parts if part.lines is not None]
-        lines = np.concatenate(by_line) if len(by_line) == len(parts) else None
+        lines = np.concatenate(by_line) if by_line and len(by_line) == len(parts) else None
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
         return cls(**arrays, lines=lines)
 
     def by_line(self, lines: int) -> list[Deposits]:
         """These, or the same of each of several ``lines`` with its light."""
-        if lines == 1:
-            return [self]
+        if lines == 1 or not len(self.value):
+            return [self] * lines
         assert self.lines is not None, "traced by line"
         return [replace(self, value=np.ascontiguousarray(self.lines[:, line]), lines=None) for line in range(lines)]
 

@@ -1,0 +1,144 @@
+"""`--colour lines` through the installed program: what each line's folder holds is a mono capture of that line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.framefile import read_frame
+from tests.system.conftest import tree
+from tests.unit.transport.test_neighbours import WALL
+
+LINES = {638: 0.5, 520: 0.3, 445: 0.2}
+"""Wavelengths [nm] and their parts of the power."""
+SHEET, BOARD = {638: 0.9, 520: 0.3, 445: 0.5}, {638: 0.2, 520: 0.8, 445: 0.6}
+"""Reflectance of the sheet and of a wall beside it, whose light on the sheet is a tenth of all."""
+PROJECTOR = 'name = "lines"\neffective_wavelength_nm = {mean}\nwavelengths_nm = {lines}\nradiant_shares = {shares}\n'
+POWER = 111000.0
+ACCURACY = 1e-2
+
+
+def spectrum(parts: dict[int, float]) -> str:
+    """A reflectance that has these ``parts`` at the lines."""
+    known = sorted(parts.items())
+    ends = (known[0][0] - 40, known[0][1]), *known, (known[-1][0] + 40, known[-1][1])
+    return ", ".join(f"{nm}:{part}" for nm, part in ends)
+
+
+def projector(path: Path, lines: dict[int, float]) -> Path:
+    """A file of a projector with these ``lines``."""
+    mean = sum(nm * part for nm, part in lines.items()) / sum(lines.values())
+    path.write_text(PROJECTOR.format(mean=mean, lines=[float(nm) for nm in lines], shares=list(lines.values())))
+    return path
+
+
+@pytest.fixture(scope="module")
+def coloured(shared_scene: Callable[..., Path]) -> Callable[[str], Path]:
+    """A coloured sheet, with or without a coloured wall; ``-D`` sets both spectra, and the projector's power."""
+
+    def write(name: str) -> Path:
+        bsdf = '<bsdf type="diffuse"><spectrum name="reflectance" value="$wall"/></bsdf>'
+        extra = WALL.format(turn=90, x=-30, bsdf=bsdf) if name == "corner" else ""
+        path = shared_scene(f"coloured {name}", extra=extra)
+        text = path.read_text().replace('value="111000"', 'value="$power"')
+        known = f'<default name="power" value="{POWER}"/><default name="wall" value="{spectrum(BOARD)}"/>'
+        text = text.replace(
+            '<default name="albedo" value="0.5"/>', f'<default name="albedo" value="{spectrum(SHEET)}"/>{known}'
+        )
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def electrons(run: Path) -> np.ndarray:
+    """(shots, rows, columns) expected electrons of a ``run``."""
+    return np.stack([read_frame(path)[0]["electrons"].astype(float) for path in sorted(run.glob("frame_*.exr"))])
+
+
+@pytest.mark.parametrize("name", ["sheet", pytest.param("corner", marks=pytest.mark.slow)])
+def test_each_line_is_what_a_mono_capture_of_it_gives(
+    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, name: str
+) -> None:
+    """Reflectances, power, diffraction and photons of each line alone: frames differ by their Monte Carlo errors.
+
+    In mono, light has other random numbers (seed 1), so that the two differ as independent estimates do; twice the
+    error that both state for themselves, of thousands of pixels and 4 shots, is far beyond chance. A line's own
+    brightness is off by half or more where a share, a spectrum or the photons' energy is wrong.
+    """
+    scene = coloured(name)
+    common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.1, "--json"
+    whole = projector(tmp_path / "all.toml", LINES)
+    outcome = shell("capture", scene, "-o", tmp_path / "run", "--colour", "lines", "--projector", whole, *common)
+    assert outcome.err == "" and outcome.code == 0
+    named = json.loads((tmp_path / "run" / "colour.json").read_text())
+    assert named["kind"] == outcome.payload["kind"] == "colour-run"
+    for channel, (nm, part) in zip(outcome.payload["channels"], LINES.items(), strict=True):
+        assert (channel["name"], channel["wavelength_nm"], channel["radiant_share"]) == (f"{nm}nm", nm, part)
+        alone = projector(tmp_path / f"{nm}.toml", {nm: 1.0})
+        own = {"albedo": SHEET[nm], "power": POWER * part} | ({"wall": BOARD[nm]} if name == "corner" else {})
+        defines = [text for key, value in own.items() for text in ("-D", f"{key}={value}")]
+        folder = tmp_path / f"mono {nm}"
+        mono = call("capture", scene, "-o", folder, "--projector", alone, *defines, *common, "--seed", 1).payload
+        ours, theirs = electrons(tmp_path / "run" / f"{nm}nm"), electrons(folder)
+        expected = np.hypot(channel["mc_error"], mono["mc_error"])
+        assert np.linalg.norm(ours - theirs) < 2 * expected * np.linalg.norm(theirs)
+        truths = [read_frame(run / "truth.exr")[0]["reflectance"] for run in (tmp_path / "run" / f"{nm}nm", folder)]
+        assert truths[0] == pytest.approx(truths[1], abs=2 * ACCURACY)
+
+
+@pytest.mark.slow
+def test_a_capture_in_colour_goes_on_where_it_stopped(
+    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Frames that are lost come back bit for bit, colour.json last; another configuration is refused before work."""
+    whole = projector(tmp_path / "all.toml", LINES)
+    common = "capture", coloured("sheet"), "--colour", "lines", "--projector", whole, "--patterns", "dots:2", "-o"
+    run = tmp_path / "run"
+    assert shell(*common, run, "--accuracy", 0.02).code == 0
+    before = {path: digest for path, digest in tree(run).items() if path.endswith(".exr")}
+    for lost in ("638nm/frame_00002.exr", "445nm/frame_00000.exr", "colour.json"):
+        (run / lost).unlink()
+    assert "holds files already" in shell(*common, run, "--accuracy", 0.02).refusal
+    assert "accuracy" in shell(*common, run, "--accuracy", 0.03, "--resume").refusal
+    assert not (run / "colour.json").exists()
+    assert shell(*common, run, "--accuracy", 0.02, "--resume").code == 0
+    assert {path: digest for path, digest in tree(run).items() if path.endswith(".exr")} == before
+    assert (run / "colour.json").exists()
+
+
+@pytest.mark.slow
+def test_each_line_is_calibrated_for_itself(
+    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Factors of a line are those of a mono session whose projector shows it alone, noise apart."""
+    whole = projector(tmp_path / "all.toml", LINES)
+    scene, common = coloured("sheet"), ("--accuracy", ACCURACY, "--json", "-o")
+    payload = shell("calibrate", scene, "--colour", "lines", "--projector", whole, *common, tmp_path / "cal").payload
+    assert payload["kind"] == "colour-calibration"
+    for channel, nm in zip(payload["channels"], LINES, strict=True):
+        alone = projector(tmp_path / f"{nm}.toml", {nm: 1.0})
+        mono = call("calibrate", scene, "--projector", alone, *common, tmp_path / f"mono {nm}").payload
+        for key in ("separability_residual", "noise_free_residual", "condition"):
+            assert channel[key] == pytest.approx(mono[key], rel=0.02), key
+        assert channel["exposure_s"] * LINES[nm] == pytest.approx(mono["exposure_s"], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--colour", "bands"), "--colour 'bands': use no or lines"),
+        (("--colour", "lines", "--seconds", "5"), "not planned by time"),
+    ],
+)
+def test_what_colour_cannot_do_is_refused(
+    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, options: tuple[str, ...], words: str
+) -> None:
+    scene = coloured("sheet")
+    assert words in shell("capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", *options).refusal
+    assert not (tmp_path / "run").exists()
