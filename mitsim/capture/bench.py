@@ -284,6 +284,34 @@ class Bench:
 
         return calibrate_depths(self, seed, accuracy, recipe, output, resume, job)
 
+    def write_session(
+        self,
+        frames: Path | str,
+        output: Path | str | None = None,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        job: Job | None = None,
+    ) -> Factors:
+        """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
+        which :func:`mitsim.calibrate_frames` makes the same factors.
+
+        Parameters
+        ----------
+        frames
+            new or empty folder.
+        output, seed, accuracy, recipe, job
+            as :meth:`calibrate`.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate`, for a recipe with depths, and a folder that holds something or has no room.
+        """
+        from mitsim.capture.calibrate import write_session
+
+        return write_session(self, frames, output, seed, accuracy, recipe, job)
+
     def render(
         self,
         estimator: Literal["reference", "factored"] = "reference",

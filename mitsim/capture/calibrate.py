@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from scipy import sparse
 from mitsim.capture.bench import Bench
 from mitsim.capture.checkpoint import Checkpoint, claimed_session, is_finished
 from mitsim.capture.filing import TRAYS, FiledLight
+from mitsim.capture.kept_frames import MOST_TIFF, KeptFrames
 from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Exposure
@@ -25,8 +27,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Clock, Job
 from mitsim.core.manifests import CalibrationManifest
-from mitsim.core.output import output_folder
+from mitsim.core.output import output_folder, whole_folder
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
 from mitsim.core.versions import DECIDING, versions
 from mitsim.optics.frames import Frame
@@ -122,7 +125,40 @@ def calibrate_depths(
     return found
 
 
-def calibrate_session(session: Session, accuracy: float, output: Path | str | None, resume: bool, job: Job) -> Factors:
+def write_session(
+    bench: Bench,
+    frames: Path | str,
+    output: Path | str | None = None,
+    seed: int = 0,
+    accuracy: float = 1e-3,
+    recipe: SessionRecipe | None = None,
+    job: Job | None = None,
+) -> Factors:
+    """What :func:`calibrate` does, and its frames in a folder as `mitsim calibrate --frames` reads it.
+
+    Parameters
+    ----------
+    bench, output, seed, accuracy, recipe, job
+        as there.
+    frames
+        new or empty folder.
+
+    Raises
+    ------
+    MitsimError
+        as there, for a recipe with depths, a folder that holds something, and a disk without room.
+    """
+    session = Session(bench, of_one_depth(recipe or load_recipe()), seed)
+    with whole_folder(frames) as folder:
+        number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
+        size = Cost(disk_bytes=float(session.shots * bench.geometry.pixels**2 * number_bytes))
+        size.check("frames", Limits(), folder)
+        return calibrate_session(session, accuracy, output, False, job or Job(), folder)
+
+
+def calibrate_session(
+    session: Session, accuracy: float, output: Path | str | None, resume: bool, job: Job, frames: Path | None = None
+) -> Factors:
     """Run a ``session`` and estimate the camera's factors.
 
     Parameters
@@ -131,6 +167,8 @@ def calibrate_session(session: Session, accuracy: float, output: Path | str | No
         what is shown.
     accuracy, output, resume, job
         as for :func:`calibrate`.
+    frames
+        folder that its frames are written to.
     """
     bench, recipe = session.bench, session.recipe
     Exposure(None, recipe.exposure_fraction).check(bench.rig)
@@ -149,7 +187,11 @@ def calibrate_session(session: Session, accuracy: float, output: Path | str | No
         plan = session.plan(accuracy, job)
         checkpoint.begin()
         lit = session.lit(_light(session, plan, checkpoint, job), job)
+        if frames is not None:
+            lit = replace(lit, kept=KeptFrames(session, frames))
         (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
+        if lit.kept is not None:
+            lit.kept.finish(digital_scale(bench, lit.exposure_s))
         warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
         if saturated:
             warnings += (

@@ -18,6 +18,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.board import missed_pixels
 from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import Exposer, camera_warnings, in_chunks
+from mitsim.capture.kept_frames import KeptFrames
 from mitsim.capture.light import Light, Sampling, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
@@ -219,6 +220,8 @@ class LitSession:
         of every shot [s], the shortest where there are several.
     speckle
         contrast of laser speckle in the frames.
+    kept
+        where its frames are written to; None: nowhere.
     """
 
     session: Session
@@ -226,6 +229,7 @@ class LitSession:
     white: Frame
     exposure_s: float
     speckle: float
+    kept: KeptFrames | None = None
 
     @property
     def response_noise(self) -> float:
@@ -376,7 +380,7 @@ class LitSession:
         for exposure, exposer in enumerate(self._exposers):
             total = np.zeros(still.shape)
             for index in range(number):
-                total += exposer.digital(still, "calibration", "dark", exposure, index)
+                total += self._read(exposer, still, "dark", exposure, index)
             rates.append(exposer.rate(total / number))
         return {side: ladder.merged(rates) for side, ladder in self.ladders.items()}
 
@@ -424,7 +428,7 @@ class LitSession:
             pixels that count.
         """
         exposer, repeats = self._exposers[exposure], self.session.recipe.repeats
-        names: tuple[str | int, ...] = ("calibration", side, index)
+        names: tuple[str | int, ...] = (side, index)
         names += ("exposure", exposure) if exposure else ()
 
         def saturated(digital: Digital) -> bool:
@@ -432,16 +436,23 @@ class LitSession:
                 return exposer.saturated(digital, lit)
             return exposer.saturated(np.where(used, digital, 0), np.where(used, lit, 0.0))
 
-        digital = exposer.digital(lit, *names)
+        digital = self._read(exposer, lit, *names)
         if repeats == 1:
             return digital, int(saturated(digital))
         count, mean = int(saturated(digital)), digital.astype(np.float64)
         for repeat in range(1, repeats):
-            digital = exposer.digital(lit, *names, "repeat", repeat)
+            digital = self._read(exposer, lit, *names, "repeat", repeat)
             count += saturated(digital)
             mean += digital
         mean /= repeats
         return mean, count
+
+    def _read(self, exposer: Exposer, lit: FloatArray, *names: str | int) -> Digital:
+        """One noisy frame, which is kept where frames are; ``names`` find its noise."""
+        digital = exposer.digital(lit, "calibration", *names)
+        if self.kept is not None:
+            self.kept.write(names, digital)
+        return digital
 
     def _rate(self, shot: _Shot, rows: slice) -> FloatArray:
         """Rates of some ``rows`` of a ``shot``."""

@@ -62,7 +62,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-_OF_FRAMES = {"frames", "output", "as_json", "quiet"}
+_OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
 _SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
 """Options that are not called like their parameter."""
@@ -280,6 +280,9 @@ def calibrate(
     ] = False,
     psnr: Annotated[float | None, typer.Option(help="wanted of --plan's image [dB]", metavar="DB")] = None,
     patterns: Annotated[str | None, typer.Option(help="of --plan's capture", show_default="dots:7")] = None,
+    write_frames: Annotated[
+        Path | None, typer.Option(help="folder to write the simulated frames to, for --frames", metavar="DIR")
+    ] = None,
     seed: Seed = 0,
     define: Defines = None,
     outside: Outside = False,
@@ -296,7 +299,7 @@ def calibrate(
     if frames is not None:
         given = (name for name in context.params if _is_given(context, name))
         others = sorted({*given} - _OF_FRAMES)
-        return _calibrate_frames(frames, check_no_plan(None, None, output), others, as_json, quiet)
+        return _calibrate_frames(frames, check_no_plan(None, None, output), camera, others, as_json, quiet)
     if scene is None:
         raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
     from mitsim.core.resources import memory_from_here, peak_memory
@@ -304,8 +307,16 @@ def calibrate(
 
     request = request_of(accuracy=accuracy, seed=seed)
     session = load_recipe(recipe)
+    if write_frames is not None and resume:
+        raise MitsimError("--write-frames: a resumed session shows its finished patterns no more; leave out --resume")
     by_line = colour == "lines"
+    if by_line and write_frames is not None:
+        raise MitsimError(
+            f"--write-frames {write_frames}: frames are kept of light that is not told apart; leave one out"
+        )
     if planning:
+        if write_frames is not None:
+            raise MitsimError(f"--write-frames {write_frames}: --plan takes no frames; leave one of them out")
         if by_line:
             raise MitsimError("--colour lines: --plan is for light that is not told apart; leave one of them out")
         wanted = Wanted.of(psnr, patterns, output, resume)
@@ -324,8 +335,13 @@ def calibrate(
             payload, lines = of_calibration(colours, folder)
             payload["memory_bytes"] = max(peak_memory() - held, 0.0)
             return finish(as_json, payload, lines, payload["warnings"])
-        whole: dict[str, Any] = {**request, "recipe": session, "output": folder, "resume": resume, "job": job}
-        found = [*bench.calibrate_depths(**whole).values()] if session.depths else [bench.calibrate(**whole)]
+        whole: dict[str, Any] = {**request, "recipe": session, "output": folder, "job": job}
+        if write_frames is not None:
+            found = [bench.write_session(write_frames, **whole)]
+        elif session.depths:
+            found = [*bench.calibrate_depths(**whole, resume=resume).values()]
+        else:
+            found = [bench.calibrate(**whole, resume=resume)]
     taken = max(peak_memory() - held, 0.0)
     places = [str(folder / f"{depth:g}") for depth in session.depths] or [str(folder)]
     payloads = [
@@ -362,12 +378,14 @@ def _is_given(context: typer.Context, name: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-def _calibrate_frames(folder: Path, output: Path, others: Sequence[str], as_json: bool, quiet: bool) -> int:
+def _calibrate_frames(
+    folder: Path, output: Path, camera: str | None, others: Sequence[str], as_json: bool, quiet: bool
+) -> int:
     """Factors from the frames of a real session, and how good they are.
 
     Parameters
     ----------
-    folder, output, as_json, quiet
+    folder, output, camera, as_json, quiet
         as the options of `mitsim calibrate`.
     others
         options beside them, which frames leave no choice of.
@@ -388,7 +406,7 @@ def _calibrate_frames(folder: Path, output: Path, others: Sequence[str], as_json
 
     held = memory_from_here()
     with job_of(quiet or as_json) as job:
-        factors = calibrate_frames(session, output, job)
+        factors = calibrate_frames(session, output, job, camera)
     payload = {
         **factors.manifest.result,
         "memory_bytes": max(peak_memory() - held, 0.0),

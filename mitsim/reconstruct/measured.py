@@ -6,13 +6,14 @@ Numbers are those of a simulated session: frames of one, written to such a folde
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, verify
 from mitsim.core.imagefile import image_size, own_end, read_image
@@ -25,13 +26,24 @@ from mitsim.core.versions import versions
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.ladder import Chosen, Ladder
+from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.rig.order import SIDES, UNIFORM, Half, Side
 from mitsim.rig.patterns import stripe_signs
+from mitsim.rig.sensor import load_sensor
+
+_FILLED = ("read_noise_e", "step_dn", "saturation_dn")
+"""Of a list's `digital`, what a camera's file states where the list does not."""
+_COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
+"""What both state, and from which relative and absolute difference they contradict: published gains are good to a few
+percent, level and end are settings, true to a digital number."""
 
 
 def calibrate_frames(
-    folder: Path | str | SessionFrames, output: Path | str | None = None, job: Job | None = None
+    folder: Path | str | SessionFrames,
+    output: Path | str | None = None,
+    job: Job | None = None,
+    camera: Path | str | None = None,
 ) -> Factors:
     """The camera's two factors, from the frames of a real session.
 
@@ -43,11 +55,15 @@ def calibrate_frames(
         CAL folder that is written; None keeps the factors in memory.
     job
         clock and progress.
+    camera
+        name of a shipped camera, or its TOML file: what the list does not state of noise and saturation is the
+        camera's, and what it states is compared.
 
     Returns
     -------
     Factors
-        flagged where they cannot be trusted: for saturated frames, and responses that are not separable.
+        flagged where they cannot be trusted: for saturated frames, responses that are not separable, and a list that
+        contradicts the camera.
 
     Raises
     ------
@@ -57,20 +73,40 @@ def calibrate_frames(
     """
     job = job or Job()
     session = folder if isinstance(folder, SessionFrames) else load_frames(folder)
+    doubts: tuple[str, ...] = ()
+    if camera is not None:
+        session, doubts = _with_camera(session, camera)
     _check_sizes(session)
     if output is None:
-        return _calibrated(session, job)
+        return _calibrated(session, job, doubts)
     with output_folder(output) as place:
-        factors = _calibrated(session, job)
+        factors = _calibrated(session, job, doubts)
         factors.write(place)
     return factors
 
 
-def _calibrated(session: SessionFrames, job: Job) -> Factors:
+def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFrames, tuple[str, ...]]:
+    """The ``session`` with what its list does not state taken from the ``camera``, and where both contradict."""
+    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    stated, own = session.listed.digital, digital_of(sensor, session.listed.digital.exposure_s)
+    absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
+    doubts = []
+    for name, (part, least) in _COMPARED.items():
+        ours, theirs = getattr(stated, name), getattr(own, name)
+        if ours is not None and theirs is not None and abs(ours - theirs) > max(part * theirs, least):
+            doubts.append(
+                f"camera {sensor.name}: digital.{name} is {ours:g} in the list, and {theirs:g} by the camera's file; "
+                "correct the wrong one, or leave --camera out"
+            )
+    listed = session.listed.model_copy(update={"digital": stated.model_copy(update=absent)})
+    return replace(session, listed=listed), tuple(doubts)
+
+
+def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
     listed = session.listed
     readings = _Readings(session)
     estimate, noise = _estimate(readings, job)
-    warnings: tuple[str, ...] = () if estimate.ok else (str(estimate.status),)
+    warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "

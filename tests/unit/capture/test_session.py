@@ -6,6 +6,7 @@ Few electrons (1 % of full well) make the sensor's noise the only error that cou
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -30,7 +31,9 @@ from mitsim.optics.frames import mixes
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Estimate
 from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.measured import calibrate_frames
 from mitsim.rig.camera import centred_edges
+from mitsim.rig.framelist import FrameList
 from mitsim.rig.order import SIDES
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import SessionRecipe, load_recipe
@@ -242,6 +245,50 @@ def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[
     uniform = make_plan(board, Lighting.uniform(16), 2e-2, 0)
     assert "diffraction" not in uniform.settings.effects
     assert "diffraction" in Session(board, recipe("pair")).plan(2e-2, Job()).settings.effects
+
+
+# ---- frames of a session ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+@pytest.mark.parametrize(
+    ("more", "files", "ending"),
+    [
+        ({"signed_capture": "pair", "order": "interleaved"}, 64, ".tif"),
+        (
+            {
+                "signed_capture": "uniform",
+                "exposure_ladder": (1.0, 20.0),
+                "repeats": 2,
+                "dark_frames": 3,
+                "order": "random",
+            },
+            (34 * 2 + 3) * 2,
+            ".npy",
+        ),
+    ],
+)
+def test_frames_that_are_written_give_the_same_factors_bit_for_bit(
+    shared_scene: Callable[..., Path], tmp_path: Path, more: dict[str, object], files: int, ending: str
+) -> None:
+    """Codes as TIFF, real numbers as NPY, called by the order in which they are taken; and nothing that a camera's user
+    does not have. (Planted: numbers by the order of the list, repeats not told apart, half of the codes cut, the
+    parallax in the list.)"""
+    bench = open_bench(shared_scene("written16", n=16))
+    if ending == ".npy":
+        bench = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"bits": None})))
+    own = recipe("pair").model_copy(update=more)
+    simulated = bench.write_session(tmp_path / "frames", tmp_path / "cal", 3, recipe=own)
+    found = calibrate_frames(tmp_path / "frames")
+    assert np.array_equal(found.left, simulated.left) and np.array_equal(found.right, simulated.right)
+    assert simulated.manifest.result["frames"] == files == len(list((tmp_path / "frames").glob(f"*{ending}")))
+    assert np.array_equal(load_calibration(tmp_path / "cal").left, found.left)
+    listed = json.loads((tmp_path / "frames" / "session.json").read_text())
+    assert not listed.keys() - FrameList.model_fields.keys() and not {"parallax", "seed"} & listed.keys()
+    taken = [frame["file"] for frame in listed["frames"]]
+    assert taken == sorted(taken)
+    with pytest.raises(MitsimError, match="holds files already"):
+        bench.write_session(tmp_path / "frames", recipe=own)
 
 
 # ---- interrupted and resumed -----------------------------------------------------------------------------------------

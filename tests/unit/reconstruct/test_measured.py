@@ -235,3 +235,33 @@ def test_dark_frames_of_no_exposure_are_refused(tmp_path: Path) -> None:
     write_list(folder, signed_capture="uniform", dark=[{"file": "dark_0.png", "exposure": 1}])
     with pytest.raises(MitsimError, match="of exposure 1, but exposure_ladder has 1; give 0 to 0"):
         load_frames(folder)
+
+
+def test_a_camera_fills_what_the_list_leaves_out_and_is_compared_with_the_rest(tmp_path: Path) -> None:
+    """(Planted: what the list states overwritten, a gain that is 10 % off let pass, its part of 1 for its part.)"""
+    folder = RealSession().write(tmp_path / "frames")
+    few = {name: DIGITAL[name] for name in ("exposure_s", "black_level_dn", "gain_dn_per_e", "dark_current_e_per_s")}
+    write_list(folder, digital=few)
+    camera = tmp_path / "camera.toml"
+
+    def written(gain: float, black: float) -> Path:
+        camera.write_text(
+            f"name = 'bench'\npixel_pitch_um = 5.0\nfull_well_e = 30000\nread_noise_e = 9\ndark_current_e_per_s = 0\n"
+            f"quantum_efficiency = 0.5\ngain_dn_per_e = {gain}\nblack_level_dn = {black}\nbits = 12\nsource = 'me'\n"
+        )
+        return camera
+
+    alone = calibrate_frames(folder)
+    assert alone.ok and "digital.read_noise_e" in " ".join(alone.manifest.result["not_known"])
+    filled = calibrate_frames(folder, camera=written(0.127, 160.5))
+    assert filled.ok and filled.manifest.digital is not None
+    assert (filled.manifest.digital.read_noise_e, filled.manifest.digital.saturation_dn) == (9, 3970)
+    assert filled.manifest.digital.gain_dn_per_e == 0.125 and filled.manifest.result["response_noise"] is not None
+    assert np.array_equal(filled.left, alone.left)
+    (gain,) = calibrate_frames(folder, camera=written(0.1375, 160)).warnings
+    assert gain.startswith("camera bench: digital.gain_dn_per_e is 0.125 in the list, and 0.1375")
+    (black,) = calibrate_frames(folder, camera=written(0.125, 170)).warnings
+    assert "black_level_dn is 160 in the list, and 170" in black
+    write_list(folder, digital={**DIGITAL, "saturation_dn": 4000})
+    (end,) = calibrate_frames(folder, camera=written(0.125, 160)).warnings
+    assert "saturation_dn is 4000 in the list, and 3910" in end
