@@ -263,5 +263,7 @@ def test_a_camera_fills_what_the_list_leaves_out_and_is_compared_with_the_rest(t
     (black,) = calibrate_frames(folder, camera=written(0.125, 170)).warnings
     assert "black_level_dn is 160 in the list, and 170" in black
     write_list(folder, digital={**DIGITAL, "saturation_dn": 4000})
-    (end,) = calibrate_frames(folder, camera=written(0.125, 160)).warnings
+    stated = calibrate_frames(folder, camera=written(0.125, 160))
+    assert stated.manifest.digital is not None and stated.manifest.digital.read_noise_e == 10
+    (end,) = stated.warnings
     assert "saturation_dn is 4000 in the list, and 3910" in end
