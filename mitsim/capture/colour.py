@@ -14,11 +14,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mitsim.capture.calibrate import calibrate_session, of_one_depth
 from mitsim.capture.light import Light, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
 from mitsim.capture.session import Session
+from mitsim.capture.truth import trace_truths
 from mitsim.core.colours import CALIBRATION, RUN, ColourManifest, Line, write_colours
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
@@ -116,6 +119,10 @@ def capture_lines(
         with job.clock.stage("transport"):
             sampling = sampling_of(colours.whole, request)
             lights = trace_lines(colours.whole, colours.benches, plan, lighting, request.seed, sampling, job.progress)
+        with job.clock.stage("truth"):
+            errors = np.stack([light.flux_error for light in lights])
+            truths = trace_truths(colours.whole, plan.settings, request.seed, errors)
+        lights = [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
         runs = zip(colours.manifest.names, colours.benches, lights, places, strict=True)
         return {name: capture(each, request, job, place, resume, light=light) for name, each, light, place in runs}
 

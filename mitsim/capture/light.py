@@ -142,6 +142,8 @@ class Light:
         of each group, by the name of what was traced; empty where nobody kept them.
     looked
         what the last look at its error found.
+    known_truth
+        :attr:`apparent`, where it was traced with that of other lines.
     """
 
     groups: tuple[FiledLight, ...]
@@ -156,6 +158,7 @@ class Light:
     reached: bool
     samples: Mapping[str, int] = field(default_factory=dict)
     looked: Looked | None = None
+    known_truth: Truth | None = None
 
     def __repr__(self) -> str:
         return f"Light({self.paths:.2g} paths, relative error {self.sampling_error:.1e}, of {self.bench!r})"
@@ -290,7 +293,7 @@ class Light:
     @cached_property
     def apparent(self) -> Truth:
         """What a perfect image of this light would show, with its standard error; traced on its own."""
-        return trace_truth(self.bench, self.plan.settings, self.seed, self.flux_error)
+        return self.known_truth or trace_truth(self.bench, self.plan.settings, self.seed, self.flux_error)
 
     @property
     def truth(self) -> FloatArray:

@@ -63,7 +63,7 @@ class Truth:
     def error_of(self, flux_error: FloatArray) -> float:
         """What sampling leaves in any image, rms over it: the standard error ``flux_error`` (n^2,) [W m^-2] of the
         frames' own light, over the board's."""
-        return _rms(_over(flux_error, self.board_flux))
+        return float(_rms(_over(flux_error, self.board_flux)))
 
 
 def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
@@ -79,27 +79,47 @@ def trace_truth(bench: Bench, settings: Settings, seed: int, flux_error: FloatAr
         (n^2,) standard error of each projector pixel's direct light in the frames [W m^-2]: what sampling alone leaves
         in any image of them.
     """
+    (truth,) = trace_truths(bench, settings, seed, flux_error[None])
+    return truth
+
+
+def trace_truths(bench: Bench, settings: Settings, seed: int, flux_errors: FloatArray) -> list[Truth]:
+    """The truth of each line of a projector, from paths that all lines share.
+
+    Parameters
+    ----------
+    bench
+        with its lines; or light that is not told apart, as one line.
+    settings, seed
+        as for :func:`trace_truth`.
+    flux_errors
+        (lines, n^2) ``flux_error`` there.
+    """
     effects = names(lambda effect: effect.in_truth) & settings.effects
     board = _Flux(bench.with_board(load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
     unit = board.mean
-    target = max(TRUTH_PART * _rms(_over(flux_error, unit)), _FINEST)
-    board.refine(unit, _BOARD_PART * target, np.ones_like(unit))
+    target = np.maximum(TRUTH_PART * _rms(_over(flux_errors, unit)), _FINEST)
+    board.refine(unit, _BOARD_PART * target, np.ones(unit.shape[1]))
     scene = _Flux(bench, effects, seed, "scene", TRUTH_SAMPLES)
-    scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target, np.square(_over(flux_error, unit)))
+    likely = np.square(_over(flux_errors, unit)).sum(axis=0)
+    scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target, likely)
     reflectance = _over(scene.mean, board.mean)
     error = np.hypot(_over(scene.standard_error, board.mean), reflectance * _over(board.standard_error, board.mean))
-    shape = (bench.n, bench.n)
-    return Truth(reflectance.reshape(shape), error.reshape(shape), board.mean, scene.rays + board.rays)
+    shape, rays = (bench.n, bench.n), scene.rays + board.rays
+    lines = zip(reflectance, error, board.mean, strict=True)
+    return [Truth(own.reshape(shape), its.reshape(shape), flux, rays) for own, its, flux in lines]
 
 
 class _Flux:
-    """Direct light of every projector pixel on the sensor, in independent groups; sampled where that helps most."""
+    """Direct light of every projector pixel on the sensor by line, in independent groups; sampled where that helps
+    most."""
 
     def __init__(self, bench: Bench, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
         physics, loaded, pixels = Physics.simulated(bench, effects), bench.loaded, bench.n**2
         self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry, loaded.glossy)
         self._seed = integer(seed, "truth", name)
-        self._sums, self._samples = np.zeros((TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)
+        lines = len(bench.lines.shares) if physics.projector.by_line and bench.lines else 1
+        self._sums, self._samples = np.zeros((lines, TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)
         self._shape, self._first = (bench.n, bench.n), samples
         self._sample(np.full(pixels, samples))
 
@@ -110,23 +130,24 @@ class _Flux:
 
     @property
     def mean(self) -> FloatArray:
-        """(n^2,) [W m^-2]."""
-        return np.asarray(self._sums.mean(axis=0) / self._samples)
+        """(lines, n^2) [W m^-2]."""
+        return np.asarray(self._sums.mean(axis=1) / self._samples)
 
     @property
     def standard_error(self) -> FloatArray:
-        """(n^2,) of the mean, from the spread of the groups [W m^-2]."""
-        return np.asarray(self._sums.std(axis=0, ddof=1) / self._samples / np.sqrt(TRUTH_GROUPS))
+        """(lines, n^2) of the mean, from the spread of the groups [W m^-2]."""
+        return np.asarray(self._sums.std(axis=1, ddof=1) / self._samples / np.sqrt(TRUTH_GROUPS))
 
-    def refine(self, unit: FloatArray, target: float, likely: FloatArray) -> None:
-        """Trace more where that brings most, until the standard error meets a target, or too many rays would be needed.
+    def refine(self, unit: FloatArray, target: FloatArray, likely: FloatArray) -> None:
+        """Trace more where that brings most, until the standard error of every line meets its target, or too many rays
+        would be needed.
 
         Parameters
         ----------
         unit
-            (n^2,) of the error [W m^-2].
+            (lines, n^2) of the error [W m^-2].
         target
-            its rms over the image, in these units.
+            (lines,) its rms over the image, in these units.
         likely
             (n^2,) variances at equal samples, in any unit, by what others know. The pixels' own spread does not tell:
             a pixel whose samples happen to agree would get no more of them, and be further off than it says.
@@ -135,8 +156,9 @@ class _Flux:
         likely = likely + mean_of_neighbours(likely.reshape(self._shape)).ravel()
         likely += _ANYWHERE * likely.mean() or 1.0
         most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
-        while (error := _rms(_over(self.standard_error, unit))) > target:
-            wanted = _allotted(likely, self._samples, self._first, (_AIM * target / error) ** 2, most)
+        while ((error := _rms(_over(self.standard_error, unit))) > target).any():
+            part = float(np.square(_AIM * target / np.maximum(error, np.finfo(float).tiny)).min())
+            wanted = _allotted(likely, self._samples, self._first, part, most)
             if (wanted == self._samples).all():
                 return
             self._sample(wanted)
@@ -149,9 +171,11 @@ class _Flux:
         blocks = more // block
         place = np.repeat(np.arange(len(pixels)), blocks)
         within = np.arange(len(place)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
-        light = self._tracer.sums(self._seed, TRUTH_GROUPS, pixels[place], done[place] + block * within, block)
-        for sums, part in zip(self._sums, light, strict=True):
-            sums += np.bincount(pixels[place], part, len(sums))
+        starts = done[place] + block * within
+        light = self._tracer.sums_by_line(self._seed, TRUTH_GROUPS, pixels[place], starts, block)
+        for groups, parts in zip(self._sums, light, strict=True):
+            for sums, part in zip(groups, parts, strict=True):
+                sums += np.bincount(pixels[place], part, len(sums))
         self._samples = wanted
 
 
@@ -180,9 +204,10 @@ def _allotted(likely: FloatArray, samples: IntArray, first: int, part: float, mo
 
 
 def _over(flux: FloatArray, unit: FloatArray) -> FloatArray:
-    """``flux`` (n^2,) in units ``unit`` (n^2,); 0 where there is no unit, as the board has no light there."""
+    """``flux`` (..., n^2) in units ``unit``, of its shape; 0 where there is none, as the board has no light there."""
     return np.divide(flux, unit, out=np.zeros_like(flux), where=unit > 0)
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.square(values).mean()))
+def _rms(values: FloatArray) -> FloatArray:
+    """Along the last axis."""
+    return np.asarray(np.sqrt(np.square(values).mean(axis=-1)))

@@ -60,7 +60,12 @@ class FluxTracer:
         self._pixels, self._glossy = projector.n**2, glossy
 
     def sums(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
-        """(groups, m) light of m blocks of samples, each summed [W m^-2].
+        """(groups, m) light of m blocks of samples, each summed [W m^-2]; all arguments as :meth:`sums_by_line`."""
+        return np.asarray(self.sums_by_line(seed, groups, pixels, first, samples).sum(axis=0))
+
+    def sums_by_line(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
+        """(lines, groups, m) light of m blocks of samples, each summed [W m^-2]; one line where light is not told
+        apart.
 
         Parameters
         ----------
@@ -80,7 +85,8 @@ class FluxTracer:
             when the scene sends NaN or infinite light to the camera.
         """
         blocks, at_once = groups * len(pixels), max(1, self.lanes_per_launch // samples)
-        total = np.empty(blocks)
+        lines = self._rays.projector.lines
+        total = np.empty((len(lines.shares) if lines and lines.several else 1, blocks))
         numbers, starts = mi.UInt32(pixels), mi.UInt32(first)
         # Opaque numbers keep the compiled kernel the same for all of them.
         each, count = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, len(pixels))
@@ -93,11 +99,20 @@ class FluxTracer:
             number = block - group * count
             sample = dr.gather(mi.UInt32, starts, number) + (lane - place * each)
             light = self._light(seed, group, dr.gather(mi.UInt32, numbers, number), sample)
-            total[start:stop] = np.array(dr.block_sum(mi.Float64(light), samples))
+            for own, value in zip(total, self._by_line(light, len(total)), strict=True):
+                own[start:stop] = np.array(dr.block_sum(mi.Float64(value), samples))
         check_finite(total)
-        return total.reshape(groups, -1)
+        return total.reshape(len(total), groups, -1)
 
-    def _light(self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Float:
+    @staticmethod
+    def _by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
+        """Light of each of several ``lines``, or of all in one; worked out together, for apart each would trace it."""
+        if lines == 1:
+            return [panchromatic(light)]
+        dr.eval(light)
+        return [light[line] / len(light) for line in range(lines)]
+
+    def _light(self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.UnpolarizedSpectrum:
         """Mean irradiance that one ray of each ``pixel`` brings to the sensor."""
         pixels = dr.opaque(mi.UInt32, self._pixels)
         shared, rng = streams(seed, pixel + group * pixels, sample)
@@ -113,15 +128,15 @@ class FluxTracer:
             direction: mi.Vector3f,
             light: mi.Spectrum,
             active: mi.Bool,
-            state: tuple[mi.Float, mi.PCG32],
-        ) -> tuple[mi.Float, mi.PCG32]:
+            state: tuple[mi.UnpolarizedSpectrum, mi.PCG32],
+        ) -> tuple[mi.UnpolarizedSpectrum, mi.PCG32]:
             total, rng = state
             if turn is None:
                 return total + self._connected(si, direction, light, sensor, active), rng
             total = total + self._turned(si, direction, light, (rng.next_float32(), turn), active)
             return total + self._connected(si, direction, light, sensor, active), rng
 
-        total, _ = self._receiver.passage.along(ray, flux, (mi.Float(0), rng), seen_at)
+        total, _ = self._receiver.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), seen_at)
         return total
 
     def _turned(
@@ -131,7 +146,7 @@ class FluxTracer:
         light: mi.Spectrum,
         numbers: tuple[mi.Float, mi.Point2f],
         active: mi.Bool,
-    ) -> mi.Float:
+    ) -> mi.UnpolarizedSpectrum:
         """What ``light`` that comes to surfaces in a ``direction`` brings over turns, which ``numbers`` draw."""
         si.wi = si.to_local(-direction)
         context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -149,10 +164,10 @@ class FluxTracer:
         light: mi.Spectrum,
         point: mi.Point3f,
         active: mi.Bool,
-    ) -> mi.Float:
+    ) -> mi.UnpolarizedSpectrum:
         """What it brings to a ``point`` of the sensor; over glossy surfaces, over 1 + A q."""
         reception = self._receiver.receive(si, -direction, point, active)
-        value = panchromatic(reception.irradiance * light)
+        value = reception.irradiance * light
         if not self._glossy:
             return value
         si.wi = si.to_local(-direction)
