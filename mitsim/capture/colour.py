@@ -17,15 +17,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.calibrate import calibrate_session, of_one_depth
+from mitsim.capture.evidence import Settings
 from mitsim.capture.light import Light, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
 from mitsim.capture.session import Session
+from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import trace_truths
 from mitsim.core.colours import CALIBRATION, RUN, ColourManifest, Line, write_colours
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.output import output_folder
+from mitsim.core.seeds import integer
 from mitsim.rig.projector import Lines
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
@@ -37,6 +40,9 @@ if TYPE_CHECKING:
 
 _WAVELENGTHS = 4
 """Wavelengths that a path carries in Mitsuba's spectral variants."""
+_RAYS, _ALIKE = 4, 0.9
+"""Rays of each pixel that tell how rough a line's light is, a tenth of a second; and the part of the roughest line's
+differences from which a line counts as rough: what a plan leaves follows their root, of which this is a twentieth."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,25 @@ class ColourBench:
         alone = replace(rig, projector=rig.projector.at(line.wavelengths_nm[0]))
         return replace(self.whole, rig=alone, lines=line)
 
+    def roughest(self, seed: int) -> Bench:
+        """The line that is planned for: that whose light differs most between neighbouring pixels of the projector.
+
+        What a plan makes coarse leaves most of such light. Of lines that are alike the longest, whose shadow has the
+        widest fringes, is the worst. ``seed``: of a few rays for each pixel.
+        """
+        bench = self.whole
+        direct = Simulation(bench, Settings(bench.geometry.scene_distance)).direct
+        deposits = direct.trace(integer(seed, "colour"), 0, _RAYS)
+        wavelengths = [line.wavelength_nm for line in self.manifest.channels]
+        steps = []
+        for light in deposits.by_line(len(wavelengths)):
+            flux = np.bincount(light.pixel, light.value, bench.n**2).reshape(bench.n, bench.n)
+            differences = sum(float(np.square(np.diff(flux, axis=axis)).sum()) for axis in (0, 1))
+            energy = float(np.square(flux).sum())
+            steps.append(differences / energy if energy else 0.0)
+        alike = [line for line, step in enumerate(steps) if step >= _ALIKE * max(steps)]
+        return self.benches[max(alike, key=lambda line: wavelengths[line])]
+
     def boards(self, recipe: SessionRecipe) -> tuple[Bench, ...]:
         """The same before one board of a ``recipe``."""
         board = Session(self.whole, recipe).board
@@ -112,7 +137,7 @@ def capture_lines(
         for each, place in zip(colours.benches, places, strict=True):
             check_run(each, request, place, resume)
         with job.clock.stage("plan"):
-            plan = plan_request(colours.whole, request)
+            plan = plan_request(colours.roughest(request.seed), request)
         if plan.cost:
             plan.cost.check(request.patterns, job.limits)
         lighting = bench.family(request.patterns, request.seed).lighting

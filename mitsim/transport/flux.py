@@ -174,4 +174,6 @@ class FluxTracer:
         context = mi.BSDFContext(mi.TransportMode.Importance)
         density = si.bsdf().pdf(context, si, si.to_local(reception.direction), active)
         area = 4 * dr.square(dr.opaque(mi.Float, self._sensor.half_width))
-        return dr.select(value > 0, value / (1 + area * density * reception.solid_angle(point)), 0)
+        # As a spectrum: by a number, Dr.Jit would multiply with the reciprocal, which is rounded.
+        share = mi.UnpolarizedSpectrum(1 + area * density * reception.solid_angle(point))
+        return dr.select(value > 0, value / share, 0)
