@@ -172,7 +172,7 @@ class _Flux:
         place = np.repeat(np.arange(len(pixels)), blocks)
         within = np.arange(len(place)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
         starts = done[place] + block * within
-        light = self._tracer.sums_by_line(self._seed, TRUTH_GROUPS, pixels[place], starts, block)
+        light = self._tracer.sums(self._seed, TRUTH_GROUPS, pixels[place], starts, block)
         for groups, parts in zip(self._sums, light, strict=True):
             for sums, part in zip(groups, parts, strict=True):
                 sums += np.bincount(pixels[place], part, len(sums))

@@ -60,10 +60,6 @@ class FluxTracer:
         self._pixels, self._glossy = projector.n**2, glossy
 
     def sums(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
-        """(groups, m) light of m blocks of samples, each summed [W m^-2]; all arguments as :meth:`sums_by_line`."""
-        return np.asarray(self.sums_by_line(seed, groups, pixels, first, samples).sum(axis=0))
-
-    def sums_by_line(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
         """(lines, groups, m) light of m blocks of samples, each summed [W m^-2]; one line where light is not told
         apart.
 

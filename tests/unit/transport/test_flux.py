@@ -44,7 +44,7 @@ def flux(bench: Bench, glossy: bool, samples: int, pixels: np.ndarray | None = N
     loaded = bench.loaded
     tracer = FluxTracer(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, glossy)
     pixels = np.arange(N * N) if pixels is None else pixels
-    sums = tracer.sums(0, SEEDS, pixels, np.zeros_like(pixels), samples).sum(axis=1) / samples
+    sums = tracer.sums(0, SEEDS, pixels, np.zeros_like(pixels), samples)[0].sum(axis=1) / samples
     return float(np.mean(sums)), float(np.std(sums, ddof=1) / np.sqrt(SEEDS))
 
 
@@ -101,11 +101,11 @@ def test_sums_are_those_of_blocks_however_they_are_traced(
     loaded = rig.loaded
     tracer = FluxTracer(loaded.scene, loaded.camera, rig.projector_optics, rig.geometry, True)
     first = np.full_like(LIT, 3)
-    whole = tracer.sums(5, 2, LIT, first, 40)
+    whole = tracer.sums(5, 2, LIT, first, 40)[0]
     lit = whole[0] > 0
     assert lit.sum() > 12 and (whole[0] != whole[1])[lit].all()
     pixels, starts = np.concatenate([LIT[::-1], LIT]), np.concatenate([first + 20, first])
-    halves = tracer.sums(5, 2, pixels, starts, 20)
+    halves = tracer.sums(5, 2, pixels, starts, 20)[0]
     assert halves[:, : len(LIT)][:, ::-1] + halves[:, len(LIT) :] == pytest.approx(whole, rel=1e-12)
     monkeypatch.setattr(FluxTracer, "lanes_per_launch", 3 * 40 + 1)
-    np.testing.assert_allclose(tracer.sums(5, 2, LIT, first, 40), whole, rtol=1e-6)
+    np.testing.assert_allclose(tracer.sums(5, 2, LIT, first, 40)[0], whole, rtol=1e-6)
