@@ -585,9 +585,9 @@ def study(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `sweep`
-    of any knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask
-    does; `merge` joins the parts of --shard.
+    """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `colour`
+    of a ColorChecker; `sweep` of any knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`;
+    what `diffraction` at the mask does; `merge` joins the parts of --shard.
     """
     from mitsim.study import OF_NO_SCENE, find_study, is_experiment
 

@@ -80,7 +80,8 @@ def chart() -> Chart:
 def _tristimulus(spectrum: Any) -> FloatArray:
     """(3,) XYZ of a reflectance ``spectrum`` under D65, Y = 1 for a perfect reflector (ASTM E308)."""
     colour = _colour()
-    found = colour.sd_to_XYZ(spectrum, colour.MSDS_CMFS[_OBSERVER], colour.SDS_ILLUMINANTS[_WHITE]) / 100
+    with colour.utilities.suppress_warnings(colour_runtime_warnings=True):  # that spectra end at 380 and 780 nm
+        found = colour.sd_to_XYZ(spectrum, colour.MSDS_CMFS[_OBSERVER], colour.SDS_ILLUMINANTS[_WHITE]) / 100
     return np.asarray(found, dtype=np.float64)
 
 
@@ -93,6 +94,12 @@ def _white_xy() -> tuple[float, float]:
 def white_xyz() -> FloatArray:
     """(3,) XYZ of the white board in D65, Y = 1."""
     return np.asarray(_colour().xy_to_XYZ(_white_xy()), dtype=np.float64)
+
+
+def daylight(wavelengths_nm: npt.ArrayLike) -> FloatArray:
+    """Power of D65 at ``wavelengths_nm`` in steps of 5 nm, 300 to 780, relative to that at 560 nm."""
+    light = _colour().SDS_ILLUMINANTS[_WHITE]
+    return np.asarray(light[np.asarray(wavelengths_nm, dtype=np.float64)], dtype=np.float64) / 100
 
 
 @dataclass(frozen=True, eq=False)

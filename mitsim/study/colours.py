@@ -14,6 +14,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.colours import CALIBRATION, COLOUR, IMAGE, RUN, ColourManifest, read_colours, write_colours
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
+from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.pictures import colour_png
 from mitsim.reconstruct.colour import ColourModel, linear_srgb
@@ -34,6 +35,8 @@ class JudgedColours:
         of each line, by its name.
     model
         from reflectances at the lines to colours.
+    board
+        reflectance of the calibrations' board; 1 where they do not state it.
     output
         the folder that holds all.
     """
@@ -41,16 +44,17 @@ class JudgedColours:
     lines: ColourManifest
     images: Mapping[str, Judged]
     model: ColourModel
+    board: float
     output: str
 
     @property
     def reflectances(self) -> FloatArray:
-        """(n, n', lines) reflectance at each line, 1 = the calibration's board."""
-        return stacked(self.images)
+        """(n, n', lines) reflectance at each line, 1 = a perfect reflector."""
+        return self.board * stacked(self.images)
 
     @property
     def xyz(self) -> FloatArray:
-        """(n, n', 3) CIE XYZ under D65; the board has Y = 1."""
+        """(n, n', 3) CIE XYZ under D65; a perfect reflector has Y = 1."""
         return self.model.xyz(self.reflectances)
 
     @property
@@ -127,14 +131,26 @@ def reconstruct_colours(
             name: reconstruct(run / name, calibration / name, folder / name, overwrite=overwrite, **options)
             for name in lines.names
         }
-        model = ColourModel.of_lines(lines.wavelengths_nm)
+        model, board = ColourModel.of_lines(lines.wavelengths_nm), _board(calibration, lines)
         if chart is not None:
-            model = ColourModel.fitted(lines.wavelengths_nm, chart.means(stacked(images)), "the chart in this image")
-        found = JudgedColours(lines, images, model, str(folder))
+            model = ColourModel.fitted(
+                lines.wavelengths_nm, board * chart.means(stacked(images)), "the chart in this image"
+            )
+        found = JudgedColours(lines, images, model, board, str(folder))
         write_colour_image(folder, found.xyz)
         parts = {key: value for key, value in found.summary().items() if key != "channels"}
         write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **parts)
     return found
+
+
+def _board(calibration: Path, lines: ColourManifest) -> float:
+    """Reflectance of the board that a calibration's images are relative to; 1 where it is not stated."""
+    boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
+    if len(boards) > 1:
+        raise MitsimError(
+            f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
+        )
+    return boards.pop() or 1.0
 
 
 def same_lines(run: Path, calibration: Path) -> ColourManifest:
@@ -162,6 +178,8 @@ def write_colour_image(folder: Path, xyz: FloatArray) -> None:
     rgb = linear_srgb(xyz)
     named = dict(zip("RGBXYZ", np.moveaxis(np.concatenate([rgb, xyz], axis=-1), -1, 0), strict=True))
     channels = {name: values.astype(np.float32) for name, values in named.items()}
-    write_frame(folder / IMAGE_FILE, channels, {"rgb": "linear sRGB", "xyz": "CIE 1931 under D65, board Y = 1"})
+    write_frame(
+        folder / IMAGE_FILE, channels, {"rgb": "linear sRGB", "xyz": "CIE 1931 under D65, perfect reflector Y = 1"}
+    )
     with whole_file(folder / "image.png") as part:
         part.write_bytes(colour_png(rgb))

@@ -110,6 +110,13 @@ class Studio:
         self._kept.clear()
         self._folder.cleanup()
 
+    def folder(self, name: str) -> Path:
+        """A new folder of this studio's own, which ends with it; what was in one of that ``name`` is removed."""
+        place = Path(self._folder.name) / "own" / name
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        return place
+
     def bench(self, setup: Setup) -> Bench:
         """The bench of a ``setup``.
 

@@ -107,3 +107,18 @@ def test_a_chart_of_a_grey_run_is_refused(pair: tuple[Path, Path], capsys: pytes
     run, calibration = (str(folder / "638nm") for folder in pair)
     assert main(["reconstruct", run, "--calibration", calibration, "--chart", "colour_checker"]) == 2
     assert "is not coloured; leave out --chart" in capsys.readouterr().err
+
+
+def test_the_board_counts_with_its_reflectance(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    """Images are relative to it; colours are not."""
+    run, calibration = pair
+    plain = reconstruct_colours(run, calibration, tmp_path / "plain")
+    shutil.copytree(calibration, tmp_path / "cal")
+    for name in plain.images:
+        path = tmp_path / "cal" / name / "manifest.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "board_reflectance": 0.8}))
+    found = reconstruct_colours(run, tmp_path / "cal", tmp_path / "image")
+    assert np.allclose(found.xyz, 0.8 * plain.xyz)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "board_reflectance": 0.9}))
+    with pytest.raises(MitsimError, match="calibrate all with one board"):
+        reconstruct_colours(run, tmp_path / "cal", tmp_path / "other")

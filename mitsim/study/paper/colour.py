@@ -1,0 +1,268 @@
+"""Colours of a ColorChecker: Delta E 2000 of each patch to its spectrum in daylight, by patterns and by ways to see it.
+
+*Floor*: no camera, but the matrix from reflectances at the projector's lines to XYZ; what three lines cannot tell.
+*Rendered*: frames of every line with the sensor's noise, a calibration and a solve for each. *One calibration for all*:
+the middle line's factors serve all lines. *D65*: a lamp of daylight as bright as the projector's white shines on the
+chart, its frame taken off. *Mosaic*: all lines at once behind colour filters (:mod:`mitsim.study.mosaic`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mitsim.capture.ambient import shots_for
+from mitsim.capture.exposer import Exposer
+from mitsim.core.arrays import FloatArray
+from mitsim.core.pictures import lightness
+from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.solver import prepare
+from mitsim.rig.chart import ChartPlace, load_chart
+from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.study.compare import label
+from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.study.exposures import RENDERED
+from mitsim.study.lines import LitLine, daylit, lit_lines, serving
+from mitsim.study.metrics import psnr
+from mitsim.study.mosaic import exposed, mosaic_shots, peak_seconds, ways
+from mitsim.study.paper.measure import verdict
+from mitsim.study.plots import BLUE, FONT, GREEN, VERMILION, figure_of, label_axes
+from mitsim.study.studio import Studio
+from mitsim.study.table import Table
+
+FAMILIES = ("uniform", "dots:7", "hadamard:8")
+GOAL = 0.5
+"""Most that 49 dots may add to the floor's mean Delta E."""
+OWN, ONE, DAYLIGHT = "one line at a time", "one calibration for all lines", "D65 light beside it"
+_IMAGE = "xyz"
+_SHOWN = "dots:7"
+_TILE = 24
+"""Pixels a side of a patch in the picture of the chart."""
+
+
+def _points(scope: Scope) -> Sequence[Point]:
+    setup = scope.setup if scope.pictures == (None,) else replace(scope.setup, scene="colour_checker")
+    seen = {
+        OWN: FAMILIES,
+        ONE: scope.chosen(FAMILIES, (_SHOWN,)),
+        DAYLIGHT: scope.chosen(FAMILIES, (_SHOWN,)),
+        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in ways()},
+    }
+    return [
+        Point.of(setup, way=way, patterns=patterns, seed=seed)
+        for seed in scope.seeds
+        for way, families in seen.items()
+        for patterns in families
+    ]
+
+
+def _measure(studio: Studio, point: Point) -> Found:
+    setup, way, patterns, seed = point.setup, str(point["way"]), str(point["patterns"]), int(point["seed"])
+    lines = studio.once("lines", 1, (setup, seed), lambda: lit_lines(setup, seed))
+    if way.startswith("mosaic"):
+        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: mosaic_shots(lines, patterns, seed))
+        images = np.moveaxis(shots.images(way.removeprefix("mosaic, ")), 0, -1)
+    elif way == DAYLIGHT:
+        light = studio.once("daylight", 1, setup, lambda: daylit(setup, studio.folder("daylight")))
+        images = _under_daylight(lines, light, patterns, seed)
+    else:
+        middle = lines[len(lines) // 2]
+        factors = [line.factors if way == OWN else serving(line, middle) for line in lines]
+        images = np.stack([_solved(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)], axis=-1)
+    truth = np.stack([line.lit.truth for line in lines], axis=-1)
+    board = lines[0].factors.manifest.board_reflectance or 1.0
+    return _judged(point, [line.wavelength_nm for line in lines], images * board, truth * board)
+
+
+def _solved(line: LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
+    """(n, n) image of a line, as a user's own frames are exposed and reconstructed."""
+    return reconstruct(line.lit.light.expose(patterns, seed=line.seed(seed)), factors).image
+
+
+def _under_daylight(lines: Sequence[LitLine], light: tuple[FloatArray, float], patterns: str, seed: int) -> FloatArray:
+    """(n, n, lines) images of frames that a lamp's ``light`` (irradiance and wavelength) shines on, less that light."""
+    images = []
+    for line in lines:
+        bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
+        lamp = electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
+        unit = Exposer(bench.rig, 1.0, 0)
+        rates = [unit.electrons(frame) + lamp for frame in line.lit.expected(RENDERED, family)]
+        exposer = Exposer(bench.rig, peak_seconds(bench.sensor, rates), line.seed(seed))
+        names = [("ambient", shot) for shot in range(0 if family.signed else shots_for(family))]
+        dark = [exposer.rate(exposer.digital(lamp * exposer.exposure_s, *name)) for name in names]
+        model = prepare(*line.factors.sides, family.left, family.right, centre=line.factors.manifest.centre)
+        sums = model.accumulator()
+        for measured in exposed(exposer, family, rates, np.mean(dark, axis=0) if dark else 0.0):
+            sums.add(*measured)
+        images.append(model.solve(sums, "auto").image)
+    return np.stack(images, axis=-1)
+
+
+def _judged(point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray) -> Found:
+    """Rows of all patches of the chart in ``images`` (n, n, lines), and its colours."""
+    place, known, fixed = _place(point.setup.scene), chart(), ColourModel.of_lines(wavelengths)
+    means = place.means(images)
+    seen, fitted = fixed.xyz(means), ColourModel.fitted(wavelengths, means, "").xyz(means)
+    columns: dict[str, Any] = {
+        "floor": delta_e(fixed.xyz(known.at(wavelengths)), known.xyz),
+        "delta_e": delta_e(seen, known.xyz),
+        "delta_e_fitted": delta_e(fitted, known.xyz),
+        "delta_e_pixel": [
+            float(delta_e(fixed.xyz(block), xyz).mean())
+            for block, xyz in zip(place.blocks(images), known.xyz, strict=True)
+        ],
+        "delta_e_to_noise_free": delta_e(seen, fixed.xyz(place.means(truth))),
+    }
+    lines, n = len(wavelengths), images.shape[0]
+    quality = psnr(images.reshape(n, -1), truth.reshape(n, -1))
+    by_line = {
+        f"psnr_{wave:g}nm": psnr(images[..., index], truth[..., index]) for index, wave in enumerate(wavelengths)
+    }
+    rows = [
+        point.row(
+            number=number, patch=name, lines=lines, psnr_db=quality, **by_line,
+            **{column: float(values[number]) for column, values in columns.items()},
+            **{f"truth_{axis}": float(value) for axis, value in zip("XYZ", known.xyz[number], strict=True)},
+            **{axis: float(value) for axis, value in zip("XYZ", seen[number], strict=True)},
+        )
+        for number, name in enumerate(known.names)
+    ]  # fmt: skip
+    return Found(tuple(rows), {_IMAGE: fixed.xyz(images).astype(np.float32)})
+
+
+def _place(scene: str) -> ChartPlace:
+    path = Path(scene)
+    return load_chart(path.with_name("chart.json") if path.suffix == ".xml" else scene)
+
+
+def _claims(results: Results) -> Sequence[Claim]:
+    table = results.table
+
+    def told(way: str) -> Claim:
+        rows = table.where(way=way, patterns=_SHOWN)
+        floor, mean = rows.mean("floor").value, rows.mean("delta_e").value
+        return Claim(
+            f"49 dots add at most {GOAL:g} to the floor's mean Delta E 2000 ({way})",
+            "", "", f"{mean:.2f}, floor {floor:.2f}", verdict(mean <= floor + GOAL),
+        )  # fmt: skip
+
+    own, one = (table.where(way=way, patterns=_SHOWN) for way in (OWN, ONE))
+    loss = own.mean("psnr_db").value - one.mean("psnr_db").value
+    more = one.mean("delta_e").value - own.mean("delta_e").value
+    mosaics = [way for way in table.distinct("way") if str(way).startswith("mosaic")]
+    found = {way: table.where(way=way, patterns=_SHOWN) for way in mosaics}
+    *others, joint = (rows.mean("psnr_db").value for rows in found.values())
+    return [
+        *(told(way) for way in (OWN, DAYLIGHT)),
+        Claim(
+            "Each line needs a calibration of its own (49 dots)", "", "",
+            f"one for all: {loss:.1f} dB less, mean Delta E {more:+.2f}", verdict(loss > 0),
+        ),
+        Claim(
+            f"Behind a mosaic, the joint solve is the best of {len(found)} (49 dots)", "", "",
+            "; ".join(
+                f"{way}: {rows.mean('psnr_db').value:.1f} dB, Delta E {rows.mean('delta_e').value:.2f}"
+                for way, rows in found.items()
+            ),
+            verdict(joint > max(others)),
+        ),
+    ]  # fmt: skip
+
+
+def _figures(results: Results) -> Mapping[str, Figure]:
+    table = results.table
+    drawn = {"delta_e.png": _by_patch(table.where(way=OWN)), "ways.png": _by_way(table)}
+    rows = table.where(way=OWN, patterns=_SHOWN).rows
+    drawn["chart.png"] = _patches(rows[: len(chart().names)])
+    drawn["images.png"] = _images(results)
+    return drawn
+
+
+def _by_patch(table: Table) -> Figure:
+    """Delta E of each patch: the floor, and what each family of patterns comes to."""
+    names = table.distinct("patch")
+    figure, axes = figure_of(4.0)
+    place = np.arange(len(names))
+    axes.bar(place, [table.mean("floor", patch=name).value for name in names], 0.8, color="#c7d2de", label="floor")
+    for family, colour, marker in zip(FAMILIES, (VERMILION, BLUE, GREEN), ("s", "o", "^"), strict=True):
+        means = [table.mean("delta_e", patch=name, patterns=family).value for name in names]
+        axes.plot(place, means, marker, ms=5, color=colour, label=label(family))
+    axes.set_xticks(place, names, rotation=60, ha="right", fontsize=FONT - 2)
+    label_axes(axes, "", "Delta E 2000 to the spectrum in D65 [1]", grid="y")
+    axes.legend(fontsize=FONT - 1, frameon=False, ncols=4, loc="upper left", bbox_to_anchor=(0, 1.14))
+    return figure
+
+
+def _by_way(table: Table) -> Figure:
+    """Mean Delta E of each way to see colour, under 49 dots."""
+    rows = table.where(patterns=_SHOWN)
+    ways = rows.distinct("way")
+    figure, axes = figure_of(0.42 * len(ways) + 1.0)
+    means = [rows.mean("delta_e", way=way).value for way in ways]
+    bars = axes.barh(ways, means, color=BLUE)
+    axes.bar_label(
+        bars,
+        [f"{mean:.2f}, {rows.mean('psnr_db', way=way).value:.1f} dB" for mean, way in zip(means, ways, strict=True)],
+        padding=3,
+        fontsize=FONT - 1,
+    )
+    floor = rows.mean("floor").value
+    axes.axvline(floor, color=VERMILION, lw=1.5)
+    axes.text(floor, -0.75, f"floor {floor:.2f}", color=VERMILION, fontsize=FONT - 1, ha="center", va="bottom")
+    axes.invert_yaxis()
+    axes.margins(x=0.25)
+    axes.tick_params(labelsize=FONT - 1)
+    label_axes(axes, f"mean Delta E 2000 of 24 patches [1], {label(_SHOWN)}", "", grid="x")
+    return figure
+
+
+def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """The chart: left half of a patch its spectrum's colour, right half what the camera found."""
+    truth, seen = (
+        lightness(linear_srgb([[row[f"{which}{axis}"] for axis in "XYZ"] for row in rows])) for which in ("truth_", "")
+    )
+    figure, axes = figure_of(5.2)
+    axes.set_facecolor("#3a3a3a")
+    for number, row in enumerate(rows):
+        top, left = divmod(number, 6)
+        tile = np.concatenate([np.tile(each[number], (_TILE, _TILE // 2, 1)) for each in (truth, seen)], axis=1)
+        axes.imshow(tile, extent=(left + 0.06, left + 0.94, top + 0.8, top + 0.06), interpolation="none")
+        text = f"{row['patch']}  {row['delta_e']:.1f}"
+        axes.text(left + 0.5, top + 0.98, text, ha="center", va="bottom", color="white", fontsize=FONT - 3)
+    axes.set(xlim=(0, 6), ylim=(4.05, 0), xticks=[], yticks=[], aspect="auto")
+    axes.set_title(
+        f"Left half: the patch's spectrum in D65. Right half: {label(_SHOWN)}. Number: Delta E 2000", fontsize=FONT
+    )
+    return figure
+
+
+def _images(results: Results) -> Figure:
+    """What each family of patterns recovers, in colour."""
+    figure, _ = figure_of(3.2)
+    figure.clear()
+    places: Any = figure.subplots(1, len(FAMILIES))
+    for axes, family in zip(places, FAMILIES, strict=True):
+        row = results.table.where(way=OWN, patterns=family).rows[0]
+        image = results.array(row, _IMAGE)
+        if image is not None:
+            axes.imshow(lightness(linear_srgb(image)), interpolation="none")
+        axes.set(xticks=[], yticks=[])
+        mean = results.table.mean("delta_e", way=OWN, patterns=family).value
+        axes.set_title(label(family), fontsize=FONT)
+        axes.set_xlabel(f"{row['psnr_db']:.1f} dB, mean Delta E {mean:.2f}", fontsize=FONT - 1)
+    return figure
+
+
+EXPERIMENT = Experiment(
+    "colour",
+    "Colours of a ColorChecker",
+    "How near are recovered colours to those of the patches' spectra, and what does each way to see colour cost?",
+    _points, _measure, _claims, _figures,
+)  # fmt: skip
