@@ -33,8 +33,9 @@ def images(scale: float = 1.0) -> np.ndarray:
 def results(**scales: float) -> Results:
     """Of images of the chart that are so many times too bright, by the way they were seen."""
     rows, arrays = [], {}
+    dim, bright = colour.DAYLIGHT
     for way, scale in scales.items():
-        named = {"own": colour.OWN, "one": colour.ONE, "daylight": colour.DAYLIGHT}.get(way) or f"mosaic, {way}"
+        named = {"own": colour.OWN, "one": colour.ONE, "dim": dim, "bright": bright}.get(way) or f"mosaic, {way}"
         for family in colour.FAMILIES if way == "own" else ("dots:7",):
             point = Point.of(Setup("colour_checker"), way=named, patterns=family, seed=0)
             found = colour._judged(point, LINES, images(scale), images())
@@ -64,15 +65,23 @@ def test_an_exact_image_has_the_floors_colours() -> None:
 def test_verdicts_are_on_what_is_added_to_the_floor() -> None:
     """Images 2 % too bright are near it, 30 % are not; a scale is what a fitted matrix takes out, but for white."""
     mosaics = {"half resolution": 0.9, "joint": 1.01}
-    claims = colour._claims(results(own=1.02, one=1.3, daylight=1.3, **mosaics))
-    assert [claim.verdict for claim in claims] == ["confirmed", "not confirmed", "confirmed", "confirmed"]
-    assert "best of 2" in claims[3].claim
-    swapped = colour._claims(results(own=1.3, one=1.01, daylight=1.01, **{"half resolution": 1.01, "joint": 0.9}))
-    assert [claim.verdict for claim in swapped] == ["not confirmed", "confirmed", "not confirmed", "not confirmed"]
+    claims = colour._claims(results(own=1.02, one=1.3, dim=1.02, bright=1.3, **mosaics))
+    assert [claim.verdict for claim in claims] == ["confirmed", "confirmed", "not confirmed", "confirmed", "confirmed"]
+    assert "most PSNR of 2" in claims[4].claim
+    swapped = colour._claims(
+        results(own=1.3, one=1.01, dim=1.3, bright=1.01, **{"half resolution": 1.01, "joint": 0.9})
+    )
+    assert [claim.verdict for claim in swapped] == [
+        "not confirmed",
+        "not confirmed",
+        "confirmed",
+        "not confirmed",
+        "not confirmed",
+    ]
 
 
 def test_every_figure_is_drawn() -> None:
-    drawn = colour._figures(results(own=1.02, one=1.3, daylight=1.3, joint=1.01))
+    drawn = colour._figures(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
     assert set(drawn) == {"delta_e.png", "ways.png", "chart.png", "images.png"}
 
 
@@ -88,6 +97,6 @@ def test_a_small_scene_is_studied_whole(small_scene: Callable[..., Path], tmp_pa
     done = subprocess.run([sys.executable, "-m", "mitsim", *command], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
-    assert told["points"] >= 7 and {row["way"] for row in told["rows"]} >= {colour.OWN, "mosaic, joint"}
+    assert told["points"] >= 6 and {row["way"] for row in told["rows"]} >= {colour.OWN, "mosaic, joint"}
     own = [row for row in told["rows"] if row["way"] == colour.OWN and row["patterns"] == "dots:7"]
     assert all(row["psnr_db"] > 25 for row in own)
