@@ -2,15 +2,16 @@
 
     python benchmarks/plan_promise.py [-o promise.json] [--scenes NAME[:PATTERNS] ...] [--psnr DB ...] [--seeds N]
 
-For each scene and wanted PSNR: the plan (seed 0), then N captures and sessions by the planned recipe, each with seeds
-of its own (light, noise of the capture, noise of every frame of the session), calibrated and reconstructed. Prints a
-row of Markdown for each: predicted PSNR, the mean of the N images with its standard error, and their difference.
+For each scene and wanted PSNR: the plan (seed 0), then another capture, another session's light, and N sessions by the
+planned recipe in it, whose every frame is exposed with noise of its own, calibrated and reconstructed. Prints a row of
+Markdown for each: predicted PSNR, the mean of the N images with its standard error, and their difference.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,20 +31,23 @@ HEAD = (
 )
 
 
-def session_psnr(bench: Any, patterns: str, recipe: Any, seed: int) -> float:
-    """PSNR [dB] of a capture and a session of this ``seed``, as `mitsim capture`, `calibrate` and `reconstruct` make
-    them; responses without noise, which `calibrate` forms for its report alone, are left out."""
-    shots = bench.capture(patterns, seed=seed)
-    session = Session(bench, recipe, seed)
+def session_psnrs(bench: Any, patterns: str, recipe: Any, seeds: range) -> list[float]:
+    """PSNR [dB] of a capture with factors of a session of each of the ``seeds``, as `mitsim capture`, `calibrate` and
+    `reconstruct` make them; responses without noise, which `calibrate` forms for its report alone, are left out."""
+    shots = bench.capture(patterns, seed=seeds[0])
+    session = Session(bench, recipe, seeds[0])
     lit = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
-    found, _ = estimate(lit, Job())
     manifest = CalibrationManifest(
         camera=bench.identity(),
         centre=session.centre,
         board_reflectance=recipe.board_reflectance,
         digital=digital_scale(bench, lit.exposure_s),
     )
-    return ms.psnr(ms.reconstruct(shots, Factors.of(found, manifest)).image, shots.truth)
+    found = []
+    for seed in seeds:
+        estimated, _ = estimate(replace(lit, session=replace(session, seed=seed)), Job())
+        found.append(ms.psnr(ms.reconstruct(shots, Factors.of(estimated, manifest)).image, shots.truth))
+    return found
 
 
 def main() -> None:
@@ -51,18 +55,19 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["photograph", "colour_chart", "resolution_target:dots:5"])
     parser.add_argument("--psnr", nargs="+", type=float, default=[30.0, 40.0])
-    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--seeds", type=int, default=6)
     asked = parser.parse_args()
     print(HEAD.format(seeds=asked.seeds), flush=True)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name in asked.scenes:
         scene, _, patterns = name.partition(":")
         patterns = patterns or "dots:7"
         bench = ms.open_bench(scene)
         for wanted in asked.psnr:
             plan = ms.plan_calibration(bench, wanted, patterns)
-            seeds = range(101, 101 + asked.seeds)
-            found = [session_psnr(bench, patterns, plan.recipe, seed) for seed in seeds] if plan.reached else []
+            first = 1 + asked.seeds * len(rows)
+            seeds = range(first, first + asked.seeds)
+            found = session_psnrs(bench, patterns, plan.recipe, seeds) if plan.reached else []
             rows.append({**plan.payload(), "scene": scene, "found": found, "seeds": list(seeds)})
             if asked.output:
                 asked.output.write_text(json.dumps(rows, indent=1, default=str), encoding="utf-8")

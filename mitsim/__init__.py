@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench, open_bench
     from mitsim.capture.light import Light
+    from mitsim.capture.modelling import calibrate_model
     from mitsim.capture.plan import Plan
     from mitsim.capture.render import Rendered
     from mitsim.capture.request import Request
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.measured import calibrate_frames
     from mitsim.reconstruct.reconstruction import reconstruct
     from mitsim.reconstruct.result import Reconstruction
+    from mitsim.rig.modelling import Modelling
     from mitsim.rig.recipe import load_recipe
     from mitsim.study.calibration_plan import CalibrationPlan, plan_calibration
     from mitsim.study.metrics import psnr, ssim
@@ -43,6 +45,7 @@ _HOMES = {
     "load_calibration": "reconstruct.factors",
     "load_recipe": "rig.recipe",
     "calibrate_frames": "reconstruct.measured",
+    "calibrate_model": "capture.modelling",
     "plan_calibration": "study.calibration_plan",
     "reconstruct": "reconstruct.reconstruction",
     "psnr": "study.metrics",
@@ -56,6 +59,7 @@ _HOMES = {
     "Factors": "reconstruct.factors",
     "Reconstruction": "reconstruct.result",
     "Rendered": "capture.render",
+    "Modelling": "rig.modelling",
     "Job": "core.job",
     "Clock": "core.job",
     "Limits": "core.resources",
@@ -73,11 +77,13 @@ __all__ = [
     "Light",
     "Limits",
     "MitsimError",
+    "Modelling",
     "Plan",
     "Reconstruction",
     "Rendered",
     "Request",
     "calibrate_frames",
+    "calibrate_model",
     "load_calibration",
     "load_recipe",
     "load_run",

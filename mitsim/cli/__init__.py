@@ -18,7 +18,7 @@ import typer
 
 import mitsim
 from mitsim.cli import exchange, sensor
-from mitsim.cli.calibration import Wanted, check_no_plan
+from mitsim.cli.calibration import Wanted, check_no_plan, model_lines, modelling_of
 from mitsim.cli.colour import Colour, of_calibration, of_capture, spectral
 from mitsim.cli.options import (
     DAY,
@@ -52,6 +52,7 @@ from mitsim.cli.screen import finish, print_plan
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, stopped
+from mitsim.rig.modelling import Modelling
 
 app = typer.Typer(
     name="mitsim",
@@ -62,6 +63,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+_MODELS = "geometric|wave"
+"""What --model may be."""
 _OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
 _SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
@@ -280,6 +283,16 @@ def calibrate(
     ] = False,
     psnr: Annotated[float | None, typer.Option(help="wanted of --plan's image [dB]", metavar="DB")] = None,
     patterns: Annotated[str | None, typer.Option(help="of --plan's capture", show_default="dots:7")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(help="model the factors, its rig fitted to a few frames; of --frames with SCENE", metavar=_MODELS),
+    ] = None,
+    frames_used: Annotated[
+        int | None, typer.Option(help="frames that --model is fitted to, at most", show_default="16", metavar="K")
+    ] = None,
+    fit: Annotated[
+        str | None, typer.Option(help="what --model fits", show_default="mask, magnification, gain", metavar="NAME,...")
+    ] = None,
     write_frames: Annotated[
         Path | None, typer.Option(help="folder to write the simulated frames to, for --frames", metavar="DIR")
     ] = None,
@@ -296,6 +309,12 @@ def calibrate(
 ) -> int:
     """Render a Hadamard session on a white board, or read the frames of a real one, and estimate the camera's
     factors."""
+    if model is not None and not planning:
+        modelling, folder = modelling_of(model, frames_used, fit), check_no_plan(psnr, patterns, output)
+        return _calibrate_model(context, modelling, folder)
+    for option, value in (("--frames-used", frames_used), ("--fit", fit), ("--model", model)):
+        if value is not None:
+            raise MitsimError(f"{option} {value}: is for --model without --plan; leave it out")
     if frames is not None:
         given = (name for name in context.params if _is_given(context, name))
         others = sorted({*given} - _OF_FRAMES)
@@ -370,6 +389,45 @@ def _session_lines(payload: dict[str, Any]) -> list[str]:
         f"memory {payload['memory_bytes'] / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} "
         "predicted",
     ]
+
+
+def _calibrate_model(context: typer.Context, modelling: Modelling, output: Path) -> int:
+    """Factors of a model that is fitted to a few frames.
+
+    Parameters
+    ----------
+    context
+        of `mitsim calibrate`, with all its options.
+    modelling, output
+        what is fitted, and the CAL folder.
+
+    Raises
+    ------
+    MitsimError
+        for a missing scene, options that a fit does not have, and whatever it refuses.
+    """
+    from mitsim.rig.framelist import load_frames
+    from mitsim.rig.recipe import load_recipe
+
+    asked = context.params
+    if asked["scene"] is None:
+        raise MitsimError("--model: give the scene too, which states the camera and projector as they were to be built")
+    for name in ("resume", *(("recipe", "seed") if asked["frames"] else ()), "accuracy"):
+        if _is_given(context, name):
+            raise MitsimError(
+                f"--{name}: is of no use with --model{' of --frames' if asked['frames'] else ''}; leave it out"
+            )
+    request_of(seed=asked["seed"])
+    recipe, frames = load_recipe(asked["recipe"]), asked["frames"] and load_frames(asked["frames"])
+    bench_words = (asked[name] for name in ("scene", "variant", "camera", "projector", "define", "outside"))
+    with job_of(asked["quiet"] or asked["as_json"], asked["max_seconds"], asked["max_memory"]) as job:
+        with job.clock.stage("open scene"):
+            bench = bench_of(*bench_words)
+        from mitsim.capture.modelling import calibrate_model
+
+        factors = calibrate_model(bench, modelling, frames, recipe, asked["seed"], output, job)
+    result = factors.manifest.result
+    return finish(asked["as_json"], {**result, "output": str(output)}, model_lines(result, output), factors.warnings)
 
 
 def _is_given(context: typer.Context, name: str) -> bool:

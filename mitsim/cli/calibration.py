@@ -1,7 +1,8 @@
-"""`mitsim calibrate --plan`: words of a command line in, the session that an image needs, or a refusal, out."""
+"""`mitsim calibrate --plan` and `--model`: words of a command line in; a plan, a fit's words, or a refusal, out."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from mitsim.core.errors import MitsimError
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
     from mitsim.core.job import Job
+    from mitsim.rig.modelling import Modelling
     from mitsim.rig.recipe import SessionRecipe
 
 PATTERNS = "dots:7"
@@ -74,6 +76,36 @@ class Wanted:
             lines.append(f"Recipe: {self.output}")
         payload = {**found.payload(), "output": None if self.output is None else str(self.output)}
         return finish(as_json, payload, lines, found.warnings)
+
+
+def modelling_of(model: str, frames_used: int | None, fit: str | None) -> Modelling:
+    """What `--model` is asked for; MitsimError for words that it does not know.
+
+    Parameters
+    ----------
+    model, frames_used, fit
+        the options; None where not given.
+    """
+    from mitsim.rig.modelling import FITTED, Modelling
+
+    names = FITTED if fit is None else tuple(name.strip() for name in fit.split(","))
+    words: Any = model  # checked there
+    return Modelling(words, **({} if frames_used is None else {"frames": frames_used}), fitted=names)
+
+
+def model_lines(result: Mapping[str, Any], output: Path) -> list[str]:
+    """What people read of a fit's ``result``, in the folder ``output``."""
+    numbers = [
+        f"{name.replace('_', ' ')} {number['value']:.6g} +-{number['standard_error']:.2g} {number['unit']}"
+        for name, number in result["parameters"].items()
+        if number["standard_error"] is not None
+    ]
+    return [
+        f"{result['model']} model fitted to {result['frames']} frames in {result['seconds']['total']:.1f} s: {output}",
+        *numbers,
+        f"unexplained {result['unexplained_residual']:.2%}, chi-square {result['chi_square']:.3g} a datum, condition "
+        f"{result['condition']:.2e}",
+    ]
 
 
 def check_no_plan(psnr: float | None, patterns: str | None, output: Path | None) -> Path:

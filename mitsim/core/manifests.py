@@ -353,6 +353,23 @@ class Parallax(_Part):
         return self
 
 
+class FittedNumber(_Part):
+    """A number of a modelled camera."""
+
+    value: float = Field(description="in its unit")
+    standard_error: NonNegative | None = Field(default=None, description="as its fit tells it; none: it was held")
+    unit: str = Field(description="of both")
+
+
+class ModelledFactors(_Part):
+    """What modelled factors were fitted by."""
+
+    model: Literal["geometric", "wave"] = Field(description="of the mask's shadow")
+    frames: int = Field(ge=1, le=MOST_SHOTS, description="that it was fitted to")
+    chi_square: NonNegative = Field(description="a datum, of what the fit uses of the frames; 1 for a right model")
+    parameters: dict[str, FittedNumber] = Field(description="by name: where mask and projector are, and the gain")
+
+
 class CalibrationManifest(_Head):
     """A calibration: of which camera, and how its factors are used."""
 
@@ -367,6 +384,9 @@ class CalibrationManifest(_Head):
     noise: FactorNoise | None = Field(default=None, description="how exact the factors are; none: not stated")
     parallax: Parallax | None = Field(
         default=None, description="how the factors move with depth; none: not known, and no `--focus`"
+    )
+    modelled: ModelledFactors | None = Field(
+        default=None, description="the model that was fitted; none: the factors are measured"
     )
     result: Plain = Field(default={}, description="the session in numbers, as `calibrate --json` gives them")
     estimate: str | None = Field(default=None, description="the estimator's own words")

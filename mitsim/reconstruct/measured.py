@@ -5,7 +5,7 @@ Numbers are those of a simulated session: frames of one, written to such a folde
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -100,6 +100,24 @@ def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFra
             )
     listed = session.listed.model_copy(update={"digital": stated.model_copy(update=absent)})
     return replace(session, listed=listed), tuple(doubts)
+
+
+def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]]) -> Iterator[tuple[FloatArray, float]]:
+    """Response (rows, columns) to each of the ``chosen`` +-1 patterns, side and number, of a real ``session``, and the
+    standard deviation of its noise [electrons/s]; where the list does not state the sensor's, that of its light alone.
+
+    MitsimError for a frame with pixels at the full well or the ADC's end, where a model's fit would be misled.
+    """
+    _check_sizes(session)
+    readings = _Readings(session)
+    for side, index in chosen:
+        rate, variance = readings.response(side, index)
+        if readings.saturated:
+            raise MitsimError(
+                f"frames {session.folder}: {min(readings.saturated)} has pixels at the full well or the ADC's end; "
+                "expose for less"
+            )
+        yield rate, float(np.sqrt(variance))
 
 
 def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
