@@ -33,9 +33,9 @@ STEPS = {
     "projector_row": 2.5e-4,
     "projector_column": 2.5e-4,
 }
-"""Of each number, in its unit: half a micrometre on the mask or less, where shadows are averaged over ten. That of the
-gain is a hundredth of it."""
-_GAIN_STEP = 0.01
+"""Of each number, in its unit: half a micrometre on the mask or less, where shadows are averaged over ten."""
+GAIN_STEP = 0.01
+"""That of the gain, as a part of it: the model is linear in it."""
 _ALIKE = 0.9999
 """Correlation of two numbers from which they count as one: each is told 70 times worse than if the other were known."""
 _FEATURES = 5
@@ -145,7 +145,7 @@ class _Pass:
     @classmethod
     def of(cls, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> _Pass:
         """The problem near ``start``; other parameters as for :func:`fit_placement`."""
-        steps = {name: STEPS.get(name, _GAIN_STEP * start.gain) for name in free}
+        steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}
         turned = camera.turned(start) if "mask_rotation" in free else []
         empty = cls(camera, start, steps, turned, shown, [], np.zeros(0))
         far = [(name, sign * _REACH * step) for name, step in steps.items() if name != "gain" for sign in (-1, 1)]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.fitting import STEPS, Fitted, Shown, fit_placement
+from mitsim.capture.fitting import GAIN_STEP, STEPS, Fitted, Shown, fit_placement
 from mitsim.capture.run import digital_scale
 from mitsim.capture.session import LitSession, Session
 from mitsim.core.arrays import FloatArray
@@ -104,7 +104,7 @@ def _calibrated(
     else:
         recipe = recipe or load_recipe()
         session = Session(bench, recipe, seed)
-        plan = session.plan(_ACCURACY, job)
+        plan = session.plan(modelling.accuracy, job)
         lit = session.lit(session.trace(plan, job), job)
         with job.clock.stage("sensor"):
             shown, used = simulated(lit, modelling)
@@ -124,10 +124,6 @@ def _calibrated(
         versions=versions(),
     )
     return modelled_factors(camera, fitted, used, manifest, job)
-
-
-_ACCURACY = 1e-3
-"""Of a simulated session's light: the default of all sessions."""
 
 
 def model_of(bench: Bench, model: Model) -> ModelledCamera:
@@ -257,7 +253,7 @@ def _noise(camera: ModelledCamera, fitted: Fitted) -> FactorNoise:
     """How far the factors are off by what the fit does not know, rms over their numbers."""
     here, places = camera.factors(fitted.placement), []
     for name in fitted.free:
-        step = STEPS.get(name, 0.01 * fitted.placement.gain)
+        step = STEPS.get(name, GAIN_STEP * fitted.placement.gain)
         there = camera.factors(fitted.placement.moved({name: step}))
         places.append([((on - at) / step).ravel() for on, at in zip(there, here, strict=True)])
     left, right = (

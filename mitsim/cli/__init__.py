@@ -310,7 +310,7 @@ def calibrate(
     """Render a Hadamard session on a white board, or read the frames of a real one, and estimate the camera's
     factors."""
     if model is not None and not planning:
-        modelling, folder = modelling_of(model, frames_used, fit), check_no_plan(psnr, patterns, output)
+        modelling, folder = modelling_of(model, frames_used, fit, accuracy), check_no_plan(psnr, patterns, output)
         return _calibrate_model(context, modelling, folder)
     for option, value in (("--frames-used", frames_used), ("--fit", fit), ("--model", model)):
         if value is not None:
@@ -412,12 +412,12 @@ def _calibrate_model(context: typer.Context, modelling: Modelling, output: Path)
     asked = context.params
     if asked["scene"] is None:
         raise MitsimError("--model: give the scene too, which states the camera and projector as they were to be built")
-    for name in ("resume", *(("recipe", "seed") if asked["frames"] else ()), "accuracy"):
+    for name in ("resume", *(("recipe", "seed", "accuracy") if asked["frames"] else ())):
         if _is_given(context, name):
             raise MitsimError(
                 f"--{name}: is of no use with --model{' of --frames' if asked['frames'] else ''}; leave it out"
             )
-    request_of(seed=asked["seed"])
+    request_of(accuracy=asked["accuracy"], seed=asked["seed"])
     recipe, frames = load_recipe(asked["recipe"]), asked["frames"] and load_frames(asked["frames"])
     bench_words = (asked[name] for name in ("scene", "variant", "camera", "projector", "define", "outside"))
     with job_of(asked["quiet"] or asked["as_json"], asked["max_seconds"], asked["max_memory"]) as job:

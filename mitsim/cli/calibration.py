@@ -78,19 +78,19 @@ class Wanted:
         return finish(as_json, payload, lines, found.warnings)
 
 
-def modelling_of(model: str, frames_used: int | None, fit: str | None) -> Modelling:
+def modelling_of(model: str, frames_used: int | None, fit: str | None, accuracy: float) -> Modelling:
     """What `--model` is asked for; MitsimError for words that it does not know.
 
     Parameters
     ----------
-    model, frames_used, fit
+    model, frames_used, fit, accuracy
         the options; None where not given.
     """
     from mitsim.rig.modelling import FITTED, Modelling
 
     names = FITTED if fit is None else tuple(name.strip() for name in fit.split(","))
     words: Any = model  # checked there
-    return Modelling(words, **({} if frames_used is None else {"frames": frames_used}), fitted=names)
+    return Modelling(words, **({} if frames_used is None else {"frames": frames_used}), fitted=names, accuracy=accuracy)
 
 
 def model_lines(result: Mapping[str, Any], output: Path) -> list[str]:

@@ -42,11 +42,14 @@ class Modelling:
         of the session that are used, at most.
     fitted
         names of :data:`UNITS`; the rest is as the scene states it. The gain is always fitted.
+    accuracy
+        of a simulated session's light.
     """
 
     model: Model
     frames: int = 16
     fitted: tuple[str, ...] = FITTED
+    accuracy: float = 1e-3
 
     def __post_init__(self) -> None:
         if self.model not in get_args(Model):

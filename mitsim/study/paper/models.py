@@ -35,6 +35,7 @@ OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column":
 PATTERNS = "dots:7"
 MEASURED, WAVE, GEOMETRIC = FACTORS = ("measured", "wave", "geometric")
 _FRAMES = (2, 4, 8, 16, 64)
+"""That models are fitted to: uniform light alone, and up to a quarter of the stripes of a side."""
 _MODES = {"uniform": 1, "pair": 1, "pair x 4": 4}
 """Repeats of measured sessions, by name."""
 _EXPOSURES = (0.8, 0.01)

@@ -1,0 +1,84 @@
+"""`mitsim calibrate --plan` and `--model`, from the command line: what they print, write and refuse."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mitsim.rig.recipe import load_recipe
+from tests.system.refusals import Refused, mentions
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
+
+def test_a_plan_prints_what_it_takes_and_writes_its_recipe(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    options = "--plan", "--psnr", 20, "--patterns", "dots:4", "--json", "--quiet", "-o", tmp_path / "recipe.toml"
+    done = call("calibrate", *lab.rig, *options)
+    assert done.code == 0, done.err
+    said = done.payload
+    recipe = load_recipe(tmp_path / "recipe.toml")
+    assert (recipe.exposure_fraction, recipe.repeats) == (said["exposure_fraction"], said["repeats"])
+    assert said["reached"] and 20 <= said["psnr"] <= 21 < said["psnr_ceiling"]
+    assert said["exposure_total_s"] == pytest.approx(said["frames"] * said["exposure_s"])
+    assert said["photons_a_pixel"] > said["electrons_a_pixel"] > 0 and said["simulation_s"] > 0
+
+
+def test_a_ceiling_ends_with_status_one_and_a_line(call: Callable[..., Any], lab: Any) -> None:
+    done = call("calibrate", *lab.rig, "--plan", "--psnr", 90, "--patterns", "uniform", "--quiet")
+    assert done.code == 1
+    (line,) = [line for line in done.err.splitlines() if "cannot be reached" in line]
+    mentions(line, "90 dB cannot be reached under uniform", "without noise", "improve the capture")
+
+
+def test_modelled_factors_are_a_calibration_that_says_so(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """The small sensor sees no difference of distance and size, so one is held."""
+    fit = "mask_distance,mask_shift_row,mask_shift_column"
+    options = "--model", "wave", "--frames-used", 8, "--fit", fit, "-o", tmp_path / "cal", "--json", "--quiet"
+    done = call("calibrate", *lab.rig, *options)
+    assert done.code == 0, done.err
+    said, written = done.payload, json.loads((tmp_path / "cal" / "manifest.json").read_text())
+    assert said["frames"] == 8 and said["model"] == "wave"
+    fitted, held = (
+        written["modelled"]["parameters"]["mask_distance"],
+        written["modelled"]["parameters"]["magnification"],
+    )
+    assert abs(fitted["value"] - 2) < 5 * fitted["standard_error"] and (held["value"], held["standard_error"]) == (
+        1,
+        None,
+    )
+    image = call("reconstruct", lab.run, "--calibration", tmp_path / "cal", "-o", tmp_path / "image", "--json")
+    measured = call("reconstruct", lab.run, "--calibration", lab.calibration, "-o", tmp_path / "other", "--json")
+    assert image.code == 0 and image.payload["psnr"] > measured.payload["psnr"] - 1
+
+
+REFUSED = [
+    (("--plan",), ("--plan: give the PSNR",)),
+    (("--plan", "--psnr", 0), ("--psnr 0", "1 to 100 dB")),
+    (("--plan", "--psnr", 20, "--patterns", "stars"), ("stars",)),
+    (("--plan", "--psnr", 20, "--resume"), ("--resume",)),
+    (("--plan", "--psnr", 20, "--model", "wave"), ("--model wave", "without --plan")),
+    (("--psnr", 20), ("--psnr 20", "--plan")),
+    (("--patterns", "dots:4"), ("--patterns dots:4", "--plan")),
+    (("--frames-used", 4), ("--frames-used 4", "--model")),
+    (("--model", "ray"), ("--model 'ray'", "geometric or wave")),
+    (("--model", "wave", "--frames-used", 1), ("--frames-used 1", "2 or more")),
+    (("--model", "wave", "--fit", "tilt"), ("--fit 'tilt'", "mask_distance")),
+    (("--model", "wave", "--fit", "mask_shift_row,projector_row"), ("--fit mask_shift_row,projector_row", "fit one")),
+    (("--model", "wave", "--resume"), ("--resume",)),
+]
+
+
+@pytest.mark.parametrize(("options", "fragments"), REFUSED)
+def test_what_goes_together_with_nothing_is_refused(
+    refused: Refused, lab: Any, options: tuple[object, ...], fragments: tuple[str, ...]
+) -> None:
+    mentions(refused("calibrate", *lab.rig, "-o", "new.toml", *options), *fragments)
+
+
+def test_a_calibration_without_a_folder_or_a_model_without_a_scene_is_refused(refused: Refused, lab: Any) -> None:
+    mentions(refused("calibrate", *lab.rig), "Missing option '-o' / '--output'")
+    mentions(refused("calibrate", "--model", "wave", "-o", "new"), "--model: give the scene too")
