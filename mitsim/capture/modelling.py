@@ -33,7 +33,8 @@ from mitsim.reconstruct.measured import chosen_responses
 from mitsim.reconstruct.status import Status, Verdict
 from mitsim.rig.framelist import SessionFrames, load_frames
 from mitsim.rig.modelling import UNITS, Model, Modelling, frames_of
-from mitsim.rig.patterns import SIDES, Lighting, stripe_signs
+from mitsim.rig.order import SIDES, Side
+from mitsim.rig.patterns import Lighting, stripe_signs
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 _SIGNIFICANT = 3.0
@@ -103,6 +104,8 @@ def _calibrated(
         configuration: dict[str, Any] = {"frames": str(listed.folder)}
     else:
         recipe = recipe or load_recipe()
+        if recipe.depths:
+            raise MitsimError("recipe: has depths; a model is fitted on the aligned plane, so leave them out")
         session = Session(bench, recipe, seed)
         plan = session.plan(modelling.accuracy, job)
         lit = session.lit(session.trace(plan, job), job)
@@ -153,7 +156,7 @@ def simulated(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
         )
         for side, index in chosen
     ]
-    return shown, frames_of(chosen, pairs, repeats)
+    return shown, frames_of(chosen, pairs, repeats) * len(session.recipe.exposure_ladder)
 
 
 def _real(bench: Bench, session: SessionFrames, modelling: Modelling) -> tuple[list[Shown], Digital, int]:
@@ -174,7 +177,7 @@ def _real(bench: Bench, session: SessionFrames, modelling: Modelling) -> tuple[l
                 f"{bench.geometry.pixels} x {bench.geometry.pixels}; give the scene of this rig"
             )
         shown.append(_shown(signs[:, index], side, rate, noise, listed.centre))
-    return shown, listed.digital, frames_of(chosen, pairs, listed.repeats)
+    return shown, listed.digital, frames_of(chosen, pairs, listed.repeats) * len(listed.exposure_ladder)
 
 
 def _changes(signs: FloatArray) -> list[int]:
@@ -183,7 +186,7 @@ def _changes(signs: FloatArray) -> list[int]:
     return found
 
 
-def _shown(signs: FloatArray, side: str, rate: FloatArray, noise: float, centre: bool) -> Shown:
+def _shown(signs: FloatArray, side: Side, rate: FloatArray, noise: float, centre: bool) -> Shown:
     across = side == SIDES[0]
     even = np.ones_like(signs)
     return Shown(signs if across else even, even if across else signs, centred(rate) if centre else rate, noise)

@@ -412,11 +412,11 @@ def _calibrate_model(context: typer.Context, modelling: Modelling, output: Path)
     asked = context.params
     if asked["scene"] is None:
         raise MitsimError("--model: give the scene too, which states the camera and projector as they were to be built")
-    for name in ("resume", *(("recipe", "seed", "accuracy") if asked["frames"] else ())):
+    frames_alone = ("recipe", "seed", "accuracy") if asked["frames"] else ()
+    for name in ("resume", "write_frames", "colour", *frames_alone):
         if _is_given(context, name):
-            raise MitsimError(
-                f"--{name}: is of no use with --model{' of --frames' if asked['frames'] else ''}; leave it out"
-            )
+            other = " of --frames" if name in frames_alone else ""
+            raise MitsimError(f"--{name.replace('_', '-')}: is of no use with --model{other}; leave it out")
     request_of(accuracy=asked["accuracy"], seed=asked["seed"])
     recipe, frames = load_recipe(asked["recipe"]), asked["frames"] and load_frames(asked["frames"])
     bench_words = (asked[name] for name in ("scene", "variant", "camera", "projector", "define", "outside"))

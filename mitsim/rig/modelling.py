@@ -8,11 +8,10 @@ from types import MappingProxyType
 from typing import Literal, get_args
 
 from mitsim.core.errors import ArgumentError
+from mitsim.rig.order import Side
 
 Model = Literal["geometric", "wave"]
 """Of the mask's shadow: rays, or waves of the projector's lines."""
-Side = Literal["horizontal", "vertical"]
-"""Of stripes, as :data:`mitsim.rig.patterns.SIDES`; patterns need numpy, and checking words does not."""
 UNITS: Mapping[str, str] = MappingProxyType(
     {
         "mask_distance": "mm",
