@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,13 @@ import numpy as np
 import pytest
 
 import mitsim as ms
+from mitsim.capture.calibrate import estimate
+from mitsim.capture.run import digital_scale
+from mitsim.capture.session import Session
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.job import Job
+from mitsim.core.manifests import CalibrationManifest
+from mitsim.reconstruct.factors import Factors
 from mitsim.rig.recipe import MOST_REPEATS, SessionRecipe, load_recipe, recipe_text
 from mitsim.study.calibration_plan import least_dose
 
@@ -125,3 +132,26 @@ def test_more_than_the_capture_allows_is_said_in_one_line(bench: Any, kept_plans
     (line,) = plan.warnings
     assert "75 dB cannot be reached under dots:2" in line and f"{plan.ceiling.psnr_db:.1f} dB" in line
     assert "most of its error is" in line and "\n" not in line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["photograph", "colour_chart", "resolution_target"])
+@pytest.mark.parametrize("wanted", [30.0, 35.0])
+def test_the_promise_is_kept_within_half_a_decibel(scene: str, wanted: float, variant: str, kept_plans: None) -> None:
+    """Mean PSNR of four sessions, every frame of them exposed, in other light than the plan's, against the plan's.
+
+    Single sessions scatter by 0.4 dB, the difference of the means by 0.25 dB: the seeds are ones that keep it, as nineteen
+    of twenty do. docs/studies.md has six sessions of each.
+    """
+    bench = ms.open_bench(scene, variant)
+    patterns = "dots:5" if scene == "resolution_target" else "dots:7"
+    plan = ms.plan_calibration(bench, wanted, patterns)
+    assert plan.reached
+    shots, session = bench.capture(patterns, seed=11), Session(bench, plan.recipe, 11)
+    lit = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
+    manifest = CalibrationManifest(camera=bench.identity(), digital=digital_scale(bench, lit.exposure_s))
+    found = []
+    for seed in range(11, 15):
+        estimated, _ = estimate(replace(lit, session=replace(session, seed=seed)), Job())
+        found.append(ms.psnr(ms.reconstruct(shots, Factors.of(estimated, manifest)).image, shots.truth))
+    assert np.mean(found) == pytest.approx(plan.trial.psnr_db, abs=0.5)
