@@ -1,6 +1,8 @@
 """What `mitsim calibrate --plan` promises against what sessions by its recipe come to.
 
     python benchmarks/plan_promise.py [-o promise.json] [--scenes NAME[:PATTERNS] ...] [--psnr DB ...] [--seeds N]
+    python benchmarks/plan_promise.py --scenes resolution_target:dots:5 --psnr 35
+    python benchmarks/plan_promise.py --scenes photograph:uniform --psnr 25
 
 For each scene and wanted PSNR: the plan (seed 0), then another capture, another session's light, and N sessions by the
 planned recipe in it, whose every frame is exposed with noise of its own, calibrated and reconstructed. Prints a row of

@@ -140,8 +140,8 @@ def test_more_than_the_capture_allows_is_said_in_one_line(bench: Any, kept_plans
 def test_the_promise_is_kept_within_half_a_decibel(scene: str, wanted: float, variant: str, kept_plans: None) -> None:
     """Mean PSNR of four sessions, every frame of them exposed, in other light than the plan's, against the plan's.
 
-    Single sessions scatter by 0.4 dB, the difference of the means by 0.25 dB: the seeds are ones that keep it, as nineteen
-    of twenty do. docs/studies.md has six sessions of each.
+    Single sessions scatter by 0.4 dB and the difference of the means by 0.25 dB, so that nineteen in twenty keep it;
+    these seeds do. docs/studies.md has six sessions of each.
     """
     bench = ms.open_bench(scene, variant)
     patterns = "dots:5" if scene == "resolution_target" else "dots:7"
