@@ -233,31 +233,29 @@ class LitSession:
 
     @property
     def response_noise(self) -> float:
-        """Root mean square noise of a +-1 response [electrons / s], from the sensor's closed form.
+        """Root mean square noise of a +-1 response [electrons / s], from the sensor's closed form."""
+        return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
 
-        Its two shots share the uniform light L: variance (L + 2 D) / t + 2 read^2 / t^2 with dark electrons D for a
-        pair; with one shot of a part p of the lines, about half, and a uniform one, 2 Y(positive) - Y(uniform), it is
+    def response_variance(self, side: str) -> FloatArray:
+        """(pixels, pixels) mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form.
+
+        Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 read^2 / t^2 with dark electrons D;
+        with one shot of a part p of the lines, about half, and a uniform one, 2 Y(positive) - Y(uniform), it is
         (4 p L + L + 5 D) / t + 5 read^2 / t^2, and that of a dark frame's mean is added. Means of repeated shots have
         their number's part of it. Of several exposures each pixel has the sum of these by the squares of its weights.
         """
-        sensor, recipe = self.session.bench.sensor, self.session.recipe
+        sensor, recipe, ladder = self.session.bench.sensor, self.session.recipe, self.ladders[side]
         dark, read = sensor.superpixel_dark_current_e_per_s, sensor.superpixel_reading_noise_e**2
         lit_lines = float((1 + self.session.signs).mean()) / 2
         light_parts, shots = (1.0, 2) if self.session.pairs else (4 * lit_lines + 1, 5)
-        variance = 0.0
-        for ladder in self.ladders.values():
-            for number, exposer in enumerate(self._exposers):
-                squares = 1.0 if ladder.weights is None else np.square(ladder.weights[number])
-                lit, part, time = (
-                    float(np.mean(squares * self._white_rate)),
-                    float(np.mean(squares)),
-                    exposer.exposure_s,
-                )
-                charge = light_parts * lit + part * shots * dark
-                variance += (charge / time + part * shots * read / time**2) / recipe.repeats / len(SIDES)
-                if recipe.dark_frames:
-                    variance += part * (dark / time + read / time**2) / recipe.dark_frames / len(SIDES)
-        return float(np.sqrt(variance))
+        variance: FloatArray = np.zeros(self.uniform_rate.shape)
+        for number, time in enumerate(self.exposures_s):
+            own = (light_parts * self.uniform_rate + shots * dark) / time + shots * read / time**2
+            own /= recipe.repeats
+            if recipe.dark_frames:
+                own += (dark / time + read / time**2) / recipe.dark_frames
+            variance += own if ladder.weights is None else np.square(ladder.weights[number]) * own
+        return variance
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
         """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.
@@ -305,8 +303,13 @@ class LitSession:
         if not black:
             return frame
         light = (1 - black) * frame.irradiance
-        light += black * self.white.irradiance
+        light += self._leaked
         return replace(frame, irradiance=light)
+
+    @cached_property
+    def _leaked(self) -> FloatArray:
+        """(pixels, pixels) light of all pixels when they are black [W m^-2]."""
+        return np.asarray(self.light.simulation.physics.black_level * self.white.irradiance)
 
     def noisy(self, side: str, number: int, frame: Frame) -> Response:
         """Response to a +-1 pattern as a user of noisy frames has it.
@@ -337,7 +340,7 @@ class LitSession:
         """(pixels, pixels) the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
         rate = self._second.electrons(frame)
         rate *= 2
-        rate -= self._white_rate
+        rate -= self.uniform_rate
         return rate
 
     @property
@@ -385,7 +388,8 @@ class LitSession:
         return {side: ladder.merged(rates) for side, ladder in self.ladders.items()}
 
     @cached_property
-    def _white_rate(self) -> FloatArray:
+    def uniform_rate(self) -> FloatArray:
+        """(pixels, pixels) expected photoelectrons a second of the uniform frame."""
         return self._second.electrons(self.white)
 
     @cached_property

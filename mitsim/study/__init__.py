@@ -15,7 +15,12 @@ if TYPE_CHECKING:
     from mitsim.study.runner import Study
 
 STUDIES: Mapping[str, str] = MappingProxyType(
-    {"accuracy": "accuracy:measure", "diffraction": "diffraction:measure", "solver": "solver:measure"}
+    {
+        "accuracy": "accuracy:measure",
+        "calibration": "calibration:measure",
+        "diffraction": "diffraction:measure",
+        "solver": "solver:measure",
+    }
 )
 """Studies of one bench by name, as ``module:function``; the function takes (bench, request, job) and gives
 :class:`mitsim.study.runner.Findings`."""
@@ -44,18 +49,29 @@ ALL = "all"
 """What the study of all experiments of the paper is called."""
 
 
-def find_study(name: str) -> Study:
+def find_study(name: str, **settings: object) -> Study:
     """The study ``name``, to be called with (bench, output, request, job); nothing heavy is imported before the name is
     known to be one.
 
-    MitsimError for another name, with those that there are.
+    Parameters
+    ----------
+    name
+        of the study.
+    **settings
+        further arguments of its function.
+
+    Raises
+    ------
+    MitsimError
+        for another name, with those that there are.
     """
     if name not in STUDIES:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
     from mitsim.study.runner import run_study
 
     module, function = STUDIES[name].split(":")
-    return partial(run_study, name, getattr(importlib.import_module(f"mitsim.study.{module}"), function))
+    measure = getattr(importlib.import_module(f"mitsim.study.{module}"), function)
+    return partial(run_study, name, partial(measure, **settings))
 
 
 def find_experiment(name: str) -> Experiment:

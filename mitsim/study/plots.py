@@ -77,6 +77,43 @@ def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
     return figure
 
 
+def deviations(values: npt.ArrayLike, largest: float) -> Figure:
+    """Errors of a factor's entries ``values`` (m, n) in predicted deviations, up to ``largest`` of either sign."""
+    figure, axes = figure_of(0.5 * WIDTH, 0.5 * WIDTH)
+    drawn = axes.imshow(
+        np.asarray(values), vmin=-largest, vmax=largest, cmap="RdBu_r", interpolation="none", aspect="auto"
+    )
+    axes.set_xlabel("scene line [projector pixel]", fontsize=FONT - 1)
+    axes.set_ylabel("sensor line [pixel]", fontsize=FONT - 1)
+    bar = figure.colorbar(drawn, ax=axes, extend="both")
+    bar.set_label("error [predicted deviations]", fontsize=FONT - 1)
+    bar.ax.tick_params(labelsize=FONT - 2)
+    return figure
+
+
+def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
+    """Errors of singular values of each of ``factors``, and their standard errors as lines; rows are of (without noise,
+    with noise less its bias, standard error)."""
+    figure, axes = figure_of(0.45 * WIDTH)
+    for index, (name, rows) in enumerate(factors.items()):
+        exact, noisy, error = rows.T
+        style = {"color": _PALETTE[index + 1], "lw": 1.6}
+        axes.plot(np.arange(len(rows)), error / exact, label=f"{name}: standard error", **style)
+        axes.plot(
+            np.arange(len(rows)),
+            np.abs(noisy - exact) / exact,
+            _MARKERS[index],
+            ms=4,
+            mfc="none",
+            color=_PALETTE[index + 1],
+            label=f"{name}: found, less bias",
+        )
+    axes.set_yscale("log")
+    label_axes(axes, "number of the singular value", "relative error [1]")
+    _legend_below(figure, 4, *axes.get_legend_handles_labels())
+    return figure
+
+
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     """Singular values of each family's system, {family: values in any order}, log scale over rank in percent.
 

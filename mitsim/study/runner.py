@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from matplotlib.figure import Figure
 
@@ -17,6 +17,7 @@ from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, sweep, whole_file
 from mitsim.core.versions import versions
+from mitsim.study.table import Table
 
 DPI = 150
 """Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
@@ -32,6 +33,14 @@ class Findings(Protocol):
         """For people."""
 
     def figures(self) -> Mapping[str, Figure]:
+        """By file name."""
+
+
+@runtime_checkable
+class Tabled(Protocol):
+    """Findings with tables."""
+
+    def tables(self) -> Mapping[str, Table]:
         """By file name."""
 
 
@@ -66,7 +75,7 @@ def run_study(
     request: Request | None = None,
     job: Job | None = None,
 ) -> StudyResult:
-    """Measure, and write NAME.json and the figures to a folder.
+    """Measure, and write NAME.json, figures and tables to a folder.
 
     MitsimError for an output that cannot be written or holds something else, and for what the study itself refuses.
 
@@ -80,7 +89,7 @@ def run_study(
         new or empty folder, or one with an earlier study of that name, which is replaced.
     """
     request = request or Request.of()
-    with study_folder(output, name, ("*.png",)) as folder:
+    with study_folder(output, name, ("*.png", "*.csv")) as folder:
         findings = measure(bench, request, job or Job())
         scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
         result = StudyResult(findings, scene, patterns, str(folder))
@@ -89,6 +98,8 @@ def run_study(
         for file, figure in findings.figures().items():
             with whole_file(folder / file) as part:
                 figure.savefig(part, dpi=DPI, format="png")
+        for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():
+            table.write(folder / file)
         return result
 
 

@@ -84,5 +84,5 @@ def test_every_study_can_be_found(name: str) -> None:
 
 
 def test_another_name_is_refused_with_the_studies() -> None:
-    with pytest.raises(MitsimError, match=r"'weather'.*accuracy, diffraction"):
+    with pytest.raises(MitsimError, match=r"'weather'.*accuracy, calibration, diffraction"):
         find_study("weather")
