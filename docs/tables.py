@@ -29,6 +29,7 @@ from mitsim.core.manifests import (
 from mitsim.rig.board import BoardShape
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.chart import ChartPlace
+from mitsim.rig.drift import Drift
 from mitsim.rig.efficiency import EfficiencyCurve
 from mitsim.rig.framelist import DarkFile, FrameList, StripeFile
 from mitsim.rig.profile import MaskProfile
@@ -40,7 +41,7 @@ FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
     *(CameraGeometry, MaskProfile, ProjectorModel, Coherence),
     *(SensorModel, EfficiencyCurve),
-    *(SessionRecipe, BoardShape),
+    *(SessionRecipe, BoardShape, Drift),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile, Raw),
     *(ColourManifest, Line, ChartPlace),

@@ -7,6 +7,7 @@ noise. When n is no Hadamard order the next one is used and its first n rows: ro
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,6 +17,7 @@ import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.board import missed_pixels
+from mitsim.capture.drift import levels
 from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import Exposer, camera_warnings, in_chunks
 from mitsim.capture.kept_frames import KeptFrames
@@ -36,7 +38,7 @@ from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, decibels
 from mitsim.reconstruct.ladder import Chosen, Ladder
 from mitsim.rig.board import BoardShape
 from mitsim.rig.digital import digital_of
-from mitsim.rig.order import SIDES, Half, taken
+from mitsim.rig.order import SIDES, UNIFORM, Half, taken
 from mitsim.rig.patterns import Lighting, PatternFamily, stripe_signs
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
@@ -146,6 +148,20 @@ class Session:
         """What the lit frames show, as they are taken; each with all exposures, one after the other, and of each all
         repeats. Dark frames come last."""
         return taken(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
+
+    @cached_property
+    def powers(self) -> Mapping[tuple[str, int], FloatArray]:
+        """(exposures, repeats) power of the projector in frames of each shot, by side and number; 1 at the session's
+        begin."""
+        drift, order = self.recipe.drift, self.order
+        each = len(order), len(self.recipe.exposure_ladder), self.recipe.repeats
+        found = levels(self.seed, "session", math.prod(each), drift.session_ramp, drift.session_flicker).reshape(each)
+
+        def shot(half: Half) -> tuple[str, int]:
+            side, number, sign = half
+            return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
+
+        return {shot(half): power for half, power in zip(order, found, strict=True)}
 
     def plan(self, accuracy: float, job: Job) -> Plan:
         """What to simulate for responses of this relative ``accuracy``, and what the session takes.
@@ -435,18 +451,22 @@ class LitSession:
         names: tuple[str | int, ...] = (side, index)
         names += ("exposure", exposure) if exposure else ()
 
-        def saturated(digital: Digital) -> bool:
-            if used is True:
-                return exposer.saturated(digital, lit)
-            return exposer.saturated(np.where(used, digital, 0), np.where(used, lit, 0.0))
+        powers = self.session.powers[side, index][exposure]
 
-        digital = self._read(exposer, lit, *names)
+        def read(repeat: int) -> tuple[Digital, int]:
+            light = powers[repeat] * lit
+            digital = self._read(exposer, light, *names, *(("repeat", repeat) if repeat else ()))
+            if used is True:
+                return digital, int(exposer.saturated(digital, light))
+            return digital, int(exposer.saturated(np.where(used, digital, 0), np.where(used, light, 0.0)))
+
+        digital, count = read(0)
         if repeats == 1:
-            return digital, int(saturated(digital))
-        count, mean = int(saturated(digital)), digital.astype(np.float64)
+            return digital, count
+        mean = digital.astype(np.float64)
         for repeat in range(1, repeats):
-            digital = self._read(exposer, lit, *names, "repeat", repeat)
-            count += saturated(digital)
+            digital, saturated = read(repeat)
+            count += saturated
             mean += digital
         mean /= repeats
         return mean, count

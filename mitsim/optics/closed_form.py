@@ -186,7 +186,8 @@ class FrameOptics:
 
 def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
     """The shadow of ``geometry`` toward ``directions``; of masks of many terms, 100 MiB each, none is kept."""
-    return (shadow_terms if geometry.mask_terms > FEW else _kept_shadow)(geometry, *directions)
+    many = geometry.mask_terms > FEW or geometry.mask_motion is not None
+    return (shadow_terms if many else _kept_shadow)(geometry, *directions)
 
 
 class _Stack:

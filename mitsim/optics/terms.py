@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mitsim.optics.diffraction import wave_terms
+from mitsim.optics.motion import moving_terms
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
@@ -42,6 +43,9 @@ def shadow_terms(
     shadow = ShadowGeometry.of(geometry, depth)
     if places is not None:
         shadow = replace(shadow, pixel_centres_mm=shadow.pixel_centres_mm[np.asarray(places)])
+    if geometry.mask_motion is not None:
+        others = rows, columns, depth, spectrum, places
+        return moving_terms(geometry, shadow, rows, columns, lambda still: shadow_terms(still, *others))
     terms = geometric_terms(shadow, rows, columns) if spectrum is None else wave_terms(shadow, rows, columns, spectrum)
     if geometry.pixel_fill_factor == 1:
         return terms

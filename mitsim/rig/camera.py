@@ -16,6 +16,7 @@ from pydantic.json_schema import SkipJsonSchema
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError
+from mitsim.rig.drift import MaskMotion
 from mitsim.rig.mask import CameraMask, Mask, mls_mask
 from mitsim.rig.plate import FEW, Plate, within
 
@@ -59,6 +60,8 @@ class CameraGeometry(BaseModel):
     """1000 halves the response at 2 degrees, far less than any microlens."""
     mask_plate: SkipJsonSchema[Plate | None] = Field(None, exclude=True, description="mask of a camera file")
     """The mask ``plate``, which no scene states."""
+    mask_motion: SkipJsonSchema[MaskMotion | None] = Field(None, exclude=True, description="turn and vibration")
+    """What a drift adds between calibration and capture, which no scene states."""
 
     @model_validator(mode="after")
     def _mask_lies_before_the_scene(self) -> CameraGeometry:
@@ -89,7 +92,13 @@ class CameraGeometry(BaseModel):
     def identity(self) -> dict[str, object]:
         """What manifests say of it: all fields, but for an offset of 0 and no plate, which calibrations of 0.4 do not
         know."""
-        known = {name: value for name, value in self if value or not name.startswith(("mask_offset", "mask_plate"))}
+        known = {
+            name: value
+            for name, value in self
+            if value or not name.startswith(("mask_offset", "mask_plate", "mask_motion"))
+        }
+        if self.mask_motion is not None:
+            known["mask_motion"] = self.mask_motion.model_dump()
         return known if self.mask_plate is None else {**known, "mask_plate": self.mask_plate.identity}
 
     @property

@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from mitsim.core.configuration import load_model, shipped
 from mitsim.rig.board import BoardShape
+from mitsim.rig.drift import Drift
 from mitsim.rig.order import Order
 from mitsim.rig.sensor import ExposureFraction
 
@@ -67,6 +68,7 @@ class SessionRecipe(BaseModel):
     dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS, description="frames without light, of each exposure")
     order: Order = Field(default="listed", description="order in which patterns are taken")
     order_seed: int = Field(default=0, ge=0, le=MOST_SEED, description="of a random order")
+    drift: Drift = Field(default=Drift(), description="what moves between calibration and capture; none: nothing")
     source: str = Field(description="where the numbers come from")
 
     @model_validator(mode="after")

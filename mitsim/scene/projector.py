@@ -30,7 +30,7 @@ class ProjectorGrid:
     n
         pixels a side of the window.
     first_row, first_column
-        canvas texel of the window's pixel (0, 0).
+        canvas texel of the window's pixel (0, 0); between texels where a picture has drifted.
     canvas
         (rows, columns) of the whole texture.
     row_tan, column_tan
@@ -41,8 +41,8 @@ class ProjectorGrid:
     """
 
     n: int
-    first_row: int
-    first_column: int
+    first_row: float
+    first_column: float
     canvas: tuple[int, int]
     row_tan: tuple[float, float]
     column_tan: tuple[float, float]
@@ -151,7 +151,7 @@ def _window_corners(
     projector: mi.Emitter,
     camera: mi.Sensor,
     canvas: tuple[int, ...],
-    first: tuple[int, int],
+    first: tuple[float, float],
     n: int,
     z: float,
 ) -> FloatArray:

@@ -11,6 +11,7 @@ numbers: the renderer's float32, a lane each (:class:`ProjectorRays`), and the h
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,7 +39,8 @@ _PROBE_STEP = 1e-2
 
 @dataclass(frozen=True)
 class ProjectorOptics:
-    """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas.
+    """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas, fractions of
+    a pixel where it has moved.
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
     standard deviation of a projector pixel's spot, in projector pixels. ``lines`` are those that spectral variants
@@ -47,8 +49,8 @@ class ProjectorOptics:
 
     emitter: mi.Emitter
     n: int
-    first_row: int
-    first_column: int
+    first_row: float
+    first_column: float
     canvas: tuple[int, int]
     aperture: float = 0.0
     focus: float = 400.0
@@ -76,9 +78,10 @@ class ProjectorOptics:
 
     def pixel_at(self, uv: mi.Point2f) -> mi.UInt32:
         """The window's pixel (row-major) at canvas point ``uv``; outside of the window, the nearest."""
-        rows, columns = self.canvas
-        row = dr.clip(dr.floor(uv.y * rows) - self.first_row, 0, self.n - 1)
-        column = dr.clip(dr.floor(uv.x * columns) - self.first_column, 0, self.n - 1)
+        (rows, columns), (row_part, first_row) = self.canvas, math.modf(self.first_row)
+        column_part, first_column = math.modf(self.first_column)
+        row = dr.clip(dr.floor(uv.y * rows - row_part) - first_row, 0, self.n - 1)
+        column = dr.clip(dr.floor(uv.x * columns - column_part) - first_column, 0, self.n - 1)
         return mi.UInt32(row * self.n + column)
 
     def pixel_size(self) -> tuple[float, float]:

@@ -1,0 +1,109 @@
+"""What moves between a calibration and a capture: the table [drift] of a recipe in, a checked and frozen model out.
+
+Every number is 0 where nothing moves. Mask, projector, power, lamps, sensor and exposure are as they were in the
+session before it, and as stated here in the capture after it; a session itself drifts by ``session_ramp`` and
+``session_flicker`` alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mitsim.core.configuration import validated
+from mitsim.core.errors import MitsimError
+
+LARGEST_ROTATION_MRAD = 10.0
+"""Beyond it the cosine, which is taken for 1, moves a mask's edge 3 mm off the axis by 0.15 um."""
+UNITS: Mapping[str, str] = MappingProxyType({
+    "mask_rows_um": "um", "mask_columns_um": "um", "mask_axis_um": "um", "mask_rotation_mrad": "mrad",
+    "vibration_um": "um rms", "temperature_k": "K", "exposure": "1", "power": "1", "power_ramp": "1",
+    "power_flicker": "1 rms", "session_ramp": "1", "session_flicker": "1 rms", "lamp": "1", "lamp_flicker": "1 rms",
+    "projector_rows": "pixels", "projector_columns": "pixels", "black_level_dn": "DN",
+})  # fmt: skip
+"""Unit of each kind of drift: every field of :class:`Drift` that moves something by itself."""
+
+
+class MaskMotion(BaseModel):
+    """How a mask is turned in its plane about its centre, from rows to columns, and how it moves during an exposure."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    rotation_mrad: float = Field(default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD)
+    vibration_um: float = Field(default=0.0, ge=0, le=1000, description="rms along each axis, um")
+
+
+class Drift(BaseModel):
+    """What moves between a calibration and a capture, and by how much."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    mask_rows_um: float = Field(default=0.0, ge=-1000, le=1000, description="mask moves down the rows, um")
+    mask_columns_um: float = Field(default=0.0, ge=-1000, le=1000, description="the same along the columns, um")
+    mask_axis_um: float = Field(default=0.0, ge=-1000, le=1000, description="mask moves away from the sensor, um")
+    """A millimetre: a mask that has come loose."""
+    mask_rotation_mrad: float = Field(
+        default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD, description="mask turns in its plane, mrad"
+    )
+    vibration_um: float = Field(
+        default=0.0, ge=0, le=1000, description="normal motion of the mask during each exposure, um rms along each axis"
+    )
+    temperature_k: float = Field(default=0.0, ge=-200, le=200, description="sensor and camera grow warmer, K")
+    gap_um_per_k: float = Field(
+        default=0.0, ge=-100, le=100, description="gap from sensor to mask grows, um/K; moves nothing by itself"
+    )
+    """A metre of aluminium has 23 um/K."""
+    exposure: float = Field(default=0.0, gt=-1, le=10, description="exposure time's error, as a part of it")
+    power: float = Field(default=0.0, ge=-1, le=10, description="projector's power changes, as a part of it")
+    power_ramp: float = Field(
+        default=0.0, ge=-1, le=10, description="the same, evenly from begin to end of the capture, as a part of it"
+    )
+    power_flicker: float = Field(
+        default=0.0, ge=0, le=1, description="the same from frame to frame, normal deviates, rms as a part of it"
+    )
+    session_ramp: float = Field(
+        default=0.0, ge=-1, le=10, description="power changes from begin to end of the session, as a part of it"
+    )
+    session_flicker: float = Field(
+        default=0.0, ge=0, le=1, description="power from frame to frame of the session, rms as a part of it"
+    )
+    lamp: float = Field(
+        default=0.0, ge=-1, le=10, description="lamps change after the ambient frame, as a part of their light"
+    )
+    lamp_flicker: float = Field(
+        default=0.0, ge=0, le=1, description="lamps from frame to frame, normal deviates, rms as a part of their light"
+    )
+    projector_rows: float = Field(default=0.0, gt=-0.5, lt=0.5, description="picture moves down the rows, its pixels")
+    projector_columns: float = Field(default=0.0, gt=-0.5, lt=0.5, description="the same along the columns")
+    """Beyond half a pixel, pixels at the window's edge would light nothing."""
+    black_level_dn: float = Field(default=0.0, ge=-1e4, le=1e4, description="black level of a pixel moves, DN")
+
+    def alone(self, kind: str, amount: float | None = None) -> Drift:
+        """One ``kind`` of it without the others, by another ``amount`` where one is given.
+
+        MitsimError for a kind that there is not, or an amount that is not allowed.
+        """
+        if kind not in UNITS:
+            raise MitsimError(f"drift {kind!r}: there is no such kind; use {', '.join(UNITS)}")
+        chosen = getattr(self, kind) if amount is None else float(amount)
+        return validated(Drift, {kind: chosen, "gap_um_per_k": self.gap_um_per_k}, "drift")
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What moves."""
+        return tuple(kind for kind in UNITS if getattr(self, kind))
+
+    @property
+    def mask_mm(self) -> tuple[float, float, float]:
+        """How far the mask moves along rows, columns and axis [mm], for all reasons."""
+        axis = self.mask_axis_um + self.gap_um_per_k * self.temperature_k
+        return self.mask_rows_um / 1e3, self.mask_columns_um / 1e3, axis / 1e3
+
+    @property
+    def motion(self) -> MaskMotion | None:
+        """How the mask is turned and shakes; None where it does neither."""
+        if not (self.mask_rotation_mrad or self.vibration_um):
+            return None
+        return MaskMotion(rotation_mrad=self.mask_rotation_mrad, vibration_um=self.vibration_um)

@@ -1,0 +1,172 @@
+"""What drifts, as a camera's exposures and a bench's optics have it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from mitsim.capture.ambient import AmbientFrame, taken_off
+from mitsim.capture.bench import Bench
+from mitsim.capture.drift import DriftedExposer, drifted, levels, warmer
+from mitsim.capture.exposer import Exposer
+from mitsim.capture.session import Session
+from mitsim.core.configuration import load_model, shipped
+from mitsim.core.errors import MitsimError
+from mitsim.optics.frames import Frame
+from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.drift import Drift
+from mitsim.rig.order import SIDES
+from mitsim.rig.patterns import parse_patterns
+from mitsim.rig.projector import ProjectorModel
+from mitsim.rig.recipe import load_recipe
+from mitsim.rig.rig import Rig
+from mitsim.rig.sensor import load_sensor
+
+PIXELS, SECONDS, SEED = 12, 0.01, 5
+SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
+RIG = Rig(
+    CameraGeometry(pixels=PIXELS),
+    SENSOR,
+    load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel),
+    "imx249.toml",
+)
+FAMILY = parse_patterns("dots:2", 4)
+RNG = np.random.default_rng(1)
+AMBIENT = 2e-3 * RNG.random((PIXELS, PIXELS))
+FRAMES = [Frame(AMBIENT + 0.02 * RNG.random((PIXELS, PIXELS)), 0.0, 0.0, 0.0) for _ in FAMILY.shots]
+
+
+def exposer(**drift: float) -> DriftedExposer:
+    return DriftedExposer(RIG, SECONDS, SEED, 0.0, Drift(**drift), FAMILY, AMBIENT)
+
+
+def frames(camera: Exposer) -> np.ndarray:
+    return np.stack([rate for rate, _, _ in camera.measurements(FAMILY, cast(Any, FRAMES))])
+
+
+def test_without_drift_frames_are_the_same_bit_for_bit() -> None:
+    """(Planted: the lamps' light added once more.)"""
+    still, drifting = Exposer(RIG, SECONDS, SEED), exposer()
+    assert np.array_equal(frames(drifting), frames(still))
+    for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):
+        assert np.array_equal(drifting.lit(frame, *shot.names), still.lit(frame, *shot.names))
+
+
+def test_power_scales_the_projectors_light_and_lamps_that_of_lamps() -> None:
+    """(Planted: the lamps' light scaled with the projector's.)"""
+    for camera, power, lamp in ((exposer(power=0.1), 1.1, 1.0), (exposer(lamp=0.3), 1.0, 1.3)):
+        for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):
+            expected = power * (frame.irradiance - AMBIENT) + lamp * AMBIENT
+            unit = Exposer(RIG, SECONDS, SEED).electrons(Frame(expected, 0.0, 0.0, 0.0))
+            assert np.allclose(camera.lit(frame, *shot.names), unit, rtol=1e-12)
+
+
+def test_ramps_and_flicker_are_of_frames_in_their_order() -> None:
+    """(Planted: a ramp that ends before the last frame; flicker of one draw for all.)"""
+    assert np.allclose(levels(0, "power", 4, ramp=0.8), [1.1, 1.3, 1.5, 1.7])
+    many = levels(0, "power", 4000, flicker=0.01)
+    assert many.std() == pytest.approx(0.01, rel=0.05) and abs(many.mean() - 1) < 5e-4
+    assert (
+        np.array_equal(many[:7], levels(0, "power", 7, flicker=0.01))
+        and levels(1, "power", 7, flicker=0.01)[0] != many[0]
+    )
+    assert levels(0, "power", 500, flicker=0.9).min() == 0
+    camera = exposer(power_ramp=0.8)
+    assert [camera.levels[shot.names][0] for shot in FAMILY.shots] == pytest.approx([1.1, 1.3, 1.5, 1.7])
+
+
+def test_an_exposure_that_is_too_long_is_read_as_more_light() -> None:
+    """Of light and dark current alike; the mean over 4 frames of 144 pixels is good to 0.1 %. (Planted: the rate by the
+    time that the shutter was open.)"""
+    before, after = (frames(camera).mean() for camera in (exposer(), exposer(exposure=0.2)))
+    assert after / before == pytest.approx(1.2, rel=3e-3)
+
+
+def test_black_level_and_warmth_add_to_every_datum() -> None:
+    """4 pixels a superpixel at 0.125 DN an electron: 2 DN are 64 electrons. A kelvin more dark current where the file
+    states its law, and none where it does not. (Planted: one code a superpixel; the user's sensor warm, too.)"""
+    change = (frames(exposer(black_level_dn=2.0)) - frames(exposer())).mean() * SECONDS
+    assert change == pytest.approx(64, abs=0.5)
+    assert warmer(SENSOR, 10.0) == SENSOR
+    law = {"dark_current_temperature_c": 25.0, "dark_doubling_c": 8.0, "dark_current_e_per_s": 1e5}
+    stated = SENSOR.model_copy(update=law)
+    assert warmer(stated, 8.0).superpixel_dark_current_e_per_s == pytest.approx(2 * 4e5)
+    hot = replace(exposer(temperature_k=8.0), rig=replace(RIG, sensor=stated))
+    cold = replace(exposer(), rig=replace(RIG, sensor=stated))
+    assert (frames(hot) - frames(cold)).mean() == pytest.approx(4e5, rel=0.01)
+
+
+def test_an_ambient_frame_holds_the_lamps_as_they_were() -> None:
+    """Their change is after it, their flicker is in it: the mean of 16 shots. (Planted: the change in it.)"""
+
+    class Lit(list[Frame]):
+        has_ambient, projector_off = True, Frame(AMBIENT, 0.0, 0.0, 0.0)
+
+    lit = cast(Any, Lit(FRAMES))
+    known = taken_off(exposer(), FAMILY, lit)
+    assert np.array_equal(taken_off(exposer(lamp=0.5), FAMILY, lit), known)
+    flickering = exposer(lamp_flicker=0.2)
+    found = (
+        AmbientFrame.exposed(flickering, lit, 16).digital.mean()
+        - AmbientFrame.exposed(exposer(), lit, 16).digital.mean()
+    )
+    electrons = exposer().electrons(Lit.projector_off).mean()
+    assert found == pytest.approx((flickering.ambient_levels.mean() - 1) * electrons * SENSOR.gain_dn_per_e, rel=0.2)
+
+
+@pytest.mark.parametrize("order", ["listed", "reversed"])
+@pytest.mark.parametrize("signed", ["pair", "uniform"])
+def test_a_sessions_power_drifts_in_the_order_of_its_frames(order: str, signed: str) -> None:
+    """Evenly from its first frame to its last, over exposures and repeats. (Planted: a pair's halves swapped.)"""
+    changes = {"order": order, "signed_capture": signed, "repeats": 2, "exposure_ladder": (1.0, 4.0)}
+    recipe = load_recipe().model_copy(update={**changes, "drift": Drift(session_ramp=0.5)})
+    session = Session(cast(Any, SimpleNamespace(n=4)), recipe)
+    powers = session.powers
+    in_order = [powers[shot] for shot in sorted(powers, key=lambda shot: powers[shot][0, 0])]
+    assert np.allclose(np.ravel(in_order), 1 + 0.5 * (np.arange(4 * len(powers)) + 0.5) / (4 * len(powers)))
+    shots = [(side, number) for side in SIDES for number in range(len(powers) // 2)]
+    width = 2 if signed == "pair" else 1
+    blocks = [shots[start : start + width] for start in range(0, len(shots), width)]
+    expected = [shot for block in (blocks if order == "listed" else blocks[::-1]) for shot in block]
+    assert sorted(powers, key=lambda shot: powers[shot][0, 0]) == expected
+
+
+def bench(mirrors: bool = False, **geometry: Any) -> Bench:
+    return Bench(
+        cast(Any, SimpleNamespace(mirrors=mirrors, path=Path("scene.xml"))),
+        replace(RIG, camera=RIG.camera.model_copy(update=geometry)), "", {},
+    )  # fmt: skip
+
+
+def test_a_mask_moved_by_a_pixel_casts_the_same_shadow_a_pixel_on() -> None:
+    """Along the rows alone, and by the pixel as the mask sees it: the frame of a scene is shifted by a row. (Planted:
+    the columns instead; the other sign.)"""
+    camera, cells = RIG.camera.model_copy(update={"pixels": 64}), Directions.cells(np.linspace(-0.05, 0.05, 9))
+    by_um = 1e3 * camera.pixel_pitch * (1 - camera.mask_distance / 400.0)
+    moved = drifted(bench(pixels=64), Drift(mask_rows_um=by_um)).geometry
+    scene = np.random.default_rng(2).random((8, 8))
+    frame, before = (
+        sum(left @ scene @ right.T for left, right in shadow_terms(each, cells, cells, 400.0))
+        for each in (moved, camera)
+    )
+    assert np.allclose(frame[1:], before[:-1], rtol=1e-9) and not np.allclose(frame, before, rtol=1e-3)
+
+
+def test_warmth_moves_the_mask_away() -> None:
+    moved = drifted(bench(), Drift(temperature_k=20.0, gap_um_per_k=0.5, mask_axis_um=2.0)).geometry
+    assert moved.mask_distance == pytest.approx(2.012)
+
+
+def test_what_cannot_be_formed_is_refused() -> None:
+    """(Planted: mirrors not looked at.)"""
+    with pytest.raises(MitsimError, match=r"^drift: [^\n]*mirrors$"):
+        drifted(bench(mirrors=True), Drift(vibration_um=1.0))
+    with pytest.raises(MitsimError, match=r"^drift: mask_axis_um [^\n]*$"):
+        drifted(bench(mask_distance=0.5), Drift(mask_axis_um=-600.0))
