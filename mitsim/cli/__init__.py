@@ -43,6 +43,7 @@ from mitsim.cli.options import (
     bench_of,
     job_of,
     number_of,
+    recipe_for,
     request_of,
     scope_of,
     spoken,
@@ -639,25 +640,19 @@ def study(
         list[str] | None, typer.Option(help="what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT")
     ] = None,
     measure: Annotated[str, typer.Option(help="what sweep shows: psnr, ssim, misfit, ...")] = "psnr",
-    recipe: Annotated[Path | None, typer.Option(help="of calibration: session recipe", metavar="FILE.toml")] = None,
+    recipe: Annotated[Path | None, typer.Option(help="of calibration and drift: session recipe", metavar="FILE.toml")] = None,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `colour`
-    of a ColorChecker; `sweep` of any knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`;
-    what `diffraction` at the mask does; how good a `calibration` session is, and why; `merge` joins the parts of
-    --shard.
+    of a ColorChecker; what `drift` between calibration and capture costs; `models` of a calibration; `sweep` of any
+    knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
+    how good a `calibration` session is, and why; `merge` joins the parts of --shard.
     """
     from mitsim.study import OF_NO_SCENE, find_study, is_experiment
 
-    settings: dict[str, Any] = {}
-    if recipe is not None:
-        if name != "calibration":
-            raise MitsimError(f"study {name}: runs no session of its own; --recipe is for calibration")
-        from mitsim.rig.recipe import load_recipe
-
-        settings["recipe"] = load_recipe(recipe)
+    session = recipe_for(name, recipe)
     with job_of(quiet or as_json) as job:
         if name == "merge":
             from mitsim.study.campaign import merge
@@ -669,9 +664,10 @@ def study(
 
             scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
             scope = swept(name, replace(scope, seeds=(seed,)), patterns, over or (), measure)
+            scope = replace(scope, recipe=recipe and str(recipe))
             result = run_experiment(name, scope, output, job, Where(Shard.of(shard), jobs, scheduler))
         else:
-            run_study = find_study(name, **settings)
+            run_study = find_study(name, **({"recipe": session} if session else {}))
             request = mitsim.Request.of(patterns=patterns, seed=seed)
             bench = None
             if name in OF_NO_SCENE:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -17,6 +18,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
     from mitsim.core.job import Job
+    from mitsim.rig.recipe import SessionRecipe
     from mitsim.study.experiment import Scope
 
 _OPTIONS = {"lam": "lambda"}
@@ -135,9 +137,26 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
     if name == "sweep":
         varied = tuple(values_of(text) for text in over)
         return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
+    if name == "drift" and patterns == _MAIN_PATTERNS and measure == _MAIN_MEASURE:
+        return replace(scope, sweep=tuple(values_of(text) for text in over))
     if over or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
-        raise MitsimError(f"study {name}: has its own points and measures; --over, --measure, --patterns are for sweep")
+        others = "--measure and --patterns are for sweep, --over for drift and sweep"
+        raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
+
+
+def recipe_for(name: str, recipe: Path | None) -> SessionRecipe | None:
+    """The session in the file ``recipe`` that the study ``name`` is of, where one is given.
+
+    MitsimError for a study that takes none, and for a file that is no recipe.
+    """
+    from mitsim.rig.recipe import load_recipe
+
+    if recipe is None:
+        return None
+    if name not in ("calibration", "drift"):
+        raise MitsimError(f"study {name}: has no session of its own; --recipe is for calibration and drift")
+    return load_recipe(recipe)
 
 
 def bench_of(

@@ -43,7 +43,7 @@ PAPER = (
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
 order."""
-EXPERIMENTS = (*PAPER, "colour", "models", "sweep")
+EXPERIMENTS = (*PAPER, "colour", "drift", "models", "sweep")
 """Studies of many points: modules of :mod:`mitsim.study.paper`, each with its ``EXPERIMENT``."""
 ALL = "all"
 """What the study of all experiments of the paper is called."""

@@ -121,6 +121,36 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
     return figure
 
 
+def paired(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
+    """Two means of each thing beside each other, the first as a bar, the second as a dot, the largest on top.
+
+    Parameters
+    ----------
+    values
+        both means by name.
+    labels
+        of the two.
+    x
+        name of the axis, with its unit.
+    """
+    ordered = sorted(values.items(), key=lambda item: item[1][0].value)
+    figure, axes = figure_of(0.9 + _ROW * len(ordered))
+    rows = np.arange(len(ordered))
+    first, second = (
+        np.array([(pair[index].value, np.nan_to_num(pair[index].error)) for _, pair in ordered]).reshape(-1, 2).T
+        for index in (0, 1)
+    )
+    axes.barh(rows, first[0], 0.66, xerr=first[1], color=_END, capsize=3, label=labels[0])
+    style: dict[str, Any] = {"color": VERMILION, "ms": 5.5, "capsize": 3, "lw": 0, "elinewidth": 1.5}
+    axes.errorbar(second[0], rows, xerr=second[1], fmt="D", label=labels[1], **style)
+    axes.set_yticks(rows, [name for name, _ in ordered])
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(-0.6, len(ordered) - 0.4)
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right")
+    label_axes(axes, x, "", grid="x")
+    return figure
+
+
 @dataclass(frozen=True)
 class Step:
     """Change [dB] that an effect called ``name`` brings: as a step in order, alone, and to the whole without it; None

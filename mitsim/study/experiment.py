@@ -133,6 +133,8 @@ class Scope:
         what `mitsim study sweep` varies, values by name, and what it shows; empty for other studies.
     patterns
         of a sweep that does not vary them.
+    recipe
+        of a calibration whose drift is studied; None: the shipped one.
     """
 
     setup: Setup
@@ -142,6 +144,7 @@ class Scope:
     sweep: tuple[tuple[str, tuple[str, ...]], ...] = ()
     measures: tuple[str, ...] = ()
     patterns: str = "dots:7"
+    recipe: str | None = None
 
     def chosen(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
         """``few`` where the study is quick, otherwise ``everything``."""

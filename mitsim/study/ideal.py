@@ -61,11 +61,11 @@ class IdealCamera:
     @cached_property
     def terms(self) -> SeparableTerms:
         """Its operator, from pixels that shine evenly."""
-        return self._terms(*self._pixels)
+        return self._terms(*self.directions)
 
     def points(self) -> SeparableTerms:
         """The same operator for point sources at the centres of the projector's pixels."""
-        rows, columns = (Directions(pixels.centres, 0.0) for pixels in self._pixels)
+        rows, columns = (Directions(pixels.centres, 0.0) for pixels in self.directions)
         return self._terms(rows, columns)
 
     @cached_property
@@ -102,7 +102,7 @@ class IdealCamera:
         shift = 1 / plane.depth_mm - 1 / self.bench.geometry.scene_distance
         rows, columns = (
             Directions(pixels.centres + baseline * shift, pixels.width)
-            for pixels, baseline in zip(self._pixels, plane.baseline_mm, strict=True)
+            for pixels, baseline in zip(self.directions, plane.baseline_mm, strict=True)
         )
         return FrameOptics(self._geometry, rows, columns, (plane.depth_mm,), 1, self.spectrum)
 
@@ -111,7 +111,8 @@ class IdealCamera:
         return self.bench.geometry.model_copy(update={"mask": self.mask})
 
     @property
-    def _pixels(self) -> tuple[Directions, Directions]:
+    def directions(self) -> tuple[Directions, Directions]:
+        """Of the projector's pixels, along rows and columns."""
         rows, columns = (Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows)
         return rows, columns
 
@@ -120,7 +121,7 @@ class IdealCamera:
 
     @cached_property
     def _optics(self) -> FrameOptics:
-        return FrameOptics(self._geometry, *self._pixels, (self.bench.geometry.scene_distance,), 1, self.spectrum)
+        return FrameOptics(self._geometry, *self.directions, (self.bench.geometry.scene_distance,), 1, self.spectrum)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,8 @@ def _options(scope: Scope) -> list[str]:
     named = {"--camera": setup.camera, "--projector": setup.projector}
     given = [f"{option} {value}" for option, value in named.items() if value]
     given += [f"-D {name}={value}" for name, value in setup.parameters]
-    given += [f"--over {name}={':'.join(values)}" for name, values in scope.sweep]
+    given += [f"--over {name}={','.join(values)}" for name, values in scope.sweep]
+    given += [f"--recipe {scope.recipe}"] if scope.recipe else []
     return [*given, *(["--quick"] if scope.quick else [])]
 
 

@@ -1,0 +1,230 @@
+"""Factors that an image is made with, and what its frames differ by, in; the squared error that it is expected to have,
+out: no frame is formed, no noise drawn, nothing solved.
+
+With lambda fixed the solver is linear. With B_L = [Phi_L diag(p_i)]_i = U_L S_L V_L^T (row blocks U_Li of U_L), and the
+same on the right, it makes of frames Y_ij the image
+
+    X^ = V_L [F o W] V_R^T,  W = sum_ij U_Li^T Y_ij U_Rj,  F = s_L s_R^T / (s_L^2 s_R^2^T + lambda).
+
+What any change of the frames does to W is a product of small matrices:
+
+* frames L (P_ij o X) R^T of other factors: W = G(L) X G(R)^T with ``G(L) = sum_i U_Li^T L diag(p_i)``; of the solver's
+  own ones G = S V^T;
+* frames times gains g_ij: W = sum_ij g_ij G_i X G_j^T, with the terms of G one by one;
+* a frame E added to all: W = (sum_i U_Li)^T E (sum_j U_Rj);
+* noise of variance v in each datum: the variance of each number of W is v, as U_L and U_R are orthonormal; of a frame
+  that is taken off all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
+* noise of variance nu^2 in each number of the left factor that the frames do not know of: that of G is
+  nu^2 |sum_i p_i(x) U_Li|^2, and so on through the product, and the same of the right one.
+
+The expected squared error of X^ is that of its mean and, as V is orthonormal, the sum of F^2 times these variances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.rig.patterns import PatternFamily
+
+Terms = Sequence[tuple[FloatArray, FloatArray]]
+"""Separable terms of a camera, left (m, n) and right (m', n') each."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Axis:
+    """One side: ``slabs`` (K, m, r) of U, ``singular`` (r,), ``basis`` (n, r), and its ``patterns`` (n, K)."""
+
+    slabs: FloatArray
+    singular: FloatArray
+    basis: FloatArray
+    patterns: FloatArray
+
+    @classmethod
+    def of(cls, factor: FloatArray, patterns: FloatArray) -> _Axis:
+        stacked = np.concatenate([factor * column for column in patterns.T])
+        left, singular, right = np.linalg.svd(stacked, full_matrices=False)
+        return cls(left.reshape(patterns.shape[1], *factor.shape[:1], -1), singular, right.T, patterns)
+
+    @cached_property
+    def total(self) -> FloatArray:
+        """(m, r) sum of the slabs."""
+        return np.asarray(self.slabs.sum(axis=0))
+
+    def seen(self, factor: FloatArray) -> FloatArray:
+        """(K, r, n) terms of G of a ``factor``."""
+        return np.asarray(np.einsum("kmr,mn,nk->krn", self.slabs, factor, self.patterns, optimize=True))
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """(r, n) variance of G where each number of the factor has variance 1."""
+        mixed = np.einsum("nk,kmr->nmr", self.patterns, self.slabs, optimize=True)
+        return np.asarray(np.square(mixed).sum(axis=1).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What an image is expected to be: its mean, and the squared error about it.
+
+    Attributes
+    ----------
+    image
+        (n, n') mean.
+    variance
+        sum of the variances of all its numbers.
+    """
+
+    image: FloatArray
+    variance: float = 0.0
+
+    def psnr_db(self, truth: FloatArray) -> float:
+        """Of the mean squared error against a ``truth`` (n, n'), peak 1; infinite without any."""
+        square = (float(np.square(self.image - truth).sum()) + self.variance) / truth.size
+        return float("inf") if square == 0 else float(-10 * np.log10(square))
+
+
+@dataclass(frozen=True, eq=False)
+class Changed:
+    """Frames of a scene that are not what the solver's factors say; nothing is changed by default.
+
+    Attributes
+    ----------
+    terms
+        what is added to the camera's own separable operator.
+    gain
+        (K, K') gains of the frames on average.
+    flicker
+        rms of a further gain of each frame, independent.
+    leak
+        part of the light of all pixels that is in every frame beside the pattern's.
+    added
+        (m, m') frame that is added to all frames.
+    added_gain, added_flicker, added_common
+        what it is multiplied by: on average, and rms from frame to frame and for all frames alike.
+    """
+
+    terms: Terms = ()
+    gain: FloatArray | float = 1.0
+    flicker: float = 0.0
+    leak: float = 0.0
+    added: FloatArray | None = None
+    added_gain: float = 1.0
+    added_flicker: float = 0.0
+    added_common: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise that is independent in every number, as variances.
+
+    Attributes
+    ----------
+    datum
+        of each datum of a frame.
+    ambient
+        of each datum of a frame that is taken off all others.
+    left, right
+        of each number of the factors, as far as frames do not share it.
+    """
+
+    datum: float = 0.0
+    ambient: float = 0.0
+    left: float = 0.0
+    right: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class LinearImage:
+    """A solver with its lambda fixed; MitsimError for patterns of -1, which are differences of two frames.
+
+    Attributes
+    ----------
+    left, right
+        Phi_L (m, n), Phi_R (m', n').
+    family
+        patterns of 0 and 1.
+    lam
+        lambda, above 0.
+    centre
+        whether means of rows and columns are taken off factors and frames.
+    """
+
+    left: FloatArray
+    right: FloatArray
+    family: PatternFamily
+    lam: float
+    centre: bool = False
+
+    def __post_init__(self) -> None:
+        if self.family.signed:
+            raise MitsimError(
+                f"patterns {self.family.name!r}: are shown as pairs of frames; take uniform, dots or random"
+            )
+
+    def expected(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
+        """The image of a scene.
+
+        Parameters
+        ----------
+        scene
+            X (n, n').
+        changed, noise
+            what its frames differ by from what the factors say; None: nothing.
+        """
+        changed, noise = changed or Changed(), noise or Noise()
+        left, right = self._axes
+        cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs
+        weights, variance = np.zeros_like(self._filter), 0.0
+        gain = np.broadcast_to(changed.gain, (len(left.slabs), len(right.slabs)))
+        seen = [(left.seen(first), right.seen(second)) for first, second in cameras]
+        for row, column in np.ndindex(gain.shape):
+            part = sum(first[row] @ scene @ second[column].T for first, second in seen)
+            weights += gain[row, column] * part
+            variance += changed.flicker**2 * self._energy(np.square(part))
+        if changed.leak:
+            uniform = sum(first @ scene @ second.T for first, second in cameras)
+            weights += changed.leak * left.total.T @ uniform @ right.total
+        if changed.added is not None:
+            common = left.total.T @ changed.added @ right.total
+            weights += changed.added_gain * common
+            variance += changed.added_common**2 * self._energy(np.square(common))
+            if changed.added_flicker:
+                for row, column in np.ndindex(gain.shape):
+                    part = left.slabs[row].T @ changed.added @ right.slabs[column]
+                    variance += changed.added_flicker**2 * self._energy(np.square(part))
+        variance += self._energy(self._noise(scene, noise))
+        return Expected(left.basis @ (self._filter * weights) @ right.basis.T, variance)
+
+    def _noise(self, scene: FloatArray, noise: Noise) -> FloatArray:
+        """(r, r') variance of W."""
+        left, right = self._axes
+        total = np.full(self._filter.shape, noise.datum)
+        total += noise.ambient * np.outer(*(np.square(axis.total).sum(axis=0) for axis in (left, right)))
+        if noise.left:
+            total += noise.left * left.noise @ np.square(scene @ (right.basis * right.singular))
+        if noise.right:
+            total += noise.right * np.square(scene.T @ (left.basis * left.singular)).T @ right.noise.T
+        return total
+
+    def _energy(self, variance: FloatArray) -> float:
+        """Sum over the image of what has this ``variance``, or squares, in W."""
+        return float((np.square(self._filter) * variance).sum())
+
+    @cached_property
+    def _axes(self) -> tuple[_Axis, _Axis]:
+        left = _Axis.of(self._centred(self.left), self.family.left.astype(np.float64))
+        right = _Axis.of(self._centred(self.right), self.family.right.astype(np.float64))
+        return left, right
+
+    @cached_property
+    def _filter(self) -> FloatArray:
+        sigma = np.outer(self._axes[0].singular, self._axes[1].singular)
+        return np.asarray(sigma / (np.square(sigma) + self.lam))
+
+    def _centred(self, matrix: FloatArray) -> FloatArray:
+        return np.asarray(matrix - matrix.mean(axis=0)) if self.centre else matrix

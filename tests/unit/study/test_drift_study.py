@@ -1,0 +1,148 @@
+"""The drift study: what it measures and predicts on a small scene, its points, and what it says of invented results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.drift import projecting
+from mitsim.cli.options import recipe_for, swept
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.rig.drift import UNITS, Drift
+from mitsim.rig.recipe import load_recipe
+from mitsim.study import find_experiment
+from mitsim.study.drift import DriftStand, Outcome
+from mitsim.study.experiment import Results, Scope, Setup
+from mitsim.study.exposures import LitScene
+from mitsim.study.studio import Studio
+from mitsim.study.table import Table
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
+SEED = 3
+RECIPE = load_recipe()
+
+
+@pytest.fixture(scope="module")
+def stand(shared_scene: Callable[..., Path], variant: str) -> Iterator[DriftStand]:
+    y, x = (np.mgrid[:64, :64] + 0.5) / 64
+    print_ = np.rint(125 + 100 * np.sin(7 * y + 2 * x) * np.cos(9 * x)).astype(int)
+    setup = Setup(str(shared_scene("drift", reflectance=print_)), variant=variant)
+    with Studio() as studio:
+        lit = studio.lit(setup)
+        yield DriftStand(lit, studio.factors(setup, SEED), RECIPE, lit.bench.family("dots:4"), SEED)
+
+
+def test_without_drift_the_image_is_the_same_bit_for_bit(stand: DriftStand) -> None:
+    """(Planted: the exposure chosen anew; another seed.)"""
+    found = stand.outcome(Drift())
+    assert found.before_db == found.after_db == found.auto_db
+    assert found.lost_db == found.predicted_lost_db == found.predicted_error_db == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "amount"),
+    [("mask_rows_um", 10), ("mask_columns_um", -10), ("mask_axis_um", 40), ("mask_rotation_mrad", 3),
+     ("exposure", 0.02), ("power", -0.02), ("power_ramp", 0.03), ("black_level_dn", 8)],
+)  # fmt: skip
+def test_closed_forms_say_what_a_drift_costs(stand: DriftStand, kind: str, amount: float) -> None:
+    """To 0.5 dB of 3 or more: what detail leaves in this image, 14 dB above the model's error, shares in the drift's.
+    (Planted: rows and columns swapped; both terms of the rotation with one sign; a gain twice; black level of one
+    pixel.)"""
+    found = stand.outcome(Drift().alone(kind, amount))
+    assert found.lost_db > 3
+    assert found.predicted_lost_db == pytest.approx(found.lost_db, abs=0.5)
+
+
+@pytest.mark.parametrize("signed", ["pair", "uniform"])
+def test_a_session_whose_power_drifts_gives_other_factors(stand: DriftStand, signed: str) -> None:
+    """Phi C on either side, to 2 % of what the drift changes: noise of other light is what is left. What that costs, to
+    0.5 dB. (Planted: pairs of the other sign in what is predicted, and in what is exposed; levels of the first side for
+    both.)"""
+    drift, recipe = Drift(session_ramp=0.2, session_flicker=0.02), RECIPE.model_copy(update={"signed_capture": signed})
+    calibrate = stand.lit.bench.calibrate
+    still, factors = (
+        calibrate(SEED, recipe=recipe.model_copy(update={"drift": moving})) for moving in (Drift(), drift)
+    )
+    own = replace(stand, factors=still, recipe=recipe)
+    for before, after, mix in zip(
+        (still.left, still.right), (factors.left, factors.right), own.session_mixes(drift), strict=True
+    ):
+        assert np.linalg.norm(after - before @ mix) < 0.02 * np.linalg.norm(after - before)
+    found = own.outcome(drift, factors)
+    assert found.lost_db > 1 and found.predicted_lost_db == pytest.approx(found.lost_db, abs=0.5)
+
+
+def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
+    """A quarter of a pixel down a smooth print, its pixels see what lies between two. (Planted: rows and columns
+    swapped.)"""
+    drift = Drift(projector_rows=0.25)
+    bench = projecting(stand.lit.bench, drift)
+    (top, bottom), columns = bench.windows
+    (before, after), same = stand.lit.bench.windows
+    shift = 0.25 * (after - before) / bench.n
+    assert (top, bottom) == pytest.approx((before + shift, after + shift), abs=1e-7) and columns == pytest.approx(same)
+    moved = LitScene(bench.light(accuracy=1e-2))
+    truth = stand.lit.truth
+    left = moved.truth[:-1] - 0.75 * truth[:-1] - 0.25 * truth[1:]
+    assert np.linalg.norm(left) < 0.2 * np.linalg.norm(moved.truth - truth)
+    assert projecting(stand.lit.bench, Drift(mask_rows_um=1.0)) is stand.lit.bench
+
+
+def test_what_is_predicted_of_a_worse_image() -> None:
+    """A drift that adds as much squared error as the image has costs 3 dB; if the model has half of that image's error,
+    it alone would say 4.8. (Planted: decibels subtracted.)"""
+    found = Outcome(before_db=30.0, after_db=27.0, auto_db=27.5, predicted_before_db=33.0103, predicted_db=28.2391)
+    assert found.predicted_lost_db == pytest.approx(3.0103, abs=1e-3)
+    assert found.predicted_error_db == pytest.approx(4.7712 - 3.0103, abs=1e-3)
+    assert found.lost_db == 3.0 and found.lost_auto_db == 2.5
+
+
+def test_points_are_every_kind_alone() -> None:
+    """At the shipped amounts, lamps' before a lamp; a quick study is a start of the whole. (Planted: lamps at the
+    sheet.)"""
+    experiment = find_experiment("drift")
+    points, few = (experiment.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
+    assert {point["kind"] for point in points} == set(UNITS) and len(points) == 4 * len(UNITS)
+    assert len({point.key for point in points}) == len(points) and {p.key for p in few} <= {p.key for p in points}
+    drift = load_recipe(shipped("calibration", "drift.toml")).drift
+    assert all(point["amount"] == getattr(drift, point["kind"]) for point in points)
+    assert {p.setup.scene for p in points if p["kind"].startswith("lamp")} == {"lamp_bench"}
+    asked = experiment.points(Scope(Setup(), (None,), sweep=(("power", ("0.1", "0.2")),), quick=True))
+    assert [(point["kind"], point["amount"]) for point in asked] == [("power", 0.1), ("power", 0.2)]
+
+
+def test_options_of_the_study() -> None:
+    """(Planted: a recipe for any study.)"""
+    scope = Scope(Setup(), (None,))
+    assert swept("drift", scope, "dots:7", ["power=0.1,0.2"], "psnr").sweep == (("power", ("0.1", "0.2")),)
+    with pytest.raises(MitsimError, match="--over for drift and sweep"):
+        swept("patterns", scope, "dots:7", ["power=0.1"], "psnr")
+    with pytest.raises(MitsimError, match="--recipe is for calibration and drift"):
+        recipe_for("sweep", Path("any.toml"))
+    with pytest.raises(MitsimError, match="there is no such kind"):
+        find_experiment("drift").points(Scope(Setup(), (None,), sweep=(("sheet_z", ("390",)),)))
+    with pytest.raises(MitsimError, match="moves nothing"):
+        find_experiment("drift").points(Scope(Setup(), (None,), recipe=str(shipped("calibration", "session.toml"))))
+
+
+def test_claims_hold_predictions_against_what_was_measured() -> None:
+    """At the first amount of each kind, mean over seeds. (Planted: all amounts together.)"""
+    rows = [
+        {"kind": "power", "unit": "1", "amount": amount, "seed": seed, "lost_db": amount + 0.1 * seed,
+         "predicted_lost_db": predicted, "predicted_error_db": 0.3}
+        for amount, predicted in ((1.0, 1.4), (2.0, 9.0))
+        for seed in (0, 1)
+    ]  # fmt: skip
+    rows += [{**row, "kind": "exposure", "predicted_lost_db": 3.0} for row in rows[:2]]
+    experiment, results = find_experiment("drift"), Results(Table(tuple(rows)))
+    power, exposure = experiment.claims(results)
+    assert power.verdict == "confirmed" and exposure.verdict == "not confirmed"
+    assert power.idealised == "1.40 \N{PLUS-MINUS SIGN} 0.30 dB lost"
+    assert power.rendered == "1.05 \N{PLUS-MINUS SIGN} 0.05 dB lost"
+    assert set(experiment.figures(results)) == {"losses.png", "power.png"}
