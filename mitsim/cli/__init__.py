@@ -640,7 +640,9 @@ def study(
         list[str] | None, typer.Option(help="what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT")
     ] = None,
     measure: Annotated[str, typer.Option(help="what sweep shows: psnr, ssim, misfit, ...")] = "psnr",
-    recipe: Annotated[Path | None, typer.Option(help="of calibration and drift: session recipe", metavar="FILE.toml")] = None,
+    recipe: Annotated[
+        Path | None, typer.Option(help="of calibration and drift: session recipe", metavar="FILE.toml")
+    ] = None,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -664,7 +666,7 @@ def study(
 
             scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
             scope = swept(name, replace(scope, seeds=(seed,)), patterns, over or (), measure)
-            scope = replace(scope, recipe=recipe and str(recipe))
+            scope = replace(scope, recipe=str(recipe) if recipe else None)
             result = run_experiment(name, scope, output, job, Where(Shard.of(shard), jobs, scheduler))
         else:
             run_study = find_study(name, **({"recipe": session} if session else {}))
