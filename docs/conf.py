@@ -49,6 +49,7 @@ docs/architecture
 docs/physics
 docs/formats
 docs/exchange
+docs/bench
 docs/studies
 docs/extending
 docs/robustness

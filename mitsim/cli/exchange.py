@@ -32,6 +32,7 @@ from mitsim.cli.options import (
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.rig.families import NAMES
 
 app = typer.Typer()
 
@@ -138,6 +139,60 @@ def import_(
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
     return finish(as_json, payload, lines, payload["warnings"])
+
+
+@app.command()
+def patterns(
+    family: Annotated[
+        str, typer.Argument(help=f"{NAMES}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder to make", metavar="DIR")],
+    projector: Annotated[
+        str, typer.Option(help="projector of known rows and columns: name or TOML file", metavar="NAME|FILE")
+    ] = "mp_cl1",
+    projector_pixels: Annotated[
+        int, typer.Option(min=1, max=4096, help="projector pixels a side of the patterns", metavar="N")
+    ] = 128,
+    camera: Annotated[
+        str | None, typer.Option(help="of stripes: camera electronics, name or TOML file", metavar="NAME|FILE")
+    ] = None,
+    exposure: Annotated[float | None, typer.Option(help="of stripes: seconds of each frame", metavar="SECONDS")] = None,
+    signed_capture: Annotated[
+        str, typer.Option(help="of stripes: both halves of each, or one and a uniform frame", metavar="pair|uniform")
+    ] = "pair",
+    seed: Seed = 0,
+    variant: Variant = DEFAULT_VARIANT,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Draw patterns, or a calibration's stripes, as pictures to show on a real projector."""
+    from mitsim.exchange.drawn import SESSION, draw_family, draw_stripes, session_of
+
+    of_stripes = {"camera": camera, "exposure": exposure}
+    if family == "stripes":
+        for name, value in of_stripes.items():
+            if value is None:
+                raise ArgumentError(name, "is not given, and the list of a calibration's frames needs it; give it")
+        if camera is None or exposure is None:
+            raise AssertionError  # refused above
+        listed = session_of(camera, exposure, projector_pixels, signed_capture)
+        payload = {**draw_stripes(output, projector, listed), "session": str(output / SESSION)}
+        after = (
+            f"Copy {output / SESSION} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
+        )
+    else:
+        for name, value in of_stripes.items():
+            if value is not None:
+                raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
+        payload = {**draw_family(output, family, projector_pixels, projector, seed), "session": None}
+        after = f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} -o RUN"
+    where = payload["projector"]
+    lines = [
+        f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
+        f"{where['cell']} pixels a side: {output}",
+        after,
+    ]
+    return finish(as_json, payload, lines, ())
 
 
 @app.command()

@@ -24,7 +24,7 @@ from mitsim.exchange.flatcam import PLANES
 from mitsim.exchange.packed import FACTORS, Packed, packed_calibration
 from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import PatternFamily, parse_patterns
-from mitsim.rig.sensor import EXPOSURE_S, SensorModel, load_sensor
+from mitsim.rig.sensor import SensorModel, check_exposure, load_sensor
 
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
@@ -79,11 +79,7 @@ class RealCapture:
 
     def check(self) -> None:
         """MitsimError for values that cannot be, before any file is read."""
-        least, most = EXPOSURE_S
-        if not least <= self.exposure_s <= most:
-            raise ArgumentError(
-                "exposure", f"{self.exposure_s:g}: give the seconds of every frame, {least:g} to {most:g}"
-            )
+        check_exposure(self.exposure_s)
         if self.channel is not None and self.channel not in PLANES:
             raise ArgumentError("channel", f"{self.channel!r}: use {', '.join(PLANES)}")
         if self.ambient_shots is not None and (self.ambient is None or self.ambient_shots < 1):

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mitsim.core.configuration import read_toml, validated
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.rig.efficiency import EfficiencyCurve, Mosaic, MosaicCurves, Plane
 
 EXPOSURE_S = 1e-12, 1e6
@@ -332,6 +332,14 @@ class SensorModel(BaseModel):
     def largest_dn(self) -> int | None:
         """The largest code of a superpixel, b^2 (2^bits - 1), on chip 2^bits - 1; None for real-valued output."""
         return None if self.bits is None else (2**self.bits - 1) * self.codes
+
+
+def check_exposure(seconds: float) -> float:
+    """Exposure of every frame of a camera, ``seconds``; ArgumentError where no camera has it."""
+    shortest, longest = EXPOSURE_S
+    if not shortest <= seconds <= longest:
+        raise ArgumentError("exposure", f"{seconds:g}: give the seconds of every frame, {shortest:g} to {longest:g}")
+    return seconds
 
 
 def load_sensor(path: Path | str) -> SensorModel:

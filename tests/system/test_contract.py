@@ -23,7 +23,7 @@ from mitsim.study.solver_cost import make_problem, time_solver
 
 VERBS = (
     *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "export"),
-    *("import", "transport", "doctor"),
+    *("import", "patterns", "transport", "doctor"),
 )
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 

@@ -100,3 +100,19 @@ def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any],
         error += float((own**2 + others**2).sum())
     assert np.sqrt(apart / energy) < 1e-6
     assert square / error == pytest.approx(1, abs=0.25), "five standard deviations"
+
+
+def test_patterns_are_drawn(call: Callable[..., Any], tmp_path: Path) -> None:
+    stripes = "stripes", "-o", tmp_path / "s", "--camera", "imx249", "--exposure", 0.02, "--projector-pixels", 4
+    for arguments, count in ((("dots:2", "-o", tmp_path / "d"), 4), (stripes, 16)):
+        done = call("patterns", *arguments, "--json")
+        assert done.code == 0, done.err
+        assert done.payload.keys() == {"patterns", "n", "pictures", "projector", "session", "output"}
+        assert done.payload["pictures"] == count == len(list(Path(arguments[2]).glob("patterns/pattern_*.png")))
+    assert done.payload["session"] == str(tmp_path / "s" / "session.json")
+
+
+def test_patterns_that_cannot_be_drawn(refused: Callable[..., str]) -> None:
+    mentions(refused("patterns", "stripes", "-o", "new"), "--camera is not given")
+    mentions(refused("patterns", "dots:2", "-o", "new", "--exposure", 1), "--exposure 1.0", "goes with stripes")
+    mentions(refused("patterns", "dots:2", "-o", "new", "--projector-pixels", 0), "--projector-pixels")

@@ -1,0 +1,303 @@
+"""Patterns in; pictures at a projector's own resolution out, to show on a real one: of a family, or a calibration's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.configuration import load_model, locate, validated
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.jsonfile import write_json
+from mitsim.core.manifests import Patterns
+from mitsim.core.output import whole_folder
+from mitsim.rig.digital import digital_of
+from mitsim.rig.framelist import FrameList
+from mitsim.rig.order import UNIFORM, taken
+from mitsim.rig.patterns import parse_patterns, stripe_signs
+from mitsim.rig.projector import ProjectorModel
+from mitsim.rig.sensor import check_exposure, load_sensor
+
+PATTERNS = "patterns.json"
+"""Which picture shows what, and where the grid lies in it."""
+SESSION = "session.json"
+"""The list of a session's frames, as `mitsim calibrate --frames` reads it."""
+_WHITE = 255
+"""Of a picture for the projector; black is 0, so that its gamma plays no part."""
+
+
+def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) -> dict[str, Any]:
+    """Draw every shot of a family of patterns to a new folder, whole or not at all.
+
+    Parameters
+    ----------
+    folder
+        to make: `patterns/` and `patterns.json`.
+    name
+        of the family.
+    n
+        projector pixels a side that the patterns have.
+    projector
+        name or TOML file, of known rows and columns.
+    seed
+        of patterns of a `random` family.
+
+    Returns
+    -------
+    dict
+        `patterns`, `n`, `pictures`, `projector` (its rows and columns, and the grid's place), `output`.
+
+    Raises
+    ------
+    MitsimError
+        for a family that there is none of, or a projector of unknown or too few pixels.
+    """
+    family = parse_patterns(name, n, seed)
+    names = [frame_name(index) for index in range(len(family.shots))]
+    patterns, raster = Patterns.of(family, names), raster_of(projector)
+    light = pictures_of(patterns, f"patterns {name}")
+    with whole_folder(folder) as place:
+        where = draw(place, light, raster, f"projector {projector}")
+        write_json(place / PATTERNS, described(patterns, names, where))
+    return {"patterns": name, "n": n, "pictures": len(light), "projector": where, "output": str(folder)}
+
+
+def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, Any]:
+    """Draw every shot of a calibration session to a new folder, whole or not at all, in the order in which
+    `mitsim calibrate --frames` counts frames.
+
+    Parameters
+    ----------
+    folder
+        to make: `patterns/`, `patterns.json`, and the list that goes with the frames, `session.json`.
+    projector
+        name or TOML file, of known rows and columns.
+    listed
+        what the frames will be of.
+
+    Returns
+    -------
+    dict
+        as of :func:`draw_family`.
+
+    Raises
+    ------
+    MitsimError
+        for a projector of unknown or too few pixels, and where no Hadamard matrix has so many rows.
+    """
+    n, raster, signs = listed.n, raster_of(projector), stripe_signs(listed.n)
+    light, shots = [], []
+    for number, (side, index, sign) in enumerate(taken(signs.shape[1], listed.signed_capture == "pair")):
+        stripes = signs[:, index, None] if side == "horizontal" else signs[None, :, index]
+        light.append(np.broadcast_to(np.ones((1, 1)) if sign == UNIFORM else (1 + sign * stripes) / 2, (n, n)))
+        shots.append(
+            {"file": frame_name(number), "pattern": picture_name(number), "side": side, "index": index, "sign": sign}
+        )
+    with whole_folder(folder) as place:
+        where = draw(place, light, raster, f"projector {projector}")
+        write_json(place / PATTERNS, {"projector": where, "shots": shots})
+        write_json(place / SESSION, listed.model_dump(mode="json", exclude_defaults=True))
+    return {"patterns": "stripes", "n": n, "pictures": len(light), "projector": where, "output": str(folder)}
+
+
+def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> FrameList:
+    """The list of a calibration session's frames, in the order of their names.
+
+    Parameters
+    ----------
+    camera
+        electronics: name of a shipped file, or a TOML file.
+    exposure_s
+        of every frame [s].
+    n
+        projector pixels a side.
+    signed_capture
+        `pair` or `uniform`: how a +-1 pattern is captured.
+
+    Raises
+    ------
+    MitsimError
+        for values that cannot be.
+    """
+    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    digital = digital_of(sensor, check_exposure(exposure_s)).model_dump(exclude_none=True)
+    stated = {"camera": {"name": sensor.name}, "n": n, "signed_capture": signed_capture, "digital": digital}
+    return validated(FrameList, stated, "stripes")
+
+
+def frame_name(index: int) -> str:
+    """Name of the frame of shot ``index`` among PNG files."""
+    return f"frame_{index:05d}.png"
+
+
+def picture_name(index: int) -> str:
+    """Path of the picture of shot ``index`` in the folder that holds it."""
+    return f"patterns/pattern_{index:05d}.png"
+
+
+def raster_of(projector: str) -> tuple[int, int]:
+    """Rows and columns of the ``projector``, a name or TOML file. MitsimError where it does not say them."""
+    model = load_model(locate(projector, "calibration", ".toml"), ProjectorModel)
+    return known_raster(model.rows, model.columns)
+
+
+def known_raster(rows: object, columns: object) -> tuple[int, int]:
+    """``rows`` and ``columns`` of a projector, where both are known; MitsimError otherwise."""
+    if not (isinstance(rows, int) and isinstance(columns, int)):
+        raise ArgumentError("projector", "does not say its rows and columns; give one that does")
+    return rows, columns
+
+
+def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: tuple[int, int], place: str) -> dict[str, int]:
+    """Write a picture for each shot to `patterns/` in a folder that this process holds, and a black and a white one.
+
+    Parameters
+    ----------
+    folder
+        that holds `patterns/`.
+    light
+        (n, n') of 0 and 1 for each shot.
+    raster
+        rows and columns of the projector.
+    place
+        what the grid is of, for messages.
+
+    Returns
+    -------
+    dict
+        `rows`, `columns` of the projector, and the grid's place as of :func:`grid_in`.
+
+    Raises
+    ------
+    MitsimError
+        where a cell would have no pixel.
+    """
+    sides = light[0].shape[0], light[0].shape[1]
+    grid = grid_in(raster, sides, place)
+    (folder / "patterns").mkdir()
+    for index, shot in enumerate(light):
+        write_png(folder / picture_name(index), shown(shot, grid, raster))
+    for name, level in (("black", 0), ("white", 1)):
+        write_png(folder / "patterns" / f"{name}.png", shown(np.full(sides, level), grid, raster))
+    return {"rows": raster[0], "columns": raster[1], **grid}
+
+
+def grid_in(raster: tuple[int, int], sides: tuple[int, int], place: str) -> dict[str, int]:
+    """Where the patterns' grid lies in a projector's raster: whole pixels a cell, as large as fits, in the middle.
+
+    Parameters
+    ----------
+    raster
+        rows and columns of the projector.
+    sides
+        rows and columns of the grid.
+    place
+        what the grid is of, for messages.
+
+    Returns
+    -------
+    dict
+        `cell` [pixels a side], `first_row`, `first_column` of its first cell.
+
+    Raises
+    ------
+    MitsimError
+        where a cell would have no pixel.
+    """
+    cell = min(pixels // side for pixels, side in zip(raster, sides, strict=True))
+    if cell < 1:
+        raise MitsimError(
+            f"{place}: patterns of {sides[0]} x {sides[1]} pixels do not fit a projector of {raster[0]} rows x "
+            f"{raster[1]} columns; give a larger projector"
+        )
+    first = [(pixels - cell * side) // 2 for pixels, side in zip(raster, sides, strict=True)]
+    return {"cell": cell, "first_row": first[0], "first_column": first[1]}
+
+
+def shown(light: npt.NDArray[Any], grid: dict[str, int], raster: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """A picture for the projector, (rows, columns), black around the grid.
+
+    Parameters
+    ----------
+    light
+        (n, n') of 0 and 1.
+    grid, raster
+        as of :func:`grid_in`.
+    """
+    picture = np.zeros(raster, np.uint8)
+    cells = (_WHITE * light).astype(np.uint8).repeat(grid["cell"], axis=0).repeat(grid["cell"], axis=1)
+    rows, columns = cells.shape
+    picture[grid["first_row"] :, grid["first_column"] :][:rows, :columns] = cells
+    return picture
+
+
+def pictures_of(patterns: Patterns, place: str) -> list[npt.NDArray[Any]]:
+    """What the projector shows for each shot, (n, n') of 0 and 1.
+
+    Parameters
+    ----------
+    patterns
+        and their shots.
+    place
+        of the run, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for light between, which a projector's gamma changes.
+    """
+    left, right = patterns.matrices
+    if not np.isin(np.concatenate([left.ravel(), right.ravel()]), (-1, 0, 1)).all():
+        raise MitsimError(
+            f"{place}: patterns have values other than 0, 1 and -1, whose light a projector's gamma changes"
+        )
+    found = []
+    for shot in patterns.captures:
+        pattern = np.outer(left[:, shot.row], right[:, shot.column])
+        light = (1 + shot.sign * pattern) / 2 if shot.sign else pattern
+        if not np.isin(light, (0, 1)).all():
+            raise MitsimError(f"{place}: {shot.file} shows light other than 0 and 1, which a projector's gamma changes")
+        found.append(light)
+    return found
+
+
+def described(patterns: Patterns, names: Sequence[str], where: dict[str, int]) -> dict[str, Any]:
+    """What `patterns.json` says of a family.
+
+    Parameters
+    ----------
+    patterns
+        and their shots.
+    names
+        of the frames, one a shot.
+    where
+        the grid's place, as :func:`draw` gives it.
+    """
+    shots = [
+        {
+            "file": name,
+            "pattern": picture_name(index),
+            **shot.model_dump(include={"row", "column", "sign"}),
+        }
+        for index, (name, shot) in enumerate(zip(names, patterns.captures, strict=True))
+    ]
+    return {
+        "projector": where,
+        **patterns.model_dump(include={"family", "n", "P_L", "P_R"}),
+        "shots": shots,
+    }
+
+
+def write_png(path: Path, values: npt.NDArray[Any]) -> None:
+    """Write ``values`` (rows, columns) of 8 or 16 bits to ``path``. MitsimError where that is not possible."""
+    from PIL import Image
+
+    try:
+        Image.fromarray(values).save(path, format="png")
+    except OSError as error:
+        raise MitsimError(
+            f"file {path}: cannot be written ({error.strerror or error}); choose a folder with room"
+        ) from error
