@@ -49,10 +49,15 @@ def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float =
 def drifted(bench: Bench, drift: Drift) -> Bench:
     """A ``bench`` whose mask has moved as a ``drift`` says, for all that is made of light traced before.
 
-    MitsimError for a mask that turns or shakes before mirrors, whose light is formed ray by ray, or that moves into the
-    sensor or the scene.
+    MitsimError for a mask that turns or shakes before mirrors, whose light is formed ray by ray, or whose shadow is
+    drawn on a raster, and for one that moves into the sensor or the scene.
     """
     row, column, axis = drift.mask_mm
+    if drift.motion is not None and bench.geometry.correlated(bench.geometry.diffracts):
+        raise MitsimError(
+            f"drift: mask_rotation_mrad and vibration_um are formed of separable terms, and {bench.geometry.mask_words} "
+            "has none; turn that mask in the camera file's [mask]"
+        )
     if drift.motion is not None and bench.loaded.mirrors:
         raise MitsimError(
             "drift: mask_rotation_mrad and vibration_um are formed of light in cells, and mirrors bring light in none; "

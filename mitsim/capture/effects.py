@@ -218,7 +218,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "diffraction",
         {"spectrum": None},
-        absent="the mask is no sum of two separable terms: its shadow is geometric",
+        absent="the mask's shadow is geometric, or a picture that has it",
         note=_diffraction,
         first_look=True,
         in_shadow=True,

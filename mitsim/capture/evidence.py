@@ -262,6 +262,8 @@ class Forming:
         that the pilot measured for a frame of one anchor, layer and cell a pixel, with a wave-optical shadow.
     product
         seconds of a multiplication in a large product of matrices, on all processors; 0 where nobody has timed it.
+    correlated
+        whether frames are correlations with a shadow on a raster, and not sums of separable terms.
     """
 
     pixels: int
@@ -272,6 +274,7 @@ class Forming:
     classes: int
     seconds: float = 0.0
     product: float = 0.0
+    correlated: bool = False
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from mitsim.capture.prices import (
 from mitsim.capture.request import Request, check_accuracy
 from mitsim.core.errors import MitsimError
 from mitsim.core.pictures import table
+from mitsim.rig.plate import RASTER_ERROR
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
@@ -178,12 +179,15 @@ class SceneFacts:
         what the model of the devices does not cover, and which of the scene's light frames are known to lack.
     shapes
         where the scene's shapes are written, if that is known.
+    raster
+        whether the mask's shadow is drawn on a raster, without diffraction and with it.
     """
 
     notes: Mapping[str, str]
     keystone: float
     warnings: tuple[str, ...] = ()
     shapes: tuple[Tag, ...] = ()
+    raster: tuple[bool, bool] = (False, False)
 
     @classmethod
     def of(cls, bench: Bench, switches: Mapping[str, bool] | None = None) -> SceneFacts:
@@ -199,10 +203,21 @@ class SceneFacts:
                 f"mask_thickness {geometry.mask_thickness} mm shifts the far face by "
                 f"{geometry.wall_shift_features:.1f} features at the field stop; the two-face model holds below 1"
             )
-        if not geometry.diffracts and (switches or {}).get("diffraction") is not False:
+        plate = geometry.mask_plate
+        if (
+            not geometry.diffracts
+            and not (plate and plate.irradiance)
+            and (switches or {}).get("diffraction") is not False
+        ):
             warnings.append(
-                f"diffraction is left out: it is worked out for masks of one or two separable terms, and this one "
-                f"({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is meant"
+                "diffraction is left out: behind blurred edges it is worked out for masks of one separable term, and "
+                f"this one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is "
+                "meant"
+            )
+        if geometry.tilt_shift_mm:
+            warnings.append(
+                f"the mask's tilt is left out: it moves shadows by up to {geometry.tilt_shift_mm * 1e3:.2g} um; render "
+                "--estimator reference has it, or set it to 0 in the camera's [mask]"
             )
         longest = float(bench.spectrum.wavelengths_nm.max())
         if geometry.mask_feature * 1e6 < longest:
@@ -211,7 +226,8 @@ class SceneFacts:
                 "of masks needs features above it, so the shadow is a guess"
             )
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes)
+        raster = geometry.correlated(waves=False), geometry.correlated(geometry.diffracts)
+        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes, raster)
 
 
 def decide(
@@ -249,7 +265,7 @@ def decide(
         sampling_target=chosen.target,
         systematic_error=chosen.systematic.value,
         systematic_bound=chosen.systematic.bound,
-        warnings=facts.warnings + words.warnings,
+        warnings=facts.warnings + words.of_raster + words.warnings,
         predicted=stages,
     )
 
@@ -285,6 +301,17 @@ class _Words:
         anchors = self._anchors(), self._followed_anchors(), self._occluded_anchors()
         counted = (anchors[0], self._layers(), self._cells(), *anchors[1:])
         return (*counted, *effects, *_fixed(self.facts))
+
+    @property
+    def of_raster(self) -> tuple[str, ...]:
+        """That the mask's shadow is no more exact than its raster, where that is coarser than the accuracy."""
+        drawn = self.facts.raster["diffraction" in self.chosen.settings.effects]
+        if not drawn or self.accuracy >= RASTER_ERROR:
+            return ()
+        return (
+            f"the mask's shadow is drawn on a raster, which leaves up to some {RASTER_ERROR:g} of the frames; ask for "
+            "an accuracy no finer, or take a mask of one or two separable terms that is not turned",
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -96,6 +96,9 @@ FIXED = Paces(
 decide. Direct light takes half as much where one cell a pixel holds it, and more in many fine ones."""
 
 
+_CORRELATION = 8e3
+"""Multiplications a pixel that a correlation with a raster takes as long as, for each pair of anchors and layer: 0.045
+processor seconds of 512 x 512 pixels (benchmarks/masks.py)."""
 SHARED_COST = 6
 """Paths that a path of shared indirect light takes as long as: corner 5.7, cookie_bag 3.4."""
 
@@ -219,6 +222,8 @@ def _products(forming: Forming, lit: Number, cells: Number, layers: Number, anch
     """
     rows = lit * forming.cells * cells * anchors
     pixels = forming.pixels
+    if forming.correlated:
+        return cast(Number, _CORRELATION * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows)
     probes = GROUPS * (PROBES + 1) * (np.minimum(rows, pixels) + pixels) * rows
     terms = 1 + (forming.terms - 1) * waves
     return cast(Number, terms * layers * (pixels * rows**2 + pixels**2 * rows + probes))

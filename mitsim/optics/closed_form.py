@@ -3,13 +3,14 @@
 A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
 distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and
 its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
-hold light enter the product: for k x k shifting dots that is one in k of each.
+hold light enter the product: for k x k shifting dots that is one in k of each. Behind a mask that is drawn on a raster
+(:mod:`mitsim.optics.raster`) the frame of each pair of anchors is a correlation instead.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,7 +19,9 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.shadow import Directions, SeparableTerms
+from mitsim.optics.correlation import Correlation
+from mitsim.optics.raster import raster
+from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.plate import FEW
@@ -31,11 +34,13 @@ _HELD = 8
 """Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
 _kept_shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
+_KEPT_RASTERS = 8
+"""The last shadows on rasters, some 40 MiB each at 512 pixels: layers of a scene, with one line and with all."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Light of one layer in the rows and columns that any of several estimates lights.
+    """Light of one layer in the rows and columns that any of several estimates lights, seen by separable terms.
 
     Attributes
     ----------
@@ -69,6 +74,83 @@ class _Block:
             seen = (flat @ (right if vectors is None else right @ vectors)).reshape(count, rows, -1)
             total = total + left.T @ np.moveaxis(seen, 0, 1).reshape(rows, -1)
         return total
+
+
+@dataclass(frozen=True, eq=False)
+class _RasterBlock:
+    """The same, seen by a raster.
+
+    Attributes
+    ----------
+    layer
+        the raster, and what pixels it is for.
+    rows, columns
+        (r,) and (c,) places in (anchor, cell) of the lights' rows and columns.
+    lights
+        (estimates, r, c) light of each.
+    """
+
+    layer: _RasterLayer
+    rows: IntArray
+    columns: IntArray
+    lights: FloatArray
+
+    def frame(self, out: FloatArray | None = None) -> FloatArray:
+        """As :meth:`_Block.frame`."""
+        seen = self.layer.image(self.lights.mean(axis=0), self.rows, self.columns)
+        if out is None:
+            return seen
+        out[...] = seen
+        return out
+
+    def probe(self, vectors: FloatArray | None) -> FloatArray:
+        """As :meth:`_Block.probe`."""
+        seen = [self.layer.image(light, self.rows, self.columns) for light in self.lights]
+        return np.concatenate([frame if vectors is None else frame @ vectors for frame in seen], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _RasterLayer:
+    """One layer behind a mask on a raster: its correlation, the anchors' weights (m, anchors), and (m,) pixels along
+    both axes, None for all."""
+
+    correlation: Correlation
+    weights: FloatArray
+    places: IntArray | None
+    cells: tuple[int, int]
+
+    def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _RasterBlock:
+        """The layer with ``lights`` (estimates, r, c) in these ``rows`` and ``columns``."""
+        return _RasterBlock(self, rows, columns, lights)
+
+    def image(self, light: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
+        """(m, m) irradiance of a ``light`` (r, c) in these ``rows`` and ``columns``."""
+        (row_anchor, row), (column_anchor, column) = (
+            np.divmod(places, cells) for places, cells in zip((rows, columns), self.cells, strict=True)
+        )
+        total = np.zeros((len(self.weights),) * 2)
+        for first in np.unique(row_anchor):
+            for second in np.unique(column_anchor):
+                inside = row_anchor == first, column_anchor == second
+                part = light[np.ix_(*inside)]
+                if not part.any():
+                    continue
+                seen = self.correlation.image(part, row[inside[0]], column[inside[1]])
+                if self.places is not None:
+                    seen = seen[np.ix_(self.places, self.places)]
+                total += self.weights[:, first, None] * seen * self.weights[:, second]
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class _TermsLayer:
+    """One layer behind a mask of separable terms: by term, (anchors * cells, m) factors of rows and of columns."""
+
+    terms: Sequence[tuple[Any, Any]]
+
+    def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _Block:
+        """The layer with ``lights`` (estimates, r, c) in these ``rows`` and ``columns``."""
+        return _Block([(left[rows], right[columns]) for left, right in self.terms], lights)
 
 
 class FrameOptics:
@@ -106,13 +188,22 @@ class FrameOptics:
         self.pixels = len(centres)
         self.cells = (len(rows.centres), len(columns.centres))
         self.shape = (anchors * self.cells[0], anchors * self.cells[1])
+        if geometry.correlated(spectrum is not None):
+            chosen = None if places is None else np.asarray(places)
+            seen = [_correlation(geometry, rows, columns, depth, spectrum) for depth in depths]
+            self._layers: Sequence[_RasterLayer | _TermsLayer] = [
+                _RasterLayer(correlation, weights, chosen, self.cells) for correlation in seen
+            ]
+            return
         # Stored with the light's index first, so that picking lit rows copies contiguous memory.
         stack = _Stack if anchors > _HELD else _stack
         self._layers = [
-            [
-                (stack(left, weights), stack(right, weights))
-                for left, right in _shadow(geometry, rows, columns, depth, spectrum, places)
-            ]
+            _TermsLayer(
+                [
+                    (stack(left, weights), stack(right, weights))
+                    for left, right in _shadow(geometry, rows, columns, depth, spectrum, places)
+                ]
+            )
             for depth in depths
         ]
 
@@ -158,10 +249,10 @@ class FrameOptics:
             frame = np.zeros((self.pixels, self.pixels)) if out is None else out
         return frame, probed
 
-    def _blocks(self, estimates: Sequence[Entries]) -> Iterator[_Block]:
+    def _blocks(self, estimates: Sequence[Entries]) -> Iterator[_Block | _RasterBlock]:
         """The light of each layer that holds any."""
         split = [self._split(*entries) for entries in estimates]
-        for terms, parts in zip(self._layers, zip(*split, strict=True), strict=True):
+        for of_depth, parts in zip(self._layers, zip(*split, strict=True), strict=True):
             places = [np.divmod(place, self.shape[1]) for place, _ in parts]
             lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
             for row, column in places:
@@ -173,7 +264,7 @@ class FrameOptics:
             lights = np.zeros((len(parts), len(rows), len(columns)))
             for light, (row, column), (_, values) in zip(lights, places, parts, strict=True):
                 light[row_of[row], column_of[column]] = values
-            yield _Block([(left[rows], right[columns]) for left, right in terms], lights)
+            yield of_depth.block(rows, columns, lights)
 
     def _split(self, flat: IntArray, light: FloatArray) -> list[Entries]:
         """What lies in each layer: places in (rows, columns), and light."""
@@ -188,6 +279,15 @@ def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
     """The shadow of ``geometry`` toward ``directions``; of masks of many terms, 100 MiB each, none is kept."""
     many = geometry.mask_terms > FEW or geometry.mask_motion is not None
     return (shadow_terms if many else _kept_shadow)(geometry, *directions)
+
+
+@lru_cache(maxsize=_KEPT_RASTERS)
+def _correlation(
+    geometry: CameraGeometry, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None
+) -> Correlation:
+    """The shadow of a mask that is drawn on a raster, prepared once."""
+    shadow = replace(ShadowGeometry.of(geometry, depth), mask=raster(geometry, depth, spectrum))
+    return Correlation(shadow, rows, columns, geometry.pixel_fill_factor)
 
 
 class _Stack:

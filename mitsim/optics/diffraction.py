@@ -87,7 +87,7 @@ class EdgeWaves:
     def field(self, aperture: Steps, start_mm: float) -> ComplexArray:
         """(count,) field behind ``aperture`` at the centres of the cells from ``start_mm`` on, 1 without a mask."""
         reach, count = self._reach, self._count
-        profile = aperture.cell_means(start_mm - reach * self.step_mm, self.step_mm, count + 2 * reach)
+        profile = aperture.amplitude_means(start_mm - reach * self.step_mm, self.step_mm, count + 2 * reach)
         jumps = fft.fft(np.diff(profile), self._size)
         jumps *= self._kernel
         # The first 2 reach - 1 values lack jumps on their left, or hold what wrapped around the end.

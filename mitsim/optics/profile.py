@@ -4,6 +4,11 @@ A profile is a :class:`Steps` function of the mask coordinate s [mm]. A thick ma
 has to pass both faces. Means over a sensor pixel and a cell (two boxes, one after the other) come from the second
 antiderivative; the mean of the values is taken off first, so that the second difference has little to cancel: 1e-11 is
 left for values of order 1 (measured in tests/unit/optics/test_profile.py).
+
+Blurred by a Gaussian of standard deviation sigma, a unit step is the normal distribution function Phi(x / sigma), and
+its means over one and two boxes are differences of its antiderivatives, with phi the normal density::
+
+    x Phi + sigma phi    and    ((x^2 + sigma^2) Phi + x sigma phi) / 2
 """
 
 from __future__ import annotations
@@ -12,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from mitsim.core.arrays import FloatArray
 
@@ -24,6 +30,12 @@ look-up of four numbers instead of four of three."""
 _WIDE = 16
 """Product of two boxes' half-widths, in steps of the grid, from which cubic interpolation leaves less than 4e-5 of a
 shadow, an eighth of what the grid itself leaves (measured in tests/physics/test_diffraction.py)."""
+_BEYOND = 8.3
+"""Standard deviations beyond which a blurred step is 0 or 1 to rounding."""
+_POINTLIKE = 1e-4
+"""Half-width of a box, in standard deviations of the blur, below which it counts as none: 2e-9 is left."""
+_PER_CELL = 4
+"""Points of a grid's cell at which the root of a blurred profile is taken, which changes over its blur."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,21 +48,39 @@ class Steps:
         (k + 1,) increasing coordinates.
     values
         (k,) real numbers.
+    blur_mm
+        standard deviation of a Gaussian that blurs it [mm].
     """
 
     edges: FloatArray
     values: FloatArray
+    blur_mm: float = 0.0
 
     @classmethod
     def of(cls, profile: npt.ArrayLike, feature_mm: float) -> Steps:
         """The centred ``profile`` (N,) of features of ``feature_mm``, neighbours of equal value merged."""
+        count = len(np.asarray(profile))
+        return cls.between(profile, np.asarray((np.arange(count + 1) - count / 2) * feature_mm))
+
+    @classmethod
+    def between(cls, profile: npt.ArrayLike, lines_mm: FloatArray, blur_mm: float = 0.0) -> Steps:
+        """A profile with neighbours of equal value merged.
+
+        Parameters
+        ----------
+        profile, lines_mm
+            (N,) values between (N + 1,) lines.
+        blur_mm
+            as of the result.
+        """
         values = np.asarray(profile, dtype=np.float64)
-        edges = (np.arange(len(values) + 1) - len(values) / 2) * feature_mm
         starts = np.flatnonzero(np.diff(values, prepend=np.nan))
-        return cls(np.append(edges[starts], edges[-1]), values[starts])
+        return cls(np.append(lines_mm[starts], lines_mm[-1]), values[starts], blur_mm)
 
     def at(self, s: FloatArray) -> FloatArray:
         """Values at points ``s`` [mm]; at an edge, those of the interval that begins there."""
+        if self.blur_mm:
+            return self._blurred(s, 0.0, 0.0)
         padded = np.concatenate(([0.0], self.values, [0.0]))
         return np.asarray(padded[np.searchsorted(self.edges, s, side="right")])
 
@@ -76,6 +106,8 @@ class Steps:
         start, step, count
             first edge and width [mm] of the cells, and their number.
         """
+        if self.blur_mm:
+            return self._blurred(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2, 0.0)
         bounds = start + step * np.arange(count + 1)
         index = np.searchsorted(self.edges, bounds, side="right")
         means = np.concatenate(([0.0], self.values, [0.0]))[index[:-1]]
@@ -85,6 +117,37 @@ class Steps:
         at = np.interp(bounds[[cut, cut + 1]], self.edges, covered)
         means[cut] = (at[1] - at[0]) / step
         return np.asarray(means)
+
+    def amplitude_means(self, start: float, step: float, count: int) -> FloatArray:
+        """The same of a field's factor whose square is blurred: that square is what a blur of power is.
+
+        Parameters
+        ----------
+        start, step, count
+            as for :meth:`cell_means`.
+        """
+        if not self.blur_mm:
+            return self.cell_means(start, step, count)
+        power = Steps(self.edges, np.square(self.values), self.blur_mm)
+        points = np.asarray(start + step / _PER_CELL * (np.arange(count * _PER_CELL) + 0.5))
+        return np.asarray(np.sqrt(np.maximum(power.at(points), 0)).reshape(count, _PER_CELL).mean(axis=1))
+
+    def over(self, centres: FloatArray, half: FloatArray) -> FloatArray:
+        """Means over boxes of half-widths ``half`` [mm] about ``centres`` (the arrays broadcast); at 0 the value."""
+        return self._blurred(centres, half, 0.0)
+
+    def _blurred(self, centres: FloatArray, half: FloatArray | float, other: float) -> FloatArray:
+        """Means over two boxes, edge by edge; half-widths [mm], the ``other``'s one for all, which may be 0."""
+        reach = half + other + _BEYOND * self.blur_mm
+        jumps = np.diff(self.values, prepend=0.0, append=0.0)
+        first = np.searchsorted(self.edges, centres - reach, side="right")
+        most = int((np.searchsorted(self.edges, centres + reach, side="right") - first).max(initial=0))
+        total = np.concatenate(([0.0], self.values, [0.0]))[first]
+        for further in range(most):
+            edge = np.minimum(first + further, len(jumps))
+            beyond = centres - np.append(self.edges, np.inf)[edge]
+            total += np.append(jumps, 0.0)[edge] * blurred_step(beyond, half, other, self.blur_mm)
+        return np.asarray(total)
 
     def box_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
         """Means over two boxes, one after the other.
@@ -96,12 +159,57 @@ class Steps:
         half_pixel, half_cell
             their half-widths [mm].
         """
+        if self.blur_mm:
+            return self._blurred(centres, half_pixel, half_cell)
         reach = half_pixel + half_cell
         low, high = centres.min() - reach, centres.max() + reach
         inside = self.edges[(self.edges > low) & (self.edges < high)]
         edges = np.concatenate(([low], inside, [high]))
         values = self.at((edges[:-1] + edges[1:]) / 2)
         return np.asarray(_Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0])
+
+
+def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: float) -> FloatArray:
+    """Mean over two boxes about x of a unit step at 0 that a Gaussian blurs; all lengths in one unit.
+
+    Parameters
+    ----------
+    x
+        centres of the boxes; -inf is allowed.
+    half, other
+        their half-widths, the other's at most one for all; below a ten-thousandth of the blur they count as none.
+    blur
+        standard deviation, 0 or above; 0 with no second box alone.
+    """
+    if other > _POINTLIKE * blur and other > 0:
+        ends = (_twice(x + half + other, blur) - _twice(x + half - other, blur)) / (2 * other)
+        ends -= (_twice(x - half + other, blur) - _twice(x - half - other, blur)) / (2 * other)
+        return np.asarray(ends / (2 * half))
+    wide = np.asarray(half) > _POINTLIKE * blur
+    width = np.where(wide, half, 1.0)
+    means = (_once(x + width, blur) - _once(x - width, blur)) / (2 * width)
+    point = ndtr(x / blur) if blur else np.asarray(x >= 0, dtype=np.float64)
+    return np.asarray(np.where(wide, means, point))
+
+
+def _density(z: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi))
+
+
+def _once(x: FloatArray, blur: float) -> FloatArray:
+    """Antiderivative of the blurred step."""
+    if not blur:
+        return np.asarray(np.maximum(x, 0))
+    z = np.maximum(x / blur, -2 * _BEYOND)  # both parts are 0 before
+    return np.asarray(blur * (z * ndtr(z) + _density(z)))
+
+
+def _twice(x: FloatArray, blur: float) -> FloatArray:
+    """Its antiderivative."""
+    if not blur:
+        return np.asarray(np.square(np.maximum(x, 0)) / 2)
+    z = np.maximum(x / blur, -2 * _BEYOND)
+    return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * ndtr(z) + z * _density(z)))
 
 
 def sampled_box_means(

@@ -15,8 +15,12 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.diffraction import wave_profiles
+from mitsim.optics.profile import Steps
+from mitsim.optics.raster import raster
 from mitsim.optics.shadow import ShadowGeometry
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.mask import Mask
+from mitsim.rig.plate import Plate
 from mitsim.rig.projector import Spectrum
 
 Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
@@ -74,6 +78,8 @@ def wave_samplers(
     depth, tau
         of the source [mm], and its tan-angles along rows and columns.
     """
+    if geometry.correlated(spectrum is not None):
+        return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
     reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + geometry.pixel_pitch
     terms: list[SeparableTerm] = []
@@ -91,14 +97,25 @@ def wave_samplers(
     return terms
 
 
+def _steps_sampler(profile: Steps) -> Sampler:
+    """That of a ``profile`` whose features are not even, or blurred."""
+    return lambda s, width, tangent: profile.over(s, np.abs(width) / 2)
+
+
 def geometric_samplers(geometry: CameraGeometry) -> list[SeparableTerm]:
     """The geometric shadow of the mask of ``geometry``, as samplers."""
-    mask, (row, column) = geometry.build_mask(), geometry.mask_offset
-    return [
-        (
-            weight,
-            ProfileSampler(rows, mask.feature_mm, centre_mm=row),
-            ProfileSampler(columns, mask.feature_mm, centre_mm=column),
-        )
-        for weight, rows, columns in mask.terms
-    ]
+    if geometry.correlated(waves=False):
+        return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
+    return _of_plate(geometry.build_mask(), geometry.mask_offset)
+
+
+def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SeparableTerm]:
+    """The samplers of a ``mask`` with its ``centre`` off the axis [mm]."""
+
+    def sampler(profile: FloatArray, at: float) -> Sampler:
+        if mask.even:
+            return ProfileSampler(profile, mask.feature_mm, centre_mm=at)
+        return _steps_sampler(Steps.between(profile, mask.lines + at, mask.blur_mm))
+
+    row, column = centre
+    return [(weight, sampler(rows, row), sampler(columns, column)) for weight, rows, columns in mask.terms]

@@ -6,6 +6,7 @@ weighted by the density of s, the convolution of two boxes: a trapezoid. Its int
 difference of a piecewise-quadratic distribution function, so the mean is exact. (Four corner values of the
 profile's second cumulative sum give the same number in exact arithmetic, but they cancel in float64: the
 sums reach N**2/2 features while the second difference is a hundredth of one.) Point directions leave the pixel's box.
+Profiles whose features are not even, or blurred, are those of :mod:`mitsim.optics.profile`.
 
 A thick mask has two faces, the entrance ``thickness`` further from the sensor than the exit. A ray of slope t (x/z seen
 from its sensor point) that leaves through s entered at s' = s + thickness t, and for a point source at (tau z, z) that
@@ -148,7 +149,7 @@ class ShadowGeometry:
 
     def clear(self, profiles: Sequence[FloatArray], tau: float) -> list[Steps]:
         """What ``profiles`` (N,) of both faces leave clear toward ``tau``, in the order of :meth:`weights`."""
-        faces = [Steps.of(profile, self.mask.feature_mm) for profile in profiles]
+        faces = [Steps.between(profile, self.mask.lines, self.mask.blur_mm) for profile in profiles]
         if not self.thickness_mm:
             return faces
         scale = 1 - self.thickness_mm / (self.depth_mm - self.distance_mm)
@@ -199,11 +200,10 @@ def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Direction
 
 def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
     """(terms, m, c) mean transmissions."""
-    feature = shadow.mask.feature_mm
-    if shadow.half_pixel + shadow.half_cell(directions) > _WIDE * feature:
-        steps, crossings = [Steps.of(profile, feature) for profile in profiles], shadow.crossings(directions)
-        boxes = crossings, shadow.half_pixel, shadow.half_cell(directions)
-        return np.stack([profile.box_means(*boxes) for profile in steps])
+    feature, even = shadow.mask.feature_mm, shadow.mask.even
+    if not even or shadow.half_pixel + shadow.half_cell(directions) > _WIDE * feature:
+        boxes = shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
+        return np.stack([profile.box_means(*boxes) for profile in shadow.clear(profiles, 0.0)])
     centre = shadow.crossings(directions) / feature
     half_pixel, half_cell = np.array(shadow.half_pixel / feature), np.array(shadow.half_cell(directions) / feature)
     return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])

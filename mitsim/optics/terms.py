@@ -9,6 +9,7 @@ import numpy as np
 
 from mitsim.optics.diffraction import wave_terms
 from mitsim.optics.motion import moving_terms
+from mitsim.optics.raster import raster
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
@@ -41,6 +42,8 @@ def shadow_terms(
         (m,) pixels along an axis, increasing; None: all.
     """
     shadow = ShadowGeometry.of(geometry, depth)
+    if geometry.correlated(spectrum is not None):
+        shadow, spectrum = replace(shadow, mask=raster(geometry, depth, spectrum)), None
     if places is not None:
         shadow = replace(shadow, pixel_centres_mm=shadow.pixel_centres_mm[np.asarray(places)])
     if geometry.mask_motion is not None:

@@ -76,10 +76,10 @@ class CameraGeometry(BaseModel):
     def _a_plate_is_there(self) -> CameraGeometry:
         if (self.mask == "plate") != (self.mask_plate is not None):
             raise ValueError("mask: got 'plate' without one; a camera file's table [mask] gives it, with --camera")
-        if self.mask_plate is not None and self.mask_thickness and self.mask_plate.crosses is None:
+        if self.mask_plate is not None and self.mask_thickness and not self.mask_plate.may_be_thick:
             raise ValueError(
-                f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms "
-                f"({self.mask_plate.words}) is thin, so set 0"
+                f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms, or one "
+                f"that is blurred, dusty, turned or tilted ({self.mask_plate.words}), is thin, so set 0"
             )
         return self
 
@@ -137,8 +137,13 @@ class CameraGeometry(BaseModel):
             return mls_mask(self.mask, self.mask_feature, self.mask_order)
         if self.mask_plate is None:
             raise MitsimError("mask: got 'plate' without one; give a camera file with a table [mask]")
+        return within(self.mask_plate, self.mask_reach)
+
+    @property
+    def mask_reach(self) -> float:
+        """How far from its centre a mask is seen [mm]."""
         seen = self.half_width + (self.mask_distance + self.mask_thickness) * self.tan_half_fov
-        return within(self.mask_plate, seen + self.pixel_pitch + max(map(abs, self.mask_offset)))
+        return seen + self.pixel_pitch + max(map(abs, self.mask_offset))
 
     @property
     def centred(self) -> bool:
@@ -148,9 +153,16 @@ class CameraGeometry(BaseModel):
 
     @property
     def diffracts(self) -> bool:
-        """Whether the field behind the mask is a sum of few enough separable terms for diffraction to be simulated."""
-        mask = self.build_mask().amplitude
-        return not isinstance(mask, Plate) or mask.crosses is not None
+        """Whether diffraction at the mask is simulated."""
+        mask = self.build_mask()
+        return not isinstance(mask, Plate) or mask.diffracts
+
+    @property
+    def tilt_shift_mm(self) -> float:
+        """How far a tilt of the mask moves shadows at most, on the mask [mm]: a ray of slope t that leaves the even
+        plane at s meets the tilted one t s tan(tilt) beside."""
+        tilt = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
+        return self.tan_half_fov * self.mask_reach * sum(math.tan(abs(angle) * 1e-3) for angle in tilt)
 
     @property
     def mask_words(self) -> str:
@@ -163,8 +175,16 @@ class CameraGeometry(BaseModel):
 
     @property
     def mask_terms(self) -> int:
-        """Separable terms of the mask."""
-        return len(self.build_mask().terms)
+        """Separable terms of the mask, 1 where it has no closed form."""
+        return 1 if self.correlated(waves=False) else len(self.build_mask().terms)
+
+    def correlated(self, waves: bool) -> bool:
+        """Whether frames behind the mask, with ``waves`` or without, are correlations with a drawn shadow: of what is
+        turned, of a picture of light, and of the waves behind many terms."""
+        mask = self.build_mask()
+        if not isinstance(mask, Plate):
+            return False
+        return mask.irradiance or bool(mask.flaws.turn_deg) or (waves and mask.amplitude.crosses is None)
 
     def fresnel_number(self, wavelength_nm: float) -> float:
         """a^2 / (lambda d) of one mask feature at ``wavelength_nm``: well above 1, a geometric shadow is good."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,10 @@ class Mask(ByValue):
     kind: MaskKind
     feature_mm: float
     bits: npt.NDArray[np.int8]
+    blur_mm: ClassVar[float] = 0.0
+    """Its edges are sharp."""
+    even: ClassVar[bool] = True
+    """Its features are squares of one size."""
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(MaskKind):
@@ -68,6 +72,11 @@ class Mask(ByValue):
     def extent_mm(self) -> float:
         """Side of the patterned square [mm]; it spans -extent/2 .. +extent/2."""
         return len(self.bits) * self.feature_mm
+
+    @property
+    def lines(self) -> FloatArray:
+        """(N + 1,) coordinates of the lines between rows, and between columns [mm]."""
+        return np.asarray((np.arange(len(self.bits) + 1) - len(self.bits) / 2) * self.feature_mm)
 
     @property
     def terms(self) -> tuple[Term, ...]:

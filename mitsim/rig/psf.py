@@ -1,5 +1,8 @@
 """A picture of a point spread function in; the light that each sensor pixel gets of one point out, its sum 1.
 
+Studies take it as a camera that shifts it (:mod:`mitsim.reconstruct.convolution`), a camera file's mask of the kind
+``psf`` as a shadow that grows as the point comes nearer (:class:`mitsim.rig.profile.MaskProfile`).
+
 Such as the picture that came with DiffuserCam (Antipa et al., Optica 5, 1, 2018; data of the repository
 Waller-Lab/DiffuserCam-Tutorial, BSD 3-Clause), which mitsim does not ship: give its path.
 """

@@ -13,7 +13,8 @@ face is open, evenly among all that the field stop shows from u (:mod:`mitsim.tr
 traces the ray from u and returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T =
 tan(fov / 2) and p the part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole
 field stop three of four rays would end at a separable mask. Where a plate is not open in a few grids, the place is
-drawn from a rectangle that holds all that is open, and M(u + d t) is one more factor of the weight. The mask is a
+drawn from a rectangle that holds all that is open, and M(u + d t) is one more factor of the weight; a tilted mask is
+met where the ray crosses its plane, a blurred one at a place moved at random by a normal deviate. The mask is a
 factor, not geometry: thin geometry suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
 Diffraction is the factored estimator's: here light travels along rays.
 
@@ -61,6 +62,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.flaws import Flaws
 from mitsim.rig.plate import Plate
 from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.openings import Openings
@@ -116,11 +118,15 @@ def _sensor_class() -> type:
             self.geometry = geometry
             mask = geometry.build_mask()
             self._openings, self._feature = Openings(mask), mask.feature_mm
-            self._features = round(mask.extent_mm / mask.feature_mm)
+            self._features = self._cover = round(mask.extent_mm / mask.feature_mm)
             self._weights, self._rows, self._columns, self._values = [], [], [], None
             self._whole = isinstance(mask, Plate) and mask.grids is None
+            self._lines, self._flaws = None, Flaws()
             if isinstance(mask, Plate):
-                self._values = mi.Float(mask.values.astype(np.float32).ravel())
+                self._values, self._flaws = mi.Float(mask.values.astype(np.float32).ravel()), mask.flaws
+                if not mask.plain:
+                    self._features, self._cover = len(mask.values), mask.cover
+                    self._lines = mi.Float(mask.lines.astype(np.float32))
                 return
             for weight, rows, columns in mask.terms:
                 self._weights.append(weight)
@@ -145,7 +151,7 @@ def _sensor_class() -> type:
             t, weight = self._direction(u, sample3)
             squared = 1 + dr.squared_norm(t)
             if self._whole:
-                weight *= self._transmission(u + geometry.mask_distance * t, active)
+                weight *= self._transmission(self._crossing(u, t, sample3), active)
             if geometry.mask_thickness:
                 weight *= self._transmission(u + (geometry.mask_distance + geometry.mask_thickness) * t, active)
             if geometry.angular_exponent:
@@ -189,7 +195,7 @@ def _sensor_class() -> type:
             stop, side = geometry.tan_half_fov, self._feature
             # What the field stop shows of the mask, in features from the mask's first corner.
             first = [
-                (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._features
+                (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._cover
                 for start, centre in zip(rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
             ]
             width = 2 * stop * geometry.mask_distance / side
@@ -197,12 +203,46 @@ def _sensor_class() -> type:
             t = mi.Vector2f(*x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
             return t, part
 
+        def _crossing(self, u: mi.Point2f, t: mi.Vector2f, sample: mi.Point2f) -> mi.Point2f:
+            """Where rays of tan-angles t from sensor points u cross the mask, tilted; then moved as its blur says.
+
+            A Gaussian blur is the mean over places that are moved at random: the bits of a ``sample`` tell how far.
+            """
+            distance, flaws = self.geometry.mask_distance, self._flaws
+            if any(flaws.tilt_mrad):
+                tilt = mi.Vector2f(*x_y(*(float(np.tan(angle * 1e-3)) for angle in flaws.tilt_mrad)))
+                centre = mi.Point2f(*x_y(*self.geometry.mask_offset))
+                along = (distance + dr.dot(tilt, u - centre)) / (1 - dr.dot(tilt, t))
+                # A length along the tilted plane is longer than what it covers of the even one.
+                point = (u + along * t - centre) * dr.sqrt(1 + dr.square(tilt)) + centre
+            else:
+                point = u + distance * t
+            if flaws.blur_mm:
+                bits = [dr.reinterpret_array(mi.UInt32, mi.Float32(number)) for number in (sample.x, sample.y)]
+                rng = generator(*bits)
+                moved = mi.Point2f(rng.next_float32(), rng.next_float32())
+                point += flaws.blur_mm * mi.warp.square_to_std_normal(moved)
+            return point
+
+        def _place(self, row: mi.Float, column: mi.Float) -> tuple[mi.Float, mi.Float]:
+            """Row and column of the mask, as whole numbers, at places [mm] about its centre."""
+            if self._lines is None:
+                return tuple(dr.floor(s / self._feature + 0.5 * self._features) for s in (row, column))
+            angle = np.radians(self._flaws.turn_deg)
+            if angle:
+                cosine, sine = float(np.cos(angle)), float(np.sin(angle))
+                row, column = cosine * row + sine * column, cosine * column - sine * row
+            lines, count = self._lines, self._features + 1
+            return tuple(
+                mi.Float(dr.binary_search(0, count, lambda k, s=s: dr.gather(mi.Float, lines, k) <= s)) - 1
+                for s in (row, column)
+            )
+
         def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
             """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""
             row, column = rows_columns(point.x, point.y)
             row_centre, column_centre = self.geometry.mask_offset
-            row = dr.floor((row - row_centre) / self._feature + 0.5 * self._features)
-            column = dr.floor((column - column_centre) / self._feature + 0.5 * self._features)
+            row, column = self._place(row - row_centre, column - column_centre)
             inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)
             inside &= active
             row, column = mi.UInt32(dr.maximum(row, 0)), mi.UInt32(dr.maximum(column, 0))

@@ -154,17 +154,33 @@ def test_a_frame_equals_rays_counted_through_a_random_grey_mask() -> None:
     assert np.abs(frame - counted).max() < 0.025 and np.abs(frame - counted).mean() < 0.004
 
 
-def test_masks_of_many_terms_say_that_diffraction_is_left_out(
+def test_blurred_masks_of_many_terms_say_that_diffraction_is_left_out(
     small_scene: Callable[..., Path], variant: str, tmp_path: Path
 ) -> None:
+    """(Planted: every plate diffracts.)"""
     random = np.random.default_rng(2).integers(0, 2, (63, 63))
-    bench = open_bench(small_scene(), variant, camera_file(tmp_path, "random", random))
+    path = camera_file(tmp_path, "random", random)
+    sharp = open_bench(small_scene(), variant, path)
+    assert EFFECTS["diffraction"].present(sharp) and not SceneFacts.of(sharp).warnings
+    path.write_text(path.read_text() + "edge_blur_um = 2.0\n")
+    bench = open_bench(small_scene(), variant, path)
     assert any("diffraction is left out" in warning for warning in SceneFacts.of(bench).warnings)
     assert not SceneFacts.of(bench, {"diffraction": False}).warnings
     assert not EFFECTS["diffraction"].present(bench)
     at = Directions([0.0], 0.0)
-    with pytest.raises(MitsimError, match=r"^drawing random.npy: .*--effects=-diffraction[^\n]*$"):
+    with pytest.raises(MitsimError, match=r"^drawing random.npy.*--effects=-diffraction[^\n]*$"):
         shadow_terms(bench.geometry, at, at, 400.0, LINES)
+
+
+def test_a_tilt_is_told_with_what_it_moves(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
+    """tan 10 degrees times 0.743 mm (half the sensor, 2 mm tan 10 degrees, a pixel) times 10 mrad. (Planted: no factor
+    of the slope.)"""
+    path = camera_file(tmp_path, "tilted", drawn("separable", 6))
+    path.write_text(path.read_text() + "tilt_row_mrad = -10.0\n")
+    bench = open_bench(small_scene(), variant, path)
+    reach = 32 * 0.01172 + 2 * np.tan(np.radians(10)) + 0.01172
+    assert bench.geometry.tilt_shift_mm == pytest.approx(np.tan(np.radians(10)) * reach * 0.01, rel=1e-4)
+    assert any("tilt is left out: it moves shadows by up to 1.3 um" in told for told in SceneFacts.of(bench).warnings)
 
 
 def turned(values: np.ndarray, degrees: float) -> np.ndarray:

@@ -157,9 +157,10 @@ class FineLight:
         list(ExpectedFrames([filed], Lighting(rows, timed), 0))
         seconds = (time.perf_counter() - started) / len(timed)
         cells = max(simulation.fine.bundle.cells)
-        lines = len(self.bench.spectrum.weights) * self.bench.geometry.mask_terms
+        geometry = self.bench.geometry
+        lines = len(self.bench.spectrum.weights) * geometry.mask_terms
         return Forming(
-            pixels=self.bench.geometry.pixels,
+            pixels=geometry.pixels,
             cells=cells,
             lit=self._lit(simulation, light) / cells,
             terms=float(lines),
@@ -167,6 +168,7 @@ class FineLight:
             classes=family.weights.shape[1],
             seconds=seconds,
             product=_product_seconds(),
+            correlated=geometry.correlated(geometry.diffracts),
         )
 
     def _lit(self, simulation: Simulation, light: sparse.csr_array) -> float:

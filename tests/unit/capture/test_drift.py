@@ -24,6 +24,7 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.drift import Drift
 from mitsim.rig.order import SIDES
 from mitsim.rig.patterns import parse_patterns
+from mitsim.rig.profile import MaskProfile
 from mitsim.rig.projector import ProjectorModel
 from mitsim.rig.recipe import load_recipe
 from mitsim.rig.rig import Rig
@@ -165,8 +166,12 @@ def test_warmth_moves_the_mask_away() -> None:
 
 
 def test_what_cannot_be_formed_is_refused() -> None:
-    """(Planted: mirrors not looked at.)"""
+    """(Planted: mirrors not looked at; the raster as well.)"""
     with pytest.raises(MitsimError, match=r"^drift: [^\n]*mirrors$"):
         drifted(bench(mirrors=True), Drift(vibration_um=1.0))
+    mask = MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, "order": 5, "rotation_deg": 1.0})
+    turned = mask.worn(RIG.camera, Path())
+    with pytest.raises(MitsimError, match=r"^drift: mask_rotation_mrad [^\n]*\[mask\]$"):
+        drifted(bench(mask="plate", mask_plate=turned.mask_plate), Drift(vibration_um=1.0))
     with pytest.raises(MitsimError, match=r"^drift: mask_axis_um [^\n]*$"):
         drifted(bench(mask_distance=0.5), Drift(mask_axis_um=-600.0))

@@ -148,6 +148,15 @@ def test_warnings_of_the_devices_come_first() -> None:
     assert len(plan(1e-6, facts=facts).warnings) == 2
 
 
+def test_an_accuracy_finer_than_the_masks_raster_is_flagged() -> None:
+    """With waves alone where only these are drawn on one. (Planted: at any accuracy; without waves too.)"""
+    facts = replace(FACTS, raster=(False, True))
+    fine = plan(9e-4, facts=facts)
+    assert "diffraction" in fine.settings.effects and any("on a raster" in told for told in fine.warnings)
+    assert not any("on a raster" in told for told in plan(1e-3, facts=facts).warnings)
+    assert not any("on a raster" in told for told in plan(9e-4, facts=replace(facts, raster=(True, False))).warnings)
+
+
 def test_settings_do_not_depend_on_the_machines_pace() -> None:
     """Bit-equal repetition and --resume need it: the same seed must mean the same settings."""
     efforts = {

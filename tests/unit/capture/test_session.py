@@ -32,7 +32,7 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import Estimate
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.measured import calibrate_frames
-from mitsim.rig.camera import centred_edges
+from mitsim.rig.camera import CameraGeometry, centred_edges
 from mitsim.rig.framelist import FrameList
 from mitsim.rig.order import SIDES
 from mitsim.rig.patterns import Lighting
@@ -211,7 +211,7 @@ def test_memory_of_large_sensors_stays_below_four_gib(pixels: int, mixed: bool) 
     """By prediction, with 128 and 512 stripes a side, whether frames of single lines are held or not.
     (Planted: all shots of a side held.)"""
     assert mixes(128, 128, pixels) == mixed
-    large = SimpleNamespace(n=128, geometry=SimpleNamespace(mask_terms=1, pixels=pixels))
+    large = SimpleNamespace(n=128, geometry=CameraGeometry(pixels=pixels))
     for n in (128, 512):
         large.n = n
         assert 5e8 < session_cost(large, n, Settings(400.0), 1.0).memory_bytes < 3.6 * 2**30

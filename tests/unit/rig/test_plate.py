@@ -196,7 +196,7 @@ def test_a_camera_wears_a_profile_and_cameras_without_stay_what_they_were() -> N
     assert flatcam == CameraGeometry(mask="flatcam", mask_feature=0.05, mask_order=5, mask_offset_row=0.5)
     random = MaskProfile(kind="random", feature_mm=0.05, features=60).worn(bare, Path())
     assert random.build_mask() == random.mask_plate and random.mask_offset_row == 0.5 and random.mask_feature == 0.05
-    assert random.mask_terms == 60 and not random.diffracts and "sha256" in str(random.identity["mask_plate"])
+    assert random.mask_terms == 60 and random.diffracts and "sha256" in str(random.identity["mask_plate"])
     assert random == MaskProfile(kind="random", feature_mm=0.05, features=60).worn(bare, Path()) != bare
     assert MaskProfile(kind="mura", feature_mm=0.05, features=61).worn(bare, Path()).centred
     with pytest.raises(MitsimError, match="mask_thickness"):

@@ -1,0 +1,195 @@
+"""A mask that no few separable terms make up, and its light: the shadow of a point on a raster, at one depth, out.
+
+A turned mask, the light that waves leave behind a mask of many terms, and a picture of a point spread function have no
+short closed form. Each is drawn on square cells, a whole number of which is a sensor pixel seen on the mask, as
+:mod:`mitsim.optics.correlation` needs them; a cell's value is its mean. A point at depth z and tan-angle tau then
+shades sensor point u by what the raster has at s = u (1 - d/z) + d tau, as every mask does.
+
+Means over cells smear an edge by their own box and by that of the raster, h^2 / 6 of variance; a twelfth of the second
+difference along each axis is taken off, which takes half of it back where the raster is read within cells alone.
+
+**Waves.** Behind a mask whose amplitude is a sum of K terms, the field of a point source is that sum of the products of
+1-D fields of :mod:`mitsim.optics.diffraction`, exactly; |U|^2 is averaged over each cell, and over the light's lines.
+Behind a turned mask there is the same light, turned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.optics.diffraction import EdgeWaves, grid_step
+from mitsim.optics.profile import Steps
+from mitsim.optics.shadow import ShadowGeometry
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.flaws import NO_FLAWS, Flaws
+from mitsim.rig.plate import Plate
+from mitsim.rig.projector import Spectrum
+
+_CELLS_PER_PIXEL = 4
+"""Raster cells along a pixel."""
+_CELLS_PER_FEATURE = 2
+"""And along a feature at least, where features are smaller than pixels."""
+_LARGEST = 8192
+"""Cells a side: a raster takes 512 MiB."""
+_POINTS = 4
+"""Points along a cell at which a turned mask is asked for its transmission."""
+_POINTS_PER_FRESNEL_LENGTH = 65
+"""Points in sqrt(lambda D) at which waves are squared; at 65 the separable mask's frame is 7e-4 of its mean off its
+closed form, at 49 it is 2e-3 (tests/physics/test_raster.py): what fringes leave that points are too far apart for."""
+_LEAST_WAVE_POINTS = 2
+"""Points along a cell at least."""
+_AROUND = 8
+"""Cells that a raster is wider than its turned one, for the splines' ends."""
+_AT_ONCE = 2**24
+"""Points asked for at a time, 128 MiB of each of a few arrays."""
+
+
+@lru_cache(maxsize=8)
+def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
+    """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
+
+    Parameters
+    ----------
+    geometry
+        the camera.
+    depth
+        of the point [mm].
+    spectrum
+        lines of its light; None: geometric.
+
+    Raises
+    ------
+    MitsimError
+        for a raster of too many cells, or a mask whose waves are not worked out.
+    """
+    mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
+    if not isinstance(mask, Plate):
+        raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
+    pixel = geometry.pixel_pitch * shadow.shrink
+    step = pixel / cells_per_pixel(geometry)
+    count = 2 * int(np.ceil(min(geometry.mask_reach, mask.flaws.reach(mask.extent_mm) / 2) / step))
+    if count > _LARGEST:
+        raise MitsimError(
+            f"{mask.words}: its shadow needs a raster of {count} cells a side, more than {_LARGEST}; take fewer "
+            "pixels, larger features, or a mask of one or two separable terms"
+        )
+    if mask.irradiance:
+        values = _resampled(mask, step, count)
+    elif spectrum is None:
+        values = sharpened(_turned(mask, step, count))
+    else:
+        values = sharpened(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
+    return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
+
+
+def cells_per_pixel(geometry: CameraGeometry) -> int:
+    """Raster cells along a pixel of ``geometry``."""
+    return max(_CELLS_PER_PIXEL, int(np.ceil(_CELLS_PER_FEATURE * geometry.pixel_pitch / geometry.mask_feature)))
+
+
+def sharpened(values: FloatArray) -> FloatArray:
+    """(n, n) means over cells, whose blur by the cells is taken back to second order along both axes of ``values``."""
+    for _ in ("rows", "columns"):
+        padded = np.pad(values, ((1, 1), (0, 0)))
+        values = (values - (padded[2:] - 2 * values + padded[:-2]) / 12).T
+    return values
+
+
+def _turned(mask: Plate, step: float, count: int) -> FloatArray:
+    """(count, count) mean transmissions of cells of a ``step`` [mm]."""
+    points = (np.arange(count * _POINTS) + 0.5) * (step / _POINTS) - count * step / 2
+    means = np.empty((count, count))
+    rows = max(1, _AT_ONCE // (count * _POINTS**2))
+    for start in range(0, count, rows):
+        stop = min(start + rows, count)
+        seen = mask.transmission(points[start * _POINTS : stop * _POINTS, None], points[None])
+        means[start:stop] = _blocks(seen, _POINTS)
+    return means
+
+
+def _resampled(mask: Plate, step: float, count: int) -> FloatArray:
+    """(count, count) mean values of even features over cells of a ``step`` [mm]."""
+    start = -count * step / 2
+    along = np.stack(
+        [Steps(mask.lines[k : k + 2], np.ones(1)).cell_means(start, step, count) for k in range(len(mask.values))],
+        axis=1,
+    )
+    return np.asarray(along @ mask.values @ along.T)
+
+
+def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) -> FloatArray:
+    """(count, count) mean |U|^2 of cells behind the amplitude that the ``shadow``'s mask is."""
+    mask = cast("Plate", shadow.mask)
+    if mask.blur_mm:
+        raise MitsimError(
+            f"{mask.words}: the waves behind a blurred mask of more than one separable term are not worked out; use "
+            "--effects=-diffraction for its geometric shadow"
+        )
+    if mask.flaws.turn_deg:
+        # Waves turn with the mask.
+        even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
+        whole = 2 * int(np.ceil(count / 2**0.5)) + _AROUND
+        return _turned_light(_waves(even, spectrum, step, whole), count, mask.flaws)
+    total = np.zeros((count, count))
+    for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
+        total += share * _intensity(*_fields(shadow, float(wavelength), step, count))
+    return total
+
+
+def _turned_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
+    """(count, count) cells of light (n, n) that is turned about its centre, between its cells by cubic splines."""
+    # Imported here: most masks are not turned.
+    from scipy import ndimage
+
+    middles = np.asarray(np.arange(count) + 0.5 - count / 2)
+    row, column = flaws.turned_back(middles[:, None], middles)
+    places = np.stack([row, column]) + (len(values) - 1) / 2
+    return np.asarray(ndimage.map_coordinates(values, places, order=3, mode="nearest"))
+
+
+def _fields(
+    shadow: ShadowGeometry, wavelength_nm: float, step: float, count: int
+) -> tuple[npt.NDArray[np.complex64], npt.NDArray[np.complex64], int]:
+    """(points, K) and (K, points) fields of the mask's terms along rows and columns, weights in the first; and points a
+    cell."""
+    distance = shadow.distance_mm * shadow.shrink
+    apart = (wavelength_nm * 1e-6 * distance) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
+    points = max(int(np.ceil(step / apart)), _LEAST_WAVE_POINTS)
+    # An odd number of the grid's cells between two points, so that these lie in the middle of one.
+    between = int(np.ceil(step / points / grid_step(shadow, wavelength_nm))) | 1
+    half = count * step / 2
+    span = half + shadow.mask.extent_mm / 2 + step
+    waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span)
+    terms, lines = shadow.mask.terms, shadow.mask.lines
+
+    def field(profile: FloatArray) -> npt.NDArray[np.complex64]:
+        seen = waves.field(Steps.between(profile, lines), -half)
+        return seen[between // 2 :: between].astype(np.complex64)
+
+    rows = np.stack([np.complex64(weight) * field(row) for weight, row, _ in terms], axis=1)
+    return rows, np.stack([field(column) for *_, column in terms]), points
+
+
+def _intensity(rows: npt.NDArray[np.complex64], columns: npt.NDArray[np.complex64], points: int) -> FloatArray:
+    """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell."""
+    count = len(rows) // points
+    means = np.empty((count, count))
+    at_once = max(1, _AT_ONCE // len(rows) // points)
+    for start in range(0, count, at_once):
+        stop = min(start + at_once, count)
+        field = rows[start * points : stop * points] @ columns
+        means[start:stop] = _blocks(np.square(field.real) + np.square(field.imag), points)
+    return means
+
+
+def _blocks(values: npt.NDArray[np.floating], side: int) -> FloatArray:
+    """Means of ``values`` over squares of so many a ``side``."""
+    rows, columns = (size // side for size in values.shape)
+    return np.asarray(values.reshape(rows, side, columns, side).mean(axis=(1, 3), dtype=np.float64))

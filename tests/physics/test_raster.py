@@ -1,0 +1,166 @@
+"""Shadows that are drawn on a raster: waves behind masks of many terms, turned ones too, and pictures of light.
+
+Rationale: the field behind square openings is a sum of Fresnel integrals at any point, whatever the mask's terms; and
+behind a separable mask the raster has to give what the closed form gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.special import fresnel
+
+from mitsim.capture.bench import open_bench
+from mitsim.capture.effects import EFFECTS, Physics
+from mitsim.capture.plan import SceneFacts
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.optics import raster as rasters
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.correlation import Correlation
+from mitsim.optics.raster import raster
+from mitsim.optics.shadow import Directions, ShadowGeometry
+from mitsim.optics.terms import shadow_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.profile import MaskProfile
+from mitsim.rig.projector import Spectrum
+
+BARE = CameraGeometry(pixels=40, mask_offset_row=0.013)
+LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))
+
+
+def made(**fields: object) -> CameraGeometry:
+    return MaskProfile.model_validate({"feature_mm": 0.06, **fields}).worn(BARE, Path())
+
+
+def irradiance(camera: CameraGeometry, tau: tuple[float, float], depth: float, degrees: float) -> np.ndarray:
+    """(5, 5) light of a point on every eighth pixel from the third, by Fresnel integrals at 24 x 24 points."""
+    values = MaskProfile(kind="random", feature_mm=0.06, features=31).plate(Path()).values
+    edges = (np.arange(32) - 15.5) * 0.06
+    fine = (np.arange(24) + 0.5) / 24 * 0.01172 + (np.arange(2, 40, 8)[:, None] - 20) * 0.01172
+    shrink, angle = 1 - 2 / depth, np.radians(degrees)
+    row, column = ((fine.ravel() * shrink + 2 * at) - off for at, off in zip(tau, camera.mask_offset, strict=True))
+    row, column = (part.ravel() for part in np.meshgrid(row, column, indexing="ij"))
+    row, column = np.cos(angle) * row + np.sin(angle) * column, np.cos(angle) * column - np.sin(angle) * row
+    total = np.zeros((5, 5))
+    for wavelength, share in zip(LINES.wavelengths_nm, LINES.weights, strict=True):
+
+        def side(s: np.ndarray, product: float = wavelength * 1e-6 * 2 * shrink) -> np.ndarray:
+            sine, cosine = fresnel((s[:, None] - edges) * (2 / product) ** 0.5)
+            return -np.diff(0.5 + (0.5 - 0.5j) * (cosine + 1j * sine), axis=1)
+
+        field = ((side(row) @ values) * side(column)).sum(axis=1)
+        total += share * np.square(np.abs(field)).reshape(5, 24, 5, 24).mean(axis=(1, 3))
+    return total
+
+
+@pytest.mark.parametrize("degrees", [0.0, 3.0])
+def test_waves_behind_a_random_mask_are_fresnels_integrals(degrees: float) -> None:
+    """One point, single pixels: what the raster's cells and points leave there, in parts of the mean. (Planted: light
+    turned the other way; no offset; a line's share squared.)"""
+    camera = made(kind="random", features=31, rotation_deg=degrees)
+    tau, depth = (0.03, -0.02), 30.0
+    rows, columns = (Directions([at], 0.0) for at in tau)
+    frame = FrameOptics(camera, rows, columns, (depth,), 1, LINES).frame(np.array([0]), np.ones(1))
+    expected = irradiance(camera, tau, depth, degrees)
+    geometric = FrameOptics(camera, rows, columns, (depth,), 1).frame(np.array([0]), np.ones(1))
+    assert np.sqrt(np.mean(np.square(frame[2::8, 2::8] - expected))) < 0.02 * expected.mean()
+    assert np.sqrt(np.mean(np.square(geometric[2::8, 2::8] - expected))) > 0.15 * expected.mean()
+
+
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_the_raster_gives_the_closed_forms_frame(kind: str) -> None:
+    """Of 40 x 40 cells of light, to 1e-3 of its mean. (Planted: a point's place in its cell.)"""
+    camera = made(kind=kind, order=7, over_etch_um=1e-9)
+    edges = np.linspace(-0.15, 0.15, 41)
+    at, light = Directions.cells(edges), np.random.default_rng(0).random((40, 40))
+    expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, LINES))
+    drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(camera, 400.0, LINES))
+    frame = Correlation(drawn, at, at).image(light, np.arange(40), np.arange(40))
+    assert np.sqrt(np.mean(np.square(frame - expected))) < 1e-3 * expected.mean()
+    geometric = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0))
+    assert np.sqrt(np.mean(np.square(geometric - expected))) > 3e-3 * expected.mean()
+
+
+def test_sharpened_cells_are_read_half_as_blurred() -> None:
+    """Means of x^2 over unit cells are a twelfth above it, sharpened ones a twelfth below: reading them in cells adds
+    one. (Planted: one axis alone; the sign.)"""
+    x = np.arange(-5, 6.0)
+    means = np.add.outer(x**2, 2 * x**2) + 3 / 12
+    inner = slice(1, -1)
+    got = rasters.sharpened(means)[inner, inner]
+    np.testing.assert_allclose(got, (np.add.outer(x**2, 2 * x**2) - 3 / 12)[inner, inner], rtol=0, atol=1e-12)
+
+
+def test_waves_of_grey_masks_keep_their_light() -> None:
+    """0.3 of the transmission everywhere: 0.3 of the light, exactly. (Planted: no root.)"""
+    values = MaskProfile(kind="random", feature_mm=0.06, features=31).plate(Path())
+    full, grey = (
+        raster(BARE.model_copy(update={"mask": "plate", "mask_plate": plate}), 400.0, LINES)
+        for plate in (values, replace(values, values=0.3 * values.values))
+    )
+    np.testing.assert_allclose(grey.values, 0.3 * full.values, rtol=0, atol=1e-6)
+    assert full.values.mean() > 0.2
+
+
+def psf_camera(folder: Path, pixel: float = 0.02) -> tuple[CameraGeometry, np.ndarray]:
+    """A camera with a picture of light 400 mm away, in pixels of half the sensor's, and the picture, its sum 1."""
+    light = np.zeros((140, 120))
+    light[30:-30, 20:-20] = np.random.default_rng(2).random((80, 80)) ** 4
+    np.save(folder / "light.npy", 3.0 + light)
+    table = {"kind": "psf", "feature_mm": pixel / 2, "file": "light.npy", "psf_distance_mm": 400.0, "aperture_mm2": 1.5}
+    bare = CameraGeometry(pixels=50, pixel_pitch=pixel)
+    return MaskProfile.model_validate(table).worn(bare, folder), light / light.sum()
+
+
+def test_a_picture_of_light_is_the_frame_of_its_point(tmp_path: Path) -> None:
+    """On the axis, and beside it by whole pixels, the picture itself: irradiance over that without a mask, of which the
+    aperture's area lets light through. (Planted: no shrink in the aperture; moved the other way.)"""
+    camera, light = psf_camera(tmp_path)
+    by_pixel = light.reshape(70, 2, 60, 2).sum(axis=(1, 3)) * 1.5 / (0.02 * (1 - 2 / 400)) ** 2
+    at = Directions(np.array([0.0, 3 * 0.02 * (1 - 2 / 400) / 2]), 0.0)
+    optics = FrameOptics(camera, at, at, (400.0,), 1)
+    np.testing.assert_allclose(optics.frame(np.array([0]), np.ones(1)), by_pixel[10:60, 5:55], rtol=0, atol=1e-10)
+    moved = optics.frame(np.array([2]), np.ones(1))
+    np.testing.assert_allclose(moved, by_pixel[13:63, 5:55], rtol=0, atol=1e-10)
+    ((left, right), *_) = shadow_terms(camera, at, at, 400.0)
+    assert left.shape == right.shape == (50, 2)
+
+
+def test_a_nearer_points_light_is_wider(tmp_path: Path) -> None:
+    """By (1 - d/z0) / (1 - d/z), about the axis: its second moment along a side. (Planted: the point's own shrink.)"""
+    camera, _ = psf_camera(tmp_path, pixel=0.04)
+    at = Directions([0.0], 0.0)
+    spreads = []
+    for depth in (400.0, 20.0):
+        frame = FrameOptics(camera, at, at, (depth,), 1).frame(np.array([0]), np.ones(1))
+        place = np.arange(50) - 24.5
+        along = frame.sum(axis=0)
+        spreads.append(np.sqrt((along * place**2).sum() / along.sum()))
+    assert spreads[1] / spreads[0] == pytest.approx((1 - 2 / 400) / (1 - 2 / 20), rel=3e-3)
+
+
+def test_a_camera_with_a_picture_of_light_misses_nothing(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path
+) -> None:
+    """No diffraction is added, and none is told to be left out. (Planted: the warning of blurred masks for it.)"""
+    light = np.zeros((80, 80))
+    light[20:60, 20:60] = 200 * np.random.default_rng(2).random((40, 40))
+    Image.fromarray(light.astype(np.uint8)).save(tmp_path / "light.png")
+    text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    table = 'kind = "psf"\nfeature_mm = 0.01172\nfile = "light.png"\npsf_distance_mm = 400.0\naperture_mm2 = 0.3\n'
+    (tmp_path / "camera.toml").write_text(f"{text}\n[mask]\n{table}", encoding="utf-8")
+    bench = open_bench(small_scene(), variant, tmp_path / "camera.toml")
+    assert not SceneFacts.of(bench).warnings and Physics.of(bench).spectrum is None
+    assert not EFFECTS["diffraction"].present(bench) and "light.png of 400 mm" in str(
+        bench.geometry.identity["mask_plate"]
+    )
+    table = table.replace("400.0", "1.5")
+    (tmp_path / "camera.toml").write_text(f"{text}\n[mask]\n{table}", encoding="utf-8")
+    with pytest.raises(MitsimError, match=r"psf_distance_mm is 1\.5"):
+        open_bench(small_scene(), variant, tmp_path / "camera.toml")

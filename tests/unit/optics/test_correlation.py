@@ -1,0 +1,87 @@
+"""Frames by FFT against the sum of separable terms of the same raster, which is exact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.optics import raster as rasters
+from mitsim.optics.anchors import anchor_positions, anchor_weights
+from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.correlation import Correlation
+from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
+from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.plate import Plate
+from mitsim.rig.profile import MaskProfile
+
+BARE = CameraGeometry(
+    pixels=12, pixel_pitch=0.03, mask_offset_row=0.013, mask_offset_column=-0.04, pixel_fill_factor=0.6, fov=8.0
+)
+ROWS, COLUMNS = Directions.cells(np.linspace(-0.06, 0.07, 10)), Directions.cells(np.linspace(-0.05, 0.07, 12))
+
+
+def turned(**flaws: float) -> CameraGeometry:
+    return MaskProfile(kind="separable", feature_mm=0.06, order=6, rotation_deg=2.0, **flaws).worn(BARE, Path())
+
+
+def summed(camera: CameraGeometry, depth: float, light: np.ndarray) -> np.ndarray:
+    """The frame of ``light`` by as many terms as the raster has rows."""
+    plate = rasters.raster(camera, depth)
+    terms = [(1.0, row, values) for row, values in zip(np.eye(len(plate.values)), plate.values, strict=True)]
+    rows = SimpleNamespace(
+        terms=terms, lines=plate.lines, blur_mm=plate.blur_mm, even=plate.even, feature_mm=plate.feature_mm
+    )
+    shadow = replace(ShadowGeometry.of(camera, depth), mask=rows)
+    return camera.pixel_fill_factor * sum(
+        left @ light @ right.T for left, right in geometric_terms(shadow, ROWS, COLUMNS)
+    )
+
+
+@pytest.mark.parametrize("flaws", [{}, {"edge_blur_um": 3.0}])
+def test_a_correlation_is_the_sum_of_all_terms(flaws: dict[str, float]) -> None:
+    """Off the axis, with a part of each pixel active, blurred. (Planted: a phase's index swapped; X not conjugated; one
+    raster cell off.)"""
+    camera, light = turned(**flaws), np.random.default_rng(0).random((9, 11))
+    expected = summed(camera, 300.0, light)
+    optics = FrameOptics(camera, ROWS, COLUMNS, (300.0,), 1)
+    frame = optics.frame(np.arange(99), light.ravel())
+    np.testing.assert_allclose(frame, expected, rtol=0, atol=1e-11 * expected.mean())
+    assert expected.std() > 0.1 * expected.mean()
+
+
+def test_anchors_layers_and_places_are_those_of_separable_frames() -> None:
+    """(Planted: weights of rows for columns; the second layer left out.)"""
+    camera, random = turned(), np.random.default_rng(1)
+    places = tuple(range(1, 12, 3))
+    optics = FrameOptics(camera, ROWS, COLUMNS, (300.0, 200.0), 2, places=places)
+    light = random.random((2, 2, 9, 2, 11)) * (random.random((2, 2, 9, 2, 11)) < 0.3)
+    weights = anchor_weights(anchor_positions(2, camera.half_width), camera.pixel_centres)
+    expected = np.zeros((12, 12))
+    for depth, of_layer in zip((300.0, 200.0), light, strict=True):
+        for row in range(2):
+            for column in range(2):
+                seen = summed(camera, depth, of_layer[row, :, column])
+                expected += weights[:, row, None] * seen * weights[:, column]
+    flat = np.flatnonzero(light)
+    frame = optics.frame(flat, light.ravel()[flat])
+    np.testing.assert_allclose(frame, expected[np.ix_(places, places)], rtol=0, atol=1e-11 * expected.mean())
+    vectors = random.random((len(places), 3))
+    estimates = [(flat, light.ravel()[flat]), (flat[::2], light.ravel()[flat[::2]])]
+    seen = optics.probe(estimates, vectors)
+    assert seen.shape == (len(places), 6)
+    np.testing.assert_allclose(seen[:, :3], frame @ vectors, rtol=1e-10)
+    both, _ = optics.seen(estimates, None)
+    half = optics.frame(*estimates[1])
+    np.testing.assert_allclose(both, (frame + half) / 2, rtol=0, atol=1e-12 * expected.mean())
+
+
+def test_a_raster_of_no_whole_pixel_is_refused() -> None:
+    camera = turned()
+    shadow = replace(ShadowGeometry.of(camera, 300.0), mask=Plate(0.0071, np.ones((9, 9)), "it", irradiance=True))
+    with pytest.raises(MitsimError, match="a whole number"):
+        Correlation(shadow, ROWS, COLUMNS)
