@@ -55,8 +55,8 @@ def drifted(bench: Bench, drift: Drift) -> Bench:
     row, column, axis = drift.mask_mm
     if drift.motion is not None and bench.geometry.correlated(bench.geometry.diffracts):
         raise MitsimError(
-            f"drift: mask_rotation_mrad and vibration_um are formed of separable terms, and {bench.geometry.mask_words} "
-            "has none; turn that mask in the camera file's [mask]"
+            "drift: mask_rotation_mrad and vibration_um are formed of separable terms, and "
+            f"{bench.geometry.mask_words} has none; turn that mask in the camera file's [mask]"
         )
     if drift.motion is not None and bench.loaded.mirrors:
         raise MitsimError(
