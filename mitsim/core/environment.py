@@ -6,6 +6,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -89,6 +90,22 @@ def _loaded(name: str) -> ModuleType:
         drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
     return module
+
+
+@cache
+def compiled_arrays() -> tuple[ModuleType, ModuleType]:
+    """Dr.Jit's functions, and its arrays on this machine's processors: the same numbers whatever the variant is.
+
+    MitsimError for a missing LLVM, or a Dr.Jit that cannot be imported.
+    """
+    llvm.select_llvm()
+    with held_back():
+        try:
+            import drjit
+            import drjit.llvm
+        except ImportError as error:
+            raise MitsimError(f"drjit: cannot be imported ({error}); run: {_reinstall('mitsuba')}") from error
+    return drjit, drjit.llvm
 
 
 def has_gpu() -> bool:

@@ -8,7 +8,7 @@ Means and variances in closed form are in `mitsim.sensor.moments`. All values ar
 """
 
 import math
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,18 +17,14 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.units import photon_energy
 from mitsim.rig.sensor import SensorModel
+from mitsim.sensor.compiled import by_pixel, operations
 from mitsim.sensor.specimen import neighbours, specimen
 
 Digital = FloatArray | npt.NDArray[np.uint32]
 """Digital numbers: codes, or real values of a sensor without bits."""
 _MANY = 256.0
 """Mean electrons from which counts are quantiles of normal deviates: four draws in a million are another count (see
-:func:`poisson_count`), less than 1e9 draws tell, in half the time of numpy's Poisson draw; which, besides, loses digits
-above 1e11."""
-_BLOCK = 2**15
-"""Pixels that go through all stages together: the stages' arrays stay in the cache (half the time of whole frames)."""
-_ARRAYS = 5
-"""Arrays of a block that :func:`expose` works in: expected electrons, and those of :func:`draw_electrons`."""
+:func:`poisson_count`), less than 1e9 draws tell; numpy's Poisson draw, besides, loses digits above 1e11."""
 
 
 def electrons_from_irradiance(
@@ -109,22 +105,33 @@ def expose(
         from a child of the latter.
     """
     light, dark = gathered(expected_electrons, exposure_s, model)
-    offset = reading_offset(np.shape(light), model, read_rng)
-    frame = np.empty(light.shape, np.float64 if model.largest_dn is None else np.uint32)
-    light, numbers = light.reshape(-1), frame.reshape(-1)
-    # All stages work in the same few arrays: new ones for each take a third of the time of two threads.
-    arrays = np.empty((_ARRAYS, min(_BLOCK, light.size)))
-    for start in range(0, light.size, _BLOCK):
-        block = slice(start, start + _BLOCK)
-        work = arrays[:, : light[block].size]
-        expected = np.add(light[block], dark, out=work[0])
-        electrons = draw_electrons(expected, shot_rng, work[1:])
-        electrons = bend(clip_at_full_well(electrons, model, electrons), model)
-        if offset is not None:
-            electrons += offset[block]
-        electrons = add_read_noise(electrons, model, read_rng, work[0])
-        numbers[block] = quantise(amplify(electrons, model, electrons), model, electrons)
-    return frame
+    shape = np.shape(light)
+    offset = reading_offset(shape, model, read_rng)
+    light = light.reshape(-1)
+    dark = dark.reshape(-1) if isinstance(dark, np.ndarray) else dark
+    arrays = light, dark, _few(light, dark, shot_rng), offset
+    dtype = np.float64 if model.largest_dn is None else np.uint32
+    return by_pixel(_read_out, _shared(model), arrays, (shot_rng, read_rng), dtype).reshape(shape)
+
+
+def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: Any, read: Any) -> Any:
+    """All stages from the Poisson draw on, of pixels whose normal deviates are ``shot`` and ``read``."""
+    electrons = bend(clip_at_full_well(_counted(light + dark, few, shot), model), model)
+    if offset is not None:
+        electrons = electrons + offset
+    return quantise(amplify(add_read_noise(electrons, model, read), model), model)
+
+
+def _shared(model: SensorModel) -> dict[str, float | tuple[float, ...] | None]:
+    """The numbers of ``model`` that :func:`_read_out` asks it for."""
+    return {
+        "superpixel_full_well_e": model.superpixel_full_well_e,
+        "linearity": tuple(model.linearity),
+        "superpixel_read_noise_e": model.superpixel_read_noise_e,
+        "gain_dn_per_e": model.gain_dn_per_e,
+        "superpixel_black_level_dn": model.superpixel_black_level_dn,
+        "largest_dn": model.largest_dn,
+    }
 
 
 def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
@@ -220,72 +227,46 @@ def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Ge
     return None if offset is None else offset.reshape(-1)
 
 
-def draw_electrons(
-    expected: FloatArray, rng: np.random.Generator, work: Sequence[FloatArray] | FloatArray | None = None
-) -> FloatArray:
-    """Poisson electrons, float64; mean and variance are both ``expected``.
+def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Poisson electrons, float64; mean and variance are both ``expected`` (any shape).
 
     Exact below a mean of 256, and :func:`poisson_count` of normal deviates above. Above 2^53 = 9e15 not every whole
-    number is a float64.
-
-    Parameters
-    ----------
-    expected
-        mean electrons, any shape.
-    rng
-        random numbers.
-    work
-        four arrays of its shape to work in, the result among them; new ones if not given.
+    number is a float64. ``rng`` gives what is random.
     """
-    if expected.size and expected.min() >= _MANY:
-        return _many(expected, rng, work)
+    flat = np.reshape(expected, -1)
+    drawn = by_pixel(lambda _, *values: _counted(*values), {}, (flat, _few(flat, 0.0, rng)), (rng,))
+    return np.asarray(drawn.reshape(np.shape(expected)))
+
+
+def _few(light: FloatArray, dark: FloatArray | float, rng: np.random.Generator) -> FloatArray | None:
+    """Electrons of pixels that expect fewer than :data:`_MANY`, not a number elsewhere; None where no pixel does."""
+    if not light.size or light.min() + np.min(dark) >= _MANY:
+        return None
+    expected = light + dark
     few = expected < _MANY
-    if np.all(few):
-        return np.asarray(rng.poisson(expected), dtype=np.float64)
-    drawn = _many(np.maximum(expected, _MANY), rng, work)
-    drawn[few] = rng.poisson(expected[few])
-    return drawn
+    counts = np.full(expected.shape, np.nan)
+    # Of a child, so that the pixels which expect many have the same deviates whatever these have.
+    counts[few] = rng.spawn(1)[0].poisson(expected[few])
+    return counts
 
 
-def _many(expected: FloatArray, rng: np.random.Generator, work: Sequence[FloatArray] | FloatArray | None) -> FloatArray:
-    """Electrons where all ``expected`` are many; the others are those of :func:`draw_electrons`."""
-    z, *rest = np.empty((4, *np.shape(expected))) if work is None else work
-    return poisson_count(expected, rng.standard_normal(out=z), rest)
+def _counted(expected: Any, few: Any, z: Any) -> Any:
+    """Electrons of pixels, drawn before where they are ``few``, and elsewhere as probable as ``z``."""
+    many = poisson_count(expected, z)
+    return many if few is None else operations(many).select(few == few, few, many)
 
 
-def poisson_count(
-    expected: FloatArray, z: FloatArray, work: Sequence[FloatArray] | FloatArray | None = None
-) -> FloatArray:
+def poisson_count(expected: Any, z: Any) -> Any:
     """Whole number of mean ``expected``, 256 or more, as probable as the normal deviate ``z``; both of one shape.
 
     The expansion of the inverse Poisson distribution by Giles (2016, ACM Transactions on Mathematical Software 42,
     algorithm 955, Q_N2 without its last term): what :func:`poisson_quantile` has, and the term of 1/sqrt(mu), which
     holds the third cumulant and the correction for rounding. Off the law by a total variation of 4e-6 at 256, 5e-7
     at 1000, 2e-8 at 1e4; its variance by 1e-7 of it, its third moment by 7e-4.
-
-    Parameters
-    ----------
-    expected, z
-        mean electrons and normal deviates; with ``work``, z is worked in.
-    work
-        three arrays of their shape to work in, the first the result; new ones if not given.
     """
-    count, root, square = np.empty((3, *np.shape(expected))) if work is None else work
-    if work is None:
-        z = np.array(z)
-    np.square(z, out=square)
-    np.subtract(square, 1, out=count)
-    count /= 6
-    square += 2
-    square *= z
-    np.sqrt(expected, out=root)
-    z *= root
-    z += expected
-    count += z
-    root *= 72
-    square /= root
-    count -= square
-    return np.asarray(np.rint(count, out=count))
+    root = operations(expected).sqrt(expected)
+    square = z * z
+    return operations(expected).round(expected + z * root + ((square - 1) / 6 - (square + 2) * z / (72 * root)))
 
 
 def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
@@ -293,22 +274,12 @@ def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
     return np.asarray(expected + np.sqrt(expected) * z + (np.square(z) - 1) / 6)
 
 
-def clip_at_full_well(electrons: FloatArray, model: SensorModel, out: FloatArray | None = None) -> FloatArray:
-    """Electrons less those above the full well: min(N, F). Moments: `moments.clipped_moments`.
-
-    Parameters
-    ----------
-    electrons
-        any shape.
-    model
-        whose full well.
-    out
-        an array of that shape for the result; a new one if not given.
-    """
-    return np.minimum(electrons, model.superpixel_full_well_e, out=out)
+def clip_at_full_well(electrons: Any, model: Any) -> Any:
+    """``electrons`` less those above the full well of ``model``: min(N, F). Moments: `moments.clipped_moments`."""
+    return operations(electrons).minimum(electrons, model.superpixel_full_well_e)
 
 
-def bend(electrons: FloatArray, model: SensorModel) -> FloatArray:
+def bend(electrons: Any, model: Any) -> Any:
     """What ``electrons`` (any shape) are read as by a ``model`` that is not linear: N (1 + sum c_k (N/F)^k).
 
     Its moments: `moments.bent_moments`.
@@ -316,71 +287,42 @@ def bend(electrons: FloatArray, model: SensorModel) -> FloatArray:
     if not model.linearity:
         return electrons
     part = electrons / model.superpixel_full_well_e
-    factor = np.zeros_like(part)
+    factor: Any = 0.0
     for coefficient in reversed(model.linearity):
-        factor += coefficient
-        factor *= part
-    return np.asarray(electrons * (1 + factor))
+        factor = (factor + coefficient) * part
+    return electrons * (1 + factor)
 
 
-def add_read_noise(
-    electrons: FloatArray, model: SensorModel, rng: np.random.Generator, out: FloatArray | None = None
-) -> FloatArray:
+def add_read_noise(electrons: Any, model: Any, z: Any) -> Any:
     """Electrons with normal noise added; mean unchanged, variance plus sigma_d^2.
 
     Parameters
     ----------
     electrons
         any shape.
-    model, rng
-        whose read noise, and where it is drawn from.
-    out
-        an array of that shape, not the electrons', for the result; a new one if not given.
-    """
-    noise = rng.standard_normal(np.shape(electrons), out=out)
-    noise *= model.superpixel_read_noise_e
-    noise += electrons
-    return noise
-
-
-def amplify(electrons: FloatArray, model: SensorModel, out: FloatArray | None = None) -> FloatArray:
-    """Electrons times the gain K plus the black level, real-valued; variance times K^2.
-
-    Parameters
-    ----------
-    electrons
-        any shape.
     model
-        whose gain and black level.
-    out
-        an array of that shape for the result; a new one if not given.
+        whose read noise.
+    z
+        normal deviates of that shape.
     """
-    signal = np.multiply(electrons, model.gain_dn_per_e, out=out)
-    signal += model.superpixel_black_level_dn
-    return signal
+    return electrons + model.superpixel_read_noise_e * z
 
 
-def quantise(signal_dn: FloatArray, model: SensorModel, out: FloatArray | None = None) -> Digital:
-    """The ADC: nearest code to the signal, from 0 to the largest; without bits, the signal itself.
+def amplify(electrons: Any, model: Any) -> Any:
+    """``electrons`` times the gain K of ``model`` plus its black level, real-valued; variance times K^2."""
+    return electrons * model.gain_dn_per_e + model.superpixel_black_level_dn
+
+
+def quantise(signal_dn: Any, model: Any) -> Any:
+    """The ADC of ``model``: nearest code to ``signal_dn``, from 0 to the largest; without bits, the signal itself.
 
     Mean unchanged and variance plus 1/12 DN^2 (EMVA 1288 4.0, "noise model"), away from both ends and for
     noise above about half a code; elsewhere see `moments.frame_moments`.
-
-    Parameters
-    ----------
-    signal_dn
-        any shape.
-    model
-        whose ADC.
-    out
-        an array of that shape to work in; a new one if not given.
     """
     if model.largest_dn is None:
         return signal_dn
-    codes = np.rint(signal_dn, out=out)
-    np.maximum(codes, 0, out=codes)
-    np.minimum(codes, model.largest_dn, out=codes)
-    return codes.astype(np.uint32)
+    of = operations(signal_dn)
+    return of.clip(of.round(signal_dn), 0, model.largest_dn)
 
 
 def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
