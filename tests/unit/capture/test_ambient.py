@@ -341,8 +341,8 @@ def _embedded(side) -> list[np.ndarray]:  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("patterns", ["uniform", "dots:2", "dots:4", "random:4"])
 def test_the_image_is_as_good_as_noise_allows(light: Light, factors: Factors, patterns: str) -> None:
     """Within 1.5 dB of what photons and read noise allow with exact factors; and the ambient frame brings at most a
-    sixteenth of the noise. An exposure of a millisecond makes noise the only limit that counts here. Under uniform light
-    two of 150 seeds miss it, by 1.0 and 2.9 dB, where the noise has the solver choose too small a lambda.
+    sixteenth of the noise. An exposure of a millisecond makes noise the only limit that counts here. Under uniform
+    light two of 150 seeds miss it, by 1.0 and 2.9 dB, where noise has the solver choose too small a lambda.
 
     (Planted: nothing taken off; one shot instead of 16.)
     """
