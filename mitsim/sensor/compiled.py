@@ -106,6 +106,7 @@ def _run(
         for k in range(LANE)
     ]
     dr.eval(filled)
+    dr.sync_thread()
     for k, part in enumerate(filled):
         room = result[k * quarter : (k + 1) * quarter]
         room[...] = np.asarray(part)[: len(room)]
