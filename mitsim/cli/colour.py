@@ -1,4 +1,4 @@
-"""`mitsim capture --colour` and `mitsim calibrate --colour`: runs and calibrations of a projector's lines in, what the
+"""Colour of `mitsim capture`, `calibrate` and `reconstruct`: runs and calibrations of a projector's lines in, what the
 terminal shows of them out."""
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mitsim.cli.screen import finish
 from mitsim.core.colours import CALIBRATION, RUN, read_colours
 from mitsim.core.errors import MitsimError
 
@@ -65,6 +66,42 @@ def of_calibration(factors: Mapping[str, Factors], output: Path) -> tuple[dict[s
         for part in payload["channels"]
     ]
     return payload, [*lines, _last(payload)]
+
+
+def reconstruct_lines(
+    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], as_json: bool
+) -> int:
+    """The image of every line of a coloured run, and one in colour.
+
+    Parameters
+    ----------
+    run, calibration, output, chart, as_json
+        as the options of `mitsim reconstruct`.
+    options
+        those that every line is solved with.
+    """
+    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+    from mitsim.rig.chart import load_chart
+
+    # Refused before the solver and colour-science are imported.
+    for name in read_colours(run, RUN).names:
+        read_manifest(run / name, RunManifest)
+    for name in read_colours(calibration, CALIBRATION).names:
+        read_manifest(calibration / name, CalibrationManifest)
+    place = None if chart is None else load_chart(chart)
+    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.study.colours import reconstruct_colours
+
+    held = memory_from_here()
+    found = reconstruct_colours(run, calibration, output, place, **options)
+    payload = {**found.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    lines = [
+        f"{name}: {judged.quality or 'no truth to compare with'}, lambda {judged.reconstruction.lam:.3g}, residual "
+        f"{judged.reconstruction.residual:.1e}"
+        for name, judged in found.images.items()
+    ]
+    lines.append(f"colours by a matrix fitted on {found.model.fitted_on}: {found.output}")
+    return finish(as_json, payload, lines, found.warnings)
 
 
 def _percent(part: float | None) -> str:

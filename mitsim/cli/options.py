@@ -218,6 +218,12 @@ def number_of(argument: str, text: str, words: Sequence[str] = ("auto",)) -> Any
         raise ArgumentError("lam" if argument == "lambda" else argument, told) from None
 
 
+def is_given(context: typer.Context, name: str) -> bool:
+    """Whether the command line of a ``context`` names the parameter ``name``."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 @contextmanager
 def job_of(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
     """A job with limits, and progress on stderr while the context lasts.

@@ -1,0 +1,77 @@
+"""`mitsim reconstruct`: folders of a run and a calibration in; what the terminal shows of their image out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitsim.cli.colour import reconstruct_lines
+from mitsim.cli.options import Json, Quiet, Variant, number_of
+from mitsim.cli.screen import finish
+from mitsim.core.environment import DEFAULT_VARIANT
+from mitsim.core.errors import MitsimError
+
+app = typer.Typer()
+
+
+@app.command()
+def reconstruct(
+    run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
+    calibration: Annotated[Path, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
+    ] = None,
+    lam: Annotated[str, typer.Option("--lambda", help="regularisation, or auto", metavar="auto|VALUE")] = "auto",
+    method: Annotated[str, typer.Option(help="tikhonov or tv")] = "tikhonov",
+    focus: Annotated[
+        str | None,
+        typer.Option(
+            help="depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
+            metavar="auto|MM|map",
+        ),
+    ] = None,
+    chart: Annotated[
+        str | None,
+        typer.Option(
+            help="of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
+            metavar="NAME|FILE.json",
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
+    variant: Variant = DEFAULT_VARIANT,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
+    from mitsim.core.colours import is_coloured
+    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+
+    strength = number_of("lambda", lam)
+    depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
+    if is_coloured(run):
+        options = {"lam": strength, "method": method, "overwrite": overwrite, "focus": depth}
+        return reconstruct_lines(run, calibration, output or run / "reconstruction", chart, options, as_json)
+    if chart is not None:
+        raise MitsimError(f"--chart {chart}: {run} is not coloured; leave out --chart")
+    # Refused before the solver is imported, which takes half a second.
+    read_manifest(run, RunManifest)
+    read_manifest(calibration, CalibrationManifest)
+    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.study.quality import reconstruct as reconstruct_folder
+
+    held = memory_from_here()
+    result = reconstruct_folder(run, calibration, output or run / "reconstruction", strength, method, overwrite, depth)
+    payload = {**result.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    lines = [payload["status"]]
+    if result.quality is not None:
+        lines.append(str(result.quality))
+    lines.append(
+        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
+        f"residual {payload['residual']:.1e}: {payload['output']}"
+    )
+    if result.reconstruction.focus is not None:
+        lines.append(str(result.reconstruction.focus))
+    lines += result.reconstruction.trust
+    return finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))

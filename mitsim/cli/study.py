@@ -1,0 +1,103 @@
+"""`mitsim study`: a study's name and scenes in; what the terminal shows of its results out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import mitsim
+from mitsim.cli.options import (
+    Camera,
+    Defines,
+    Json,
+    Outside,
+    Patterns,
+    Projector,
+    Quiet,
+    Seed,
+    Variant,
+    bench_of,
+    job_of,
+    recipe_for,
+    scope_of,
+    swept,
+)
+from mitsim.cli.screen import finish
+from mitsim.core.environment import DEFAULT_VARIANT
+from mitsim.core.errors import MitsimError
+
+app = typer.Typer()
+
+
+@app.command()
+def study(
+    name: Annotated[str, typer.Argument(help="of the study, or merge", metavar="NAME")],
+    scenes: Annotated[
+        list[str] | None,
+        typer.Argument(help="scene XML, or the name of a shipped scene; of merge, folders", metavar="[SCENE]"),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder of the study")] = Path("study-output"),
+    patterns: Patterns = "dots:7",
+    seed: Seed = 0,
+    camera: Camera = None,
+    projector: Projector = None,
+    define: Defines = None,
+    outside: Outside = False,
+    quick: Annotated[bool, typer.Option("--quick", help="a few points, for a first look")] = False,
+    shard: Annotated[str, typer.Option(help="measure part I of N of the points", metavar="I/N")] = "1/1",
+    jobs: Annotated[int | None, typer.Option(help="processes; one a processor if not given")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Dask scheduler that measures the points")] = None,
+    over: Annotated[
+        list[str] | None, typer.Option(help="what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT")
+    ] = None,
+    measure: Annotated[str, typer.Option(help="what sweep shows: psnr, ssim, misfit, ...")] = "psnr",
+    recipe: Annotated[
+        Path | None, typer.Option(help="of calibration and drift: session recipe", metavar="FILE.toml")
+    ] = None,
+    variant: Variant = DEFAULT_VARIANT,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `colour`
+    of a ColorChecker; what `drift` between calibration and capture costs; `models` of a calibration; `sweep` of any
+    knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
+    how good a `calibration` session is, and why; `merge` joins the parts of --shard.
+    """
+    from mitsim.study import OF_NO_SCENE, find_study, is_experiment
+
+    session = recipe_for(name, recipe)
+    with job_of(quiet or as_json) as job:
+        if name == "merge":
+            from mitsim.study.campaign import merge
+
+            result: Any = merge(scenes or (), output)
+        elif is_experiment(name):
+            from mitsim.study.campaign import Where, run_experiment
+            from mitsim.study.points import Shard
+
+            scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
+            scope = swept(name, replace(scope, seeds=(seed,)), patterns, over or (), measure)
+            scope = replace(scope, recipe=str(recipe) if recipe else None)
+            result = run_experiment(name, scope, output, job, Where(Shard.of(shard), jobs, scheduler))
+        else:
+            run_study = find_study(name, **({"recipe": session} if session else {}))
+            request = mitsim.Request.of(patterns=patterns, seed=seed)
+            bench = None
+            if name in OF_NO_SCENE:
+                if scenes:
+                    raise MitsimError(f"study {name} {' '.join(scenes)}: it is of no scene; leave the scene out")
+            else:
+                with job.clock.stage("open scene"):
+                    bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
+            result = run_study(bench, output, request, job)
+    return finish(as_json, result.payload(), result.lines(), ())
+
+
+def _only(scenes: list[str] | None) -> str | None:
+    """The scene that is studied, where one is given; MitsimError for several."""
+    if scenes and len(scenes) > 1:
+        raise MitsimError(f"{' '.join(scenes)}: give one scene")
+    return scenes[0] if scenes else None
