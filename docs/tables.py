@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from mitsim.core.colours import ColourManifest, Line
-from mitsim.core.imagefile import Raw
+from mitsim.core.imagelist import Raw
 from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,

@@ -39,6 +39,19 @@ FACE = GROUND | STAGES | {"capture", "study"}
 """Rooms whose names the face may give to type checkers."""
 MITSUBA_ROOMS = ("mitsim.scene", "mitsim.transport", "mitsim.capture", "mitsim.core.environment")
 RENDERER = {"mitsuba", "drjit"}
+CHECKS_A_REQUEST = (
+    "mitsim.cli",
+    "mitsim.capture.request",
+    "mitsim.core.manifests",
+    "mitsim.core.imagelist",
+    "mitsim.rig.sensor",
+    "mitsim.rig.recipe",
+    "mitsim.rig.framelist",
+    "mitsim.exchange.export",
+    "mitsim.exchange.load",
+    "mitsim.exchange.known",
+)
+"""What looks at words, manifests and lists before work begins."""
 
 
 def imports_of(module: str, source: str | ast.AST, is_package: bool) -> list[str]:
@@ -160,9 +173,48 @@ def test_importing_mitsim_imports_nothing_else() -> None:
 
 def test_what_checks_a_request_imports_no_numpy() -> None:
     """Half the time of a refusal would be numpy's."""
-    rooms = "mitsim.cli, mitsim.capture.request, mitsim.core.manifests, mitsim.rig.sensor, mitsim.rig.recipe"
+    rooms = ", ".join(CHECKS_A_REQUEST)
     program = f"import sys, {rooms}; assert 'numpy' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_refusal_imports_no_numpy(tmp_path: Path) -> None:
+    """Of a missing folder, a bad manifest, and words that are not known. (Planted: the name of the patterns read by
+    `parse_patterns`; the manifest of export read by `packed_run`.)"""
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "manifest.json").write_text("{}")
+    (tmp_path / "bad" / "session.toml").write_text("n = 4")
+    frames = "import bad -o r --camera imx249 --exposure 1"
+    refused = (
+        "export none --format hdf5 -o x.h5",
+        "export bad --format hdf5 -o x.h5",
+        "export bad --format hdf6 -o x.h5",
+        "import none -o r",
+        "import none.mat -o r",
+        "import none.h5 -o r",
+        f"{frames} --patterns dots:3 --calibration bad",
+        f"{frames} --patterns dotz:3 --projector-pixels 8",
+        f"{frames} --patterns dots:3 --projector-pixels 8",
+        f"{frames} --patterns none.json --projector-pixels 8",
+        "calibrate --frames none -o c",
+        "calibrate --frames bad -o c",
+        "calibrate photograph --model wave --frames bad -o c",
+        "reconstruct bad --calibration bad",
+    )
+    program = f"""
+import sys
+from mitsim.cli import run
+for line in {refused!r}:
+    sys.argv = ["mitsim", *line.split()]
+    try:
+        run()
+    except SystemExit as ended:
+        assert ended.code == 2, line
+    assert 'numpy' not in sys.modules, line
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("mitsim: ") == len(refused)
 
 
 def test_importing_every_module_selects_no_variant_and_touches_no_global_state() -> None:

@@ -116,8 +116,8 @@ def import_(
             raise MitsimError(f"{source}: says itself what its frames are; leave the options of frames out")
         payload = import_file(source, output, calibration_output, channel)
     else:
-        from mitsim.core.imagefile import Raw
-        from mitsim.exchange.real import RealCapture, import_frames
+        from mitsim.core.imagelist import Raw
+        from mitsim.exchange.known import RealCapture
 
         if output is None or calibration_output is not None:
             raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
@@ -128,7 +128,11 @@ def import_(
         if patterns is None or camera is None or exposure is None:
             raise AssertionError  # refused above
         more = calibration, projector_pixels, black_level, ambient_frame, ambient_shots, raw, channel, seed
-        payload = import_frames(source, output, RealCapture(patterns, camera, exposure, *more))
+        known = RealCapture(patterns, camera, exposure, *more)
+        known.check(source)  # refused before numpy is imported
+        from mitsim.exchange.real import import_frames
+
+        payload = import_frames(source, output, known)
     lines = []
     if payload["output"]:
         lines.append(f"{payload['frames']} frames: {payload['output']}")

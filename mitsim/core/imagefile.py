@@ -6,28 +6,25 @@ Nothing is scaled, inverted or made grey: a file whose numbers its reader would 
 from __future__ import annotations
 
 import math
-import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.plainfile import MOST_SIDE, check_plain
+from mitsim.core.errors import MitsimError
+from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
+from mitsim.core.plainfile import check_plain
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 Numbers = npt.NDArray[Any]
 """(rows, columns) numbers of a picture: whole, or real; where colours are wanted, (rows, columns, 3 or 4)."""
-_BARE = (".raw", ".bin", ".dat")
-"""Endings of files without a header."""
 _SIGNATURE, _HEAD = b"\x89PNG\r\n\x1a\n", 26
 """First bytes of a PNG, and bytes up to its colour type (ISO/IEC 15948, 5.2 and 11.2.2)."""
 _PNG_BITS = (1, 2, 4, 8, 16)
@@ -40,85 +37,8 @@ _BLACK_IS_ZERO, _RGB = 1, 2
 """PhotometricInterpretation of files that are read; 0 stores black as the largest number."""
 _UNSIGNED = 1
 """SampleFormat of whole numbers from 0, which is also meant where the tag is missing."""
-_Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
 _CHANNEL = "DN"
 """Channel of an OpenEXR file of several that is read."""
-
-
-class Raw(BaseModel):
-    """How files without a header (`.raw`, `.bin`, `.dat`) are read."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-    shape: tuple[_Side, _Side] = Field(strict=False, description="rows and columns")
-    bits: int = Field(ge=1, le=32, description="of a number; up to 8 take a byte, up to 16 two, up to 32 four")
-    byte_order: Literal["little", "big"] = Field("little", description="which byte of a number comes first")
-
-    @classmethod
-    def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:
-        """From what the command line says.
-
-        Parameters
-        ----------
-        shape
-            ROWSxCOLUMNS.
-        bits, byte_order
-            as the class has them.
-
-        Raises
-        ------
-        MitsimError
-            for what is none.
-        """
-        sides = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", shape)
-        if not sides or not all(0 < int(side) <= MOST_SIDE for side in sides.groups()):
-            raise ArgumentError("shape", f"{shape!r}: give ROWSxCOLUMNS, 1 to {MOST_SIDE} each")
-        if bits is None or not 1 <= bits <= 32:
-            raise ArgumentError("bits", f"{bits}: give the bits of a number in such a file, 1 to 32")
-        if byte_order not in ("little", "big"):
-            raise ArgumentError("byte_order", f"{byte_order!r}: use little or big")
-        return cls(
-            shape=(int(sides[1]), int(sides[2])), bits=bits, byte_order="big" if byte_order == "big" else "little"
-        )
-
-    @property
-    def kind(self) -> np.dtype[Any]:
-        """The type of a number."""
-        width = 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
-        return np.dtype(f"{'<' if self.byte_order == 'little' else '>'}u{width}")
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What pictures are of, and which of them are read.
-
-    Attributes
-    ----------
-    what
-        that they are of, for messages.
-    most
-        pixels a side.
-    bits
-        of a number in PNG and TIFF files. Frames have none of 2 and 4, which Pillow spreads over 0 to 255.
-    colour
-        whether red, green and blue of 8 bits are read too.
-    raw
-        how files without a header are read; None: such files are refused.
-    """
-
-    what: str = "frame"
-    most: int = MOST_SIDE
-    bits: Sequence[int] = (8, 12, 16, 32)
-    colour: bool = False
-    raw: Raw | None = None
-
-    def refusal(self, path: Path, reason: str) -> MitsimError:
-        """A line that says for what ``reason`` the file ``path`` is not read."""
-        return MitsimError(f"{self.what} {path}: {reason}")
-
-
-FRAME = Wanted()
-"""Frames of a camera, in files with a header."""
 
 
 @dataclass(frozen=True)
@@ -128,32 +48,6 @@ class _Found:
     pages: int
     size: tuple[int, int]
     read: Callable[[], Iterator[Numbers]]
-
-
-def image_files(source: Path, wanted: Wanted = FRAME) -> tuple[Path, ...]:
-    """Pictures in a folder, in the order of the numbers in their names: shot 10 comes after shot 9.
-
-    Parameters
-    ----------
-    source
-        the folder; or a file, which is then all.
-    wanted
-        files without a header count where they can be read.
-
-    Raises
-    ------
-    MitsimError
-        where there is none.
-    """
-    if not source.is_dir():
-        check_plain(source, wanted.what)
-        return (source,)
-    endings = tuple(ending for ending in _READERS if wanted.raw or ending not in _BARE)
-    files = [path for path in source.iterdir() if path.suffix.lower() in endings and not path.name.startswith(".")]
-    if not files:
-        bare = "" if wanted.raw else f"; {', '.join(_BARE)} count where shape and bits are stated"
-        raise MitsimError(f"{source}: holds no file that ends in {', '.join(endings)}{bare}")
-    return tuple(sorted(files, key=_natural))
 
 
 def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
@@ -343,12 +237,8 @@ def _bare(path: Path, wanted: Wanted) -> _Found:
 
 
 _READERS: dict[str, Callable[[Path, Wanted], _Found]] = {
-    ".png": _png,
-    ".tif": _tiff,
-    ".tiff": _tiff,
-    ".npy": _npy,
-    ".exr": _exr,
-    **dict.fromkeys(_BARE, _bare),
+    **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr), strict=True)),
+    **dict.fromkeys(BARE, _bare),
 }
 """What looks into a file, by the end of its name in small letters."""
 
@@ -385,9 +275,3 @@ def _told(path: Path, wanted: Wanted) -> Iterator[None]:
         raise wanted.refusal(
             path, f"cannot be read: damaged, or of another kind than its name says ({reason}); write or copy it again"
         ) from error
-
-
-def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """A key by which shot 10 comes after shot 9."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts], path.name

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.core.errors import ArgumentError
-from mitsim.core.manifests import CalibrationManifest, RunManifest
+from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.output import prepare_output
-from mitsim.exchange.packed import Packed, packed_calibration, packed_run
 
-Run = Packed[RunManifest]
-Calibration = Packed[CalibrationManifest]
+if TYPE_CHECKING:
+    from mitsim.exchange.packed import Packed
+
+    Run = Packed[RunManifest]
+    Calibration = Packed[CalibrationManifest]
 Written = tuple[str, ...]
 """Sentences on what of the run the format does not hold, or how it is used."""
 
@@ -141,11 +143,17 @@ def export_run(
         raise ArgumentError("calibration", f"is not given, and {format} is of its factors; give a folder of it")
     if calibration is not None and chosen.calibration == "none":
         raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
-    shots = packed_run(Path(run))
-    factors = None if calibration is None else packed_calibration(Path(calibration))
+    # Refused before numpy is imported.
+    read_manifest(Path(run), RunManifest)
+    if calibration is not None:
+        read_manifest(Path(calibration), CalibrationManifest)
     place = Path(output)
     if chosen.kind == "file":
         prepare_output(place, overwrite, "file")
+    from mitsim.exchange.packed import packed_calibration, packed_run
+
+    shots = packed_run(Path(run))
+    factors = None if calibration is None else packed_calibration(Path(calibration))
     notes = chosen.write(place, shots, factors, projector)
     return {
         "format": format,

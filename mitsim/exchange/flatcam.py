@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channels, Metadata
 from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest, ShotFile
 from mitsim.exchange.matlab import (
@@ -30,9 +30,7 @@ from mitsim.exchange.matlab import (
     write_variables,
 )
 from mitsim.exchange.packed import FACTORS, Packed, checked_channel, shots_of, unpacked_run
-
-PLANES = {"r": (1, 1), "gb": (0, 1), "gr": (1, 0), "b": (0, 0)}
-"""First row and first column of each plane of a frame."""
+from mitsim.exchange.planes import PLANES, check_channel
 
 
 def write_flatcam(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest]) -> None:
@@ -99,7 +97,7 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
     path
         of the file, with `P1*` and `Q1*`.
     channel
-        a key of :data:`PLANES`.
+        a key of :data:`mitsim.exchange.planes.PLANES`.
 
     Returns
     -------
@@ -111,8 +109,7 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
     MitsimError
         for a file without that plane.
     """
-    if channel not in PLANES:
-        raise ArgumentError("channel", f"{channel!r}: use {', '.join(PLANES)}")
+    check_channel(channel)
     variables = read_variables(path)
     found = {name: f"{stem}{channel}" for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
     sides = {

@@ -6,12 +6,16 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import ArgumentError
-from mitsim.core.manifests import CalibrationManifest, RunManifest
 from mitsim.core.output import whole_folder
-from mitsim.exchange.packed import Packed
+from mitsim.core.plainfile import check_plain
+from mitsim.exchange.planes import check_channel
+
+if TYPE_CHECKING:
+    from mitsim.core.manifests import CalibrationManifest, RunManifest
+    from mitsim.exchange.packed import Packed
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +90,9 @@ def import_file(
     MitsimError
         for a file that is none or is damaged, a part that it does not hold, or a place that holds something.
     """
+    check_plain(source)  # refused before numpy is imported
+    if channel is not None:
+        check_channel(channel)
     with READERS[source.suffix.lower()](source, channel) as loaded:
         wanted = {"output": (output, loaded.run), "calibration_output": (calibration_output, loaded.calibration)}
         for argument, (place, held) in wanted.items():

@@ -15,75 +15,21 @@ import numpy.typing as npt
 from mitsim.core.configuration import locate, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import Channel, Channels, Metadata, checksum
-from mitsim.core.imagefile import Numbers, Raw, Wanted, image_files, read_images
+from mitsim.core.imagefile import Numbers, read_images
+from mitsim.core.imagelist import image_files
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest
 from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.core.versions import versions
-from mitsim.exchange.flatcam import PLANES
+from mitsim.exchange.known import RealCapture
 from mitsim.exchange.packed import FACTORS, Packed, packed_calibration
+from mitsim.exchange.planes import PLANES
 from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import PatternFamily, parse_patterns
-from mitsim.rig.sensor import SensorModel, check_exposure, load_sensor
+from mitsim.rig.sensor import SensorModel, load_sensor
 
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
-
-
-@dataclass(frozen=True)
-class RealCapture:
-    """What a person knows of a real capture.
-
-    Attributes
-    ----------
-    patterns
-        name of the family, or `patterns.json` of `mitsim export --format png`.
-    camera
-        electronics: name of a shipped file, or a TOML file.
-    exposure_s
-        of every frame [s].
-    calibration
-        CAL folder of the same camera, which tells its identity and the projector's pixels.
-    n
-        projector pixels a side, without a calibration.
-    black_level_dn
-        digital number of a (binned) pixel without charge, where it is another than the camera file's.
-    ambient
-        frame, or folder of frames, with the projector off.
-    ambient_shots
-        that the single frame is the mean of.
-    raw
-        how files without a header are read.
-    channel
-        plane of a colour sensor's frames that is taken, a key of :data:`mitsim.exchange.flatcam.PLANES`.
-    seed
-        of patterns of a `random` family.
-    """
-
-    patterns: str
-    camera: str
-    exposure_s: float
-    calibration: Path | None = None
-    n: int | None = None
-    black_level_dn: float | None = None
-    ambient: Path | None = None
-    ambient_shots: int | None = None
-    raw: Raw | None = None
-    channel: str | None = None
-    seed: int = 0
-
-    @property
-    def wanted(self) -> Wanted:
-        """How its files are read."""
-        return Wanted(raw=self.raw)
-
-    def check(self) -> None:
-        """MitsimError for values that cannot be, before any file is read."""
-        check_exposure(self.exposure_s)
-        if self.channel is not None and self.channel not in PLANES:
-            raise ArgumentError("channel", f"{self.channel!r}: use {', '.join(PLANES)}")
-        if self.ambient_shots is not None and (self.ambient is None or self.ambient_shots < 1):
-            raise ArgumentError("ambient_shots", f"{self.ambient_shots}: give 1 or more, of an ambient frame")
 
 
 def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, Any]:
@@ -110,7 +56,7 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
         for values that cannot be, frames that are missing, too many, unlike each other or beyond the camera's range, or
         a place that holds something.
     """
-    known.check()
+    known.check(source)
     sensor = load_sensor(locate(known.camera, "calibration", ".toml"))
     fit = _Fit.of(known)
     digital = digital_of(sensor, known.exposure_s)
@@ -179,9 +125,7 @@ class _Fit:
     def of(cls, known: RealCapture) -> _Fit:
         if known.calibration is None:
             if known.n is None:
-                raise ArgumentError(
-                    "calibration", "is not given, and patterns need its projector; give it, or --projector-pixels"
-                )
+                raise AssertionError  # refused by RealCapture.check
             return cls(None, None, (known.n, known.n))
         calibration: Packed[CalibrationManifest] = packed_calibration(known.calibration)
         left, right = (calibration.read(name)[0]["factor"].shape for name in FACTORS)
@@ -316,7 +260,7 @@ def _ambient(known: RealCapture, sensor: SensorModel, fit: _Fit) -> tuple[npt.ND
 
 def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
     """Patterns of the shots, in their files, for a scene of so many projector pixels."""
-    if Path(known.patterns).suffix == ".json":
+    if known.in_file:
         data = read_json(known.patterns)
         if not isinstance(data, dict) or "shots" not in data:
             raise MitsimError(f"{known.patterns}: has no shots; give patterns.json of `mitsim export --format png`")

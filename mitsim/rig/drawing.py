@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.imagefile import Wanted, own_end, read_image
+from mitsim.core.imagefile import own_end, read_image
+from mitsim.core.imagelist import Wanted
 from mitsim.rig.plate import LARGEST
 
 _DRAWING = Wanted("mask drawing", most=LARGEST, bits=(1, 2, 4, 8, 16, 32))

@@ -16,11 +16,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, mo
 
 from mitsim.core.configuration import Positive, read_toml, validated
 from mitsim.core.errors import MitsimError
-from mitsim.core.imagefile import Raw, Wanted, image_files
+from mitsim.core.imagelist import Raw, Wanted, image_files
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
+from mitsim.rig.hadamard import stripe_count
 from mitsim.rig.order import UNIFORM, Half, Side, taken
-from mitsim.rig.patterns import stripe_count
 from mitsim.rig.recipe import MOST_REPEATS, MOST_RUNGS, Exposures, Merge
 
 LISTS = ("session.toml", "session.json")

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels
-from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.rig.families import read_name
+from mitsim.rig.hadamard import stripe_count, way_to
 
 PatternFactor = npt.NDArray[np.int8]
 """(n, K) of 0/1 or +-1: one side of K separable patterns."""
@@ -139,65 +139,34 @@ def _random_binary(n: int, k: int, seed: int, side: str) -> PatternFactor:
 def hadamard_matrix(order: int) -> PatternFactor:
     """(``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones.
 
-    Built from Sylvester's doubling and Paley's two constructions over prime fields (R. Paley, 1933), and their
-    Kronecker products; :func:`hadamard_orders` lists what that covers (every multiple of 4 up to 48, then gaps).
-
-    Raises
-    ------
-    MitsimError
-        for an order that these constructions do not reach, with the nearest ones that they do.
+    Built as :mod:`mitsim.rig.hadamard` says, whose errors it raises.
     """
-    matrix = _construct(order)
-    if matrix is None:
-        below = max((o for o in hadamard_orders(order) if o < order), default=1)
-        above = next(o for o in range(order + 1, 4 * order + 5) if _construct(o) is not None)
-        raise MitsimError(f"no Hadamard matrix of order {order} is available; use {below} or {above}")
+    matrix = _built(order)
     return (matrix * matrix[:, :1]).astype(np.int8)
 
 
 def stripe_signs(n: int) -> PatternFactor:
     """(``n``, N) first rows of the smallest Hadamard matrix that has them; column 0 is all +1.
 
-    The +-1 patterns of a calibration's stripes. MitsimError where no order up to 2 n can be built.
+    The +-1 patterns of a calibration's stripes. MitsimError as :func:`mitsim.rig.hadamard.stripe_count`.
     """
     return hadamard_matrix(stripe_count(n))[:n]
 
 
-def stripe_count(n: int) -> int:
-    """N, the stripe patterns of a side for ``n`` projector pixels; MitsimError as :func:`stripe_signs`."""
-    for order in range(n, 2 * n + 1):  # with a power of two among them
-        if _construct(order) is not None:
-            return order
-    raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
-
-
-def hadamard_orders(limit: int) -> list[int]:
-    """Orders up to ``limit`` that :func:`hadamard_matrix` can build."""
-    return [order for order in range(1, limit + 1) if _construct(order) is not None]
-
-
-def _construct(order: int) -> npt.NDArray[np.int64] | None:
-    if order < 1 or (order > 2 and order % 4):
-        return None
-    if order & (order - 1) == 0:
+def _built(order: int) -> npt.NDArray[np.int64]:
+    how, number = way_to(order)
+    if how == "doubled":
         # Not scipy.linalg.hadamard: importing it takes longer than all else that a refusal needs.
         doubled = np.ones((1, 1), dtype=np.int64)
         while len(doubled) < order:
             doubled = np.kron([[1, 1], [1, -1]], doubled)
         return doubled
-    if _is_prime(order - 1) and (order - 1) % 4 == 3:
-        skew = _conference(order - 1)
-        return skew + np.eye(order, dtype=np.int64)
-    half = order // 2
-    if _is_prime(half - 1) and (half - 1) % 4 == 1:
-        symmetric, eye = _conference(half - 1), np.eye(half, dtype=np.int64)
+    if how == "skew":
+        return _conference(number) + np.eye(order, dtype=np.int64)
+    if how == "symmetric":
+        symmetric, eye = _conference(number), np.eye(number + 1, dtype=np.int64)
         return np.kron(symmetric, [[1, 1], [1, -1]]) + np.kron(eye, [[1, -1], [-1, -1]])
-    for factor in range(2, order // 2 + 1):
-        if order % factor == 0:
-            left, right = _construct(factor), _construct(order // factor)
-            if left is not None and right is not None:
-                return np.kron(left, right)
-    return None
+    return np.kron(_built(number), _built(order // number))
 
 
 def _conference(q: int) -> npt.NDArray[np.int64]:
@@ -210,10 +179,6 @@ def _conference(q: int) -> npt.NDArray[np.int64]:
     matrix[1:, 0] = 1 if q % 4 == 1 else -1
     matrix[1:, 1:] = jacobsthal
     return matrix
-
-
-def _is_prime(value: int) -> bool:
-    return value > 1 and all(value % factor for factor in range(2, int(value**0.5) + 1))
 
 
 _SAME_BOTH_SIDES: dict[str, Callable[[int, int], PatternFactor]] = {

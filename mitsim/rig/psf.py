@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.imagefile import Wanted, image_size, read_image
+from mitsim.core.imagefile import image_size, read_image
+from mitsim.core.imagelist import Wanted
 
 _PICTURE = Wanted("point spread function", colour=True)
 _MOST_PIXELS = 2**26

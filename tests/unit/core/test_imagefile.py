@@ -16,7 +16,8 @@ from PIL import Image, PngImagePlugin
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
-from mitsim.core.imagefile import Raw, Wanted, image_files, image_size, own_end, read_image, read_images
+from mitsim.core.imagefile import image_size, own_end, read_image, read_images
+from mitsim.core.imagelist import Raw, Wanted, image_files
 
 NUMBERS = (np.arange(35).reshape(5, 7) * 113).astype(np.uint16)
 LARGE = np.arange(35, dtype=np.uint32).reshape(5, 7) * 120_000_000

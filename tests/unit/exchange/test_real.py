@@ -16,9 +16,10 @@ from PIL import Image
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
-from mitsim.core.imagefile import Raw
+from mitsim.core.imagelist import Raw
 from mitsim.exchange.export import export_run
-from mitsim.exchange.real import LEFT_OUT, RealCapture, import_frames
+from mitsim.exchange.known import RealCapture
+from mitsim.exchange.real import LEFT_OUT, import_frames
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made
 
 ELECTRONICS = f"""

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.rig.patterns import Lighting, hadamard_matrix, hadamard_orders, parse_patterns
+from mitsim.rig.hadamard import hadamard_orders
+from mitsim.rig.patterns import Lighting, hadamard_matrix, parse_patterns
 
 FAMILIES = [
     "uniform",
