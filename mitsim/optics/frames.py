@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray
@@ -184,6 +185,8 @@ class ExpectedFrames:
         self._shares = np.eye(classes) if self._mixed else self._weights
         least = self._least = self._weights.min(axis=0)
         self._own = sparse.csr_array(self._weights - least)
+        self._of_classes = _Mixture(self._weights, self._least, self._own)
+        self._pairs = _paired(self._weights) if self._mixed and self._own.nnz > _FEW * shots else None
         if self._mixed or shots < 2 or 2 * np.count_nonzero(self._weights == least) < self._weights.size:
             least = np.zeros(classes)
         self._leak = sparse.csr_array(sparse.csr_array(least[None]) @ indicator) if least.any() else None
@@ -226,17 +229,19 @@ class ExpectedFrames:
         step = at_once(self._pixels)
         if not self._mixed:
             for start in range(0, len(self), step):
-                yield from self._frames(*self._form(start, min(start + step, len(self))))
+                irradiance, probed = self._form(start, min(start + step, len(self)))
+                yield from self._frames(list(irradiance), list(probed))
             return
         if self._formed is None:
             self._formed = self._form(0, self._basis.shape[0])
-        irradiance, probed = self._formed
+            if self._pairs is not None:
+                chosen, (irradiance, probed) = self._pairs[0], self._formed
+                # The classes' frames are not needed any more, and their probes may be another's.
+                self._formed = _mix(chosen, irradiance, irradiance[: len(chosen)]), _mix(chosen, probed)
+        (irradiance, probed), mixture = self._formed, self._pairs[1] if self._pairs else self._of_classes
         for start in range(0, len(self), step):
             stop = min(start + step, len(self))
-            if np.array_equal(self._weights, np.eye(len(self))):
-                yield from self._frames(irradiance[start:stop], probed[start:stop])
-            else:
-                yield from self._frames(*(self._shots_of(basis, start, stop) for basis in self._formed))
+            yield from self._frames(mixture.shots(irradiance, start, stop), mixture.shots(probed, start, stop))
 
     def sampling_error(self) -> tuple[float, float]:
         """Relative Monte Carlo error of all frames, and what it is below at 95 %, without forming any.
@@ -273,7 +278,7 @@ class ExpectedFrames:
         """(shots, pixels * groups * probes) frames of single groups as random signs see them."""
         classes, weights = self.probed, self._weights[start:stop]
         if classes is not None:
-            probed = self._shots_of(classes, start, stop)
+            probed = np.stack(self._of_classes.shots(classes, start, stop))
         else:
             probed = _formed(self._lights, self._basis[start:stop], self._probes, False)[1]
             if self._leak_formed is not None:
@@ -284,27 +289,6 @@ class ExpectedFrames:
         if self._ambient:
             probed += _formed(self._ambient, _ALL, self._probes, False)[1][0]
         return probed
-
-    def _shots_of(self, basis: FloatArray, start: int, stop: int) -> FloatArray:
-        """(shots, ...) sums of a ``basis`` (classes, ...) as the shots from ``start`` to ``stop`` light the classes."""
-        if self._own.nnz > _FEW * len(self):
-            return _mix(self._weights[start:stop], basis)
-        common = _mix(self._least[None], basis)[0] if self._least.any() else None
-        mixed = np.zeros((stop - start, *basis.shape[1:]))
-
-        def add(shot: int) -> None:
-            total = mixed[shot - start]
-            classes, weights = _row(self._own, shot)
-            for place, (number, weight) in enumerate(zip(classes, weights, strict=True)):
-                if place:
-                    total += weight * basis[number]
-                else:
-                    np.multiply(basis[number], weight, out=total)
-            if common is not None:
-                total += common
-
-        in_threads(add, range(start, stop))
-        return mixed
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) those of groups as signs see them.
@@ -343,8 +327,8 @@ class ExpectedFrames:
     def _pixels(self) -> int:
         return self._lights[0].optics.pixels
 
-    def _frames(self, irradiance: FloatArray, probes: FloatArray) -> list[Frame]:
-        """Frames (b, pixels, pixels) of light with what is in all of them, and their variance by ``probes``."""
+    def _frames(self, irradiance: Sequence[FloatArray], probes: Sequence[FloatArray]) -> list[Frame]:
+        """Frames (pixels, pixels) of light with what is in all of them, and their variance by ``probes``."""
         ambient = self._ambient_formed
         count = self._groups
         pairs = count * (count - 1)
@@ -430,10 +414,90 @@ def _probes(pixels: int, seed: int) -> FloatArray:
     return np.concatenate([constant, signs - constant @ (constant.T @ signs)], axis=1)
 
 
-def _mix(weights: FloatArray, basis: FloatArray) -> FloatArray:
-    """(shots, ...) sums of (B, ...) basis arrays by weights (shots, B)."""
+@dataclass(frozen=True, eq=False)
+class _Mixture:
+    """Shots as sums of frames that are held.
+
+    Attributes
+    ----------
+    weights
+        (shots, b) of each held frame in each shot.
+    least
+        (b,) parts of them that all shots have and are added once.
+    own
+        the weights less these.
+    """
+
+    weights: FloatArray
+    least: FloatArray
+    own: sparse.csr_array
+
+    def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
+        """Those from ``start`` to ``stop``, of the held frames ``basis`` (b, ...); some may be of the basis itself."""
+        if self.own.nnz > _FEW * len(self.weights):
+            return list(_mix(self.weights[start:stop], basis))
+        common = _mix(self.least[None], basis)[0] if self.least.any() else None
+
+        def added(shot: int) -> FloatArray:
+            numbers, weights = _row(self.own, shot)
+            if common is None and list(weights) == [1]:
+                return np.asarray(basis[numbers[0]])
+            total = np.zeros(basis.shape[1:]) if common is None else common.copy()
+            for number, weight in zip(numbers, weights, strict=True):
+                if weight == -1:
+                    total -= basis[number]
+                else:
+                    total += basis[number] if weight == 1 else weight * basis[number]
+            return total
+
+        return in_threads(added, range(start, stop))
+
+
+def _paired(weights: FloatArray) -> tuple[FloatArray, _Mixture] | None:
+    """Shots of which all others are one, or what one leaves of the light of all pixels; and all shots by these.
+
+    Patterns of +1 and -1 are shown as two shots that add up to the light of all pixels (of Hadamard patterns the first
+    is that light), so half of the shots need no product of matrices. None where ``weights`` (shots, classes) have
+    other values than two, or more pairs of shots than classes.
+    """
+    low, high = float(weights.min()), float(weights.max())
+    lit = weights == high
+    if not low < high or np.any(weights[~lit] != low):
+        return None
+    chosen: dict[bytes, int] = {}
+    kept: list[npt.NDArray[np.bool_]] = []
+    numbers, left = np.zeros(len(weights), int), np.zeros(len(weights), bool)
+    for shot, row in enumerate(lit):
+        key, other = row.tobytes(), (~row).tobytes()
+        if key not in chosen and other not in chosen:
+            chosen[key if row.any() else other] = len(kept)
+            kept.append(row if row.any() else ~row)
+        left[shot] = key not in chosen
+        numbers[shot] = chosen[other if left[shot] else key]
+    everything = chosen.get(np.ones(weights.shape[1], bool).tobytes())
+    if everything is None or len(kept) > weights.shape[1]:
+        return None
+    by_pair = np.zeros((len(weights), len(kept)))
+    by_pair[left, everything] = (low + high) / high
+    by_pair[np.arange(len(weights)), numbers] += np.where(left, -1.0, 1.0)
+    mixture = _Mixture(by_pair, np.zeros(len(kept)), sparse.csr_array(by_pair))
+    return np.where(np.array(kept), high, low), mixture
+
+
+def _mix(weights: FloatArray, basis: FloatArray, out: FloatArray | None = None) -> FloatArray:
+    """(shots, ...) sums of a basis by weights.
+
+    Parameters
+    ----------
+    weights
+        (shots, b).
+    basis
+        (b, ...) arrays.
+    out
+        (shots, ...) for the result, which may be the first of the basis itself; a new array if not given.
+    """
     flat = basis.reshape(len(basis), -1)
-    mixed = np.empty((len(weights), flat.shape[1]))
+    mixed = np.empty((len(weights), flat.shape[1])) if out is None else out.reshape(len(weights), -1)
 
     def part(start: int) -> None:
         inside = slice(start, start + _COLUMNS)

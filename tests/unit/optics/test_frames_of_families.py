@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import sparse
+from scipy.linalg import hadamard
 
 from mitsim.optics import frames as frames_module
 from mitsim.optics.closed_form import FrameOptics
@@ -10,6 +11,7 @@ from mitsim.optics.frames import (
     ClassFrames,
     ExpectedFrames,
     Filed,
+    _paired,
     _product,
     at_once,
     formed_frames,
@@ -237,3 +239,54 @@ def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
         expected = plain.irradiance + row[1] * brought[0] + row[3] * brought[1]
         assert np.allclose(found.irradiance, expected, rtol=1e-10)
         assert found.variance == pytest.approx(plain.variance, rel=1e-12)
+
+
+# ---- shots that leave one another of the light of all pixels
+
+
+@pytest.mark.parametrize("low", [0.0, 0.01])
+def test_shots_of_signed_patterns_are_pairs(low: float) -> None:
+    """All +-1 patterns of order 8, with black pixels that are dark and that leak: half of the shots are kept, and these
+    make up all. (Planted: the second of a pair not turned; what leaks left out; the light of all pixels not found.)"""
+    signs = hadamard(8)
+    lit = np.stack([signs > 0, signs < 0], axis=1).reshape(16, 8)
+    weights = np.where(lit, 1.0, low)
+    kept, mixture = _paired(weights)  # type: ignore[misc]
+    assert kept.shape == (8, 8)
+    assert np.abs(mixture.weights @ kept - weights).max() < 1e-15
+    assert mixture.own.nnz <= 2 * len(weights)
+    basis = np.random.default_rng(1).random((8, 3, 5))
+    pairs = np.tensordot(kept, basis, axes=1)
+    for start, stop in ((0, 16), (5, 9)):
+        shots = np.stack(mixture.shots(pairs, start, stop))
+        assert np.abs(shots - np.tensordot(weights[start:stop], basis, axes=1)).max() < 1e-14
+
+
+@pytest.mark.parametrize("name", ["three values", "no light of all", "more pairs than classes", "one value"])
+def test_other_shots_are_not_pairs(name: str) -> None:
+    weights = {
+        "three values": np.array([[1.0, 1, 1], [1, 0, 0.5], [0, 1, 0.5]]),
+        "no light of all": np.array([[1.0, 1, 0], [0, 0, 1], [0, 1, 1]]),
+        "more pairs than classes": np.concatenate([np.ones((1, 3)), np.eye(3)]),
+        "one value": np.ones((2, 2)),
+    }[name]
+    assert _paired(weights) is None
+
+
+def test_frames_of_pairs_are_those_of_classes() -> None:
+    """Signed patterns through a camera, asked for twice; the probes of another family are left as they were. (Planted:
+    probes mixed in place.)"""
+    signs = hadamard(16)
+    weights = np.stack([signs > 0, signs < 0], axis=1).reshape(32, 16).astype(float)
+    optics, groups = small_optics(), random_groups(3, 7, spread=0.1)
+    labels = np.arange(PIXELS)
+    paired = expected_frames(optics, groups, labels, weights, 5)
+    probed = np.array(paired.probed)
+    first, again = list(paired), list(paired)
+    mean = sum(groups[1:], groups[0]) / 3
+    for one, other, row in zip(first, again, weights, strict=True):
+        plain = optics.frame(np.arange(CELLS**2), np.asarray(row @ mean.toarray()))
+        assert np.abs(one.irradiance - plain).max() < 1e-12 * max(np.abs(plain).max(), 1e-9)
+        assert np.array_equal(one.irradiance, other.irradiance) and one.variance == other.variance
+    assert np.array_equal(paired.probed, probed)
+    assert paired._pairs is not None
