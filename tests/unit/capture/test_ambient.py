@@ -340,17 +340,22 @@ def _embedded(side) -> list[np.ndarray]:  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("patterns", ["uniform", "dots:2", "dots:4", "random:4"])
 def test_the_image_is_as_good_as_noise_allows(light: Light, factors: Factors, patterns: str) -> None:
-    """Within 1.5 dB of what photons and read noise allow with exact factors; and the ambient frame brings at most a
-    sixteenth of the noise. An exposure of a millisecond makes noise the only limit that counts here. Under uniform
-    light two of 150 seeds miss it, by 1.0 and 2.9 dB, where noise has the solver choose too small a lambda.
+    """Within 1.5 dB of what photons and read noise allow with exact factors, in the median of seven seeds; and the
+    ambient frame brings at most a sixteenth of the noise. An exposure of a millisecond makes noise the only limit that
+    counts here.
+
+    Single images of 16 x 16 numbers scatter; under uniform light two of 150 are below by more than that, where noise
+    has the solver choose too small a lambda.
 
     (Planted: nothing taken off; one shot instead of 16.)
     """
-    shots = light.expose(patterns, exposure=1e-3, seed=3)
-    bound, part = allowed(shots, factors, light)
-    found = ms.psnr(reconstruct(shots, factors).image, light.truth)
-    assert part < 1 / 16
-    assert bound - 1.5 < found < bound + 1.5
+    apart = []
+    for seed in range(7):
+        shots = light.expose(patterns, exposure=1e-3, seed=seed)
+        bound, part = allowed(shots, factors, light)
+        apart.append(ms.psnr(reconstruct(shots, factors).image, light.truth) - bound)
+        assert part < 1 / 16
+    assert abs(np.median(apart)) < 1.5
 
 
 @pytest.mark.slow
