@@ -38,11 +38,15 @@ def stripes(pixels: int, period: int, signed: bool) -> np.ndarray:
     return columns[np.arange(pixels) % len(columns)]
 
 
-def made(folder: Path, signed: bool = False, ambient: bool = False, real_output: bool = False) -> Made:
-    """Frames of a separable camera with noise, recorded as `mitsim capture` does, with truth and expected electrons."""
+def made(
+    folder: Path, signed: bool = False, ambient: bool = False, real_output: bool = False, scale: float = 1.0
+) -> Made:
+    """Frames of a separable camera with noise, recorded as `mitsim capture` does, with truth and expected electrons;
+    its factors times ``scale``."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(17)
-    left, right, scene = rng.random((ROWS, SCENE[0])) * 300, rng.random((COLUMNS, SCENE[1])) * 300, rng.random(SCENE)
+    left, right = (rng.random((side, n)) * 300 * scale for side, n in zip((ROWS, COLUMNS), SCENE, strict=True))
+    scene = rng.random(SCENE)
     manifest = CalibrationManifest(camera=CAMERA, board_reflectance=0.99, digital=DIGITAL)
     known = Factors(
         *(side.astype(np.float32).astype(np.float64) for side in (left, right)),

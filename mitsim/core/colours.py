@@ -86,11 +86,42 @@ def read_colours(folder: Path | str, kind: str) -> ColourManifest:
         raise MitsimError(
             f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]} --colour lines`"
         )
-    data: Any = read_json(folder / COLOUR)
+    return checked_colours(read_json(folder / COLOUR), kind, folder)
+
+
+def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
+    """The lines of a coloured folder.
+
+    Parameters
+    ----------
+    data
+        as its colour.json holds it.
+    kind
+        of folder that it is to be, one of :data:`KINDS`.
+    place
+        where it was found, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when it is of another kind or breaks a rule.
+    """
     found = data.get("kind") if isinstance(data, dict) else type(data).__name__
     if found != kind:
-        raise MitsimError(f"{folder}: holds a {cut(str(found))}, not a {kind}; give the right folder")
-    return validated(ColourManifest, data, f"{folder}/{COLOUR}")
+        raise MitsimError(f"{place}: holds a {cut(str(found))}, not a {kind}; give the right folder")
+    return validated(ColourManifest, data, f"{place}/{COLOUR}")
+
+
+def same_lines(run: Path, calibration: Path) -> ColourManifest:
+    """The lines of a coloured ``run``; MitsimError where its ``calibration`` has others, or either is not coloured."""
+    lines, calibrated = read_colours(run, RUN), read_colours(calibration, CALIBRATION)
+    ours, theirs = (dict(zip(each.names, each.wavelengths_nm, strict=True)) for each in (lines, calibrated))
+    if ours != theirs:
+        raise MitsimError(
+            f"calibration {calibration}: its lines are {', '.join(theirs)}, but {run} has {', '.join(ours)}; "
+            "calibrate each line of this projector"
+        )
+    return lines
 
 
 def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:

@@ -7,15 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.core.errors import ArgumentError
+from mitsim.core.colours import RUN, is_coloured, read_colours, same_lines
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.output import prepare_output
 
 if TYPE_CHECKING:
+    from mitsim.exchange.coloured import Coloured
     from mitsim.exchange.packed import Packed
 
     Run = Packed[RunManifest]
     Calibration = Packed[CalibrationManifest]
+    ColouredRun = Coloured[RunManifest]
+    ColouredCalibration = Coloured[CalibrationManifest]
 Written = tuple[str, ...]
 """Sentences on what of the run the format does not hold, or how it is used."""
 
@@ -34,12 +38,15 @@ class Format:
         whether a calibration is needed, or may be given.
     write
         from the place, the run, the calibration and a projector's name to what is said about them.
+    write_lines
+        the same of a coloured run; None: the format has no place for its lines.
     """
 
     what: str
     kind: Literal["file", "folder"]
     calibration: Literal["needed", "optional", "none"]
     write: Callable[[Path, Run, Calibration | None, str | None], Written]
+    write_lines: Callable[[Path, ColouredRun, ColouredCalibration | None], Written] | None = None
 
 
 def _hdf5(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
@@ -49,10 +56,25 @@ def _hdf5(path: Path, run: Run, calibration: Calibration | None, projector: str 
     return ()
 
 
+def _hdf5_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+    from mitsim.exchange.hdf5 import write_hdf5_lines
+
+    write_hdf5_lines(path, run, calibration)
+    return ()
+
+
 def _mat(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
     from mitsim.exchange.matlab import ELECTRONS, write_matlab
 
     write_matlab(path, run, calibration)
+    without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
+    return (*without, f"Left out: {ELECTRONS}")
+
+
+def _mat_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+    from mitsim.exchange.matlab import ELECTRONS, write_matlab_lines
+
+    write_matlab_lines(path, run, calibration)
     without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
     return (*without, f"Left out: {ELECTRONS}")
 
@@ -79,20 +101,39 @@ def _torch(path: Path, run: Run, calibration: Calibration | None, projector: str
     return ()
 
 
+def _torch_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+    from mitsim.exchange.tensors import write_tensors_lines
+
+    write_tensors_lines(path, run, calibration)
+    return ()
+
+
 def _deepinv(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
     from mitsim.exchange.tensors import extra, write_tensors
 
     extra("deepinv")
     write_tensors(path, run, calibration)
+    return _read_by(path)
+
+
+def _deepinv_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+    from mitsim.exchange.tensors import extra
+
+    extra("deepinv")
+    _torch_lines(path, run, calibration)
+    return _read_by(path)
+
+
+def _read_by(path: Path) -> Written:
     return (f"Read it by mitsim.exchange.tensors.load_physics({str(path)!r})",)
 
 
 FORMATS: dict[str, Format] = {
-    "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", _hdf5),
-    "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", _mat),
+    "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", _hdf5, _hdf5_lines),
+    "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", _mat, _mat_lines),
     "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", _flatcam),
-    "deepinv": Format("tensors of a deepinv physics", "file", "needed", _deepinv),
-    "torch": Format("tensors for torch.load", "file", "optional", _torch),
+    "deepinv": Format("tensors of a deepinv physics", "file", "needed", _deepinv, _deepinv_lines),
+    "torch": Format("tensors for torch.load", "file", "optional", _torch, _torch_lines),
     "png": Format("frames as pictures, patterns for a real projector", "folder", "none", _png),
 }
 """Formats by the name that `--format` takes."""
@@ -111,7 +152,7 @@ def export_run(
     Parameters
     ----------
     run
-        RUN folder.
+        RUN folder, or a coloured one.
     format
         a key of :data:`FORMATS`.
     output
@@ -126,13 +167,13 @@ def export_run(
     Returns
     -------
     dict
-        `format`, `output`, `frames`, `calibration`, `notes`: what the command line prints.
+        `format`, `output`, `frames` (of all lines), `calibration`, `notes`: what the command line prints.
 
     Raises
     ------
     MitsimError
-        before anything is written, for an unknown format, a missing calibration, a place that holds something, or a
-        folder that is none; and for a run that the format cannot hold.
+        before anything is written, for an unknown format, a missing calibration, a place that holds something, a
+        folder that is none, or a calibration of other lines; and for a run that the format cannot hold.
     """
     if format not in FORMATS:
         raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
@@ -143,22 +184,43 @@ def export_run(
         raise ArgumentError("calibration", f"is not given, and {format} is of its factors; give a folder of it")
     if calibration is not None and chosen.calibration == "none":
         raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
-    # Refused before numpy is imported.
-    read_manifest(Path(run), RunManifest)
-    if calibration is not None:
-        read_manifest(Path(calibration), CalibrationManifest)
-    place = Path(output)
+    folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
+    lines = _lines(folder, factors)
+    if lines and chosen.write_lines is None:
+        raise MitsimError(
+            f"{folder}: is coloured, and {format} has no place for its lines; export the folder of each, as "
+            f"{folder / lines[0]}"
+        )
+    for line in lines or ("",):  # refused before numpy is imported
+        read_manifest(folder / line, RunManifest)
+        if factors is not None:
+            read_manifest(factors / line, CalibrationManifest)
     if chosen.kind == "file":
         prepare_output(place, overwrite, "file")
-    from mitsim.exchange.packed import packed_calibration, packed_run
+    if chosen.write_lines is not None and lines:
+        from mitsim.exchange.coloured import coloured_calibration, coloured_run
 
-    shots = packed_run(Path(run))
-    factors = None if calibration is None else packed_calibration(Path(calibration))
-    notes = chosen.write(place, shots, factors, projector)
+        coloured = coloured_run(folder)
+        shots = [*coloured.lines.values()]
+        notes = chosen.write_lines(place, coloured, None if factors is None else coloured_calibration(factors))
+    else:
+        from mitsim.exchange.packed import packed_calibration, packed_run
+
+        shots = [packed_run(folder)]
+        notes = chosen.write(place, shots[0], None if factors is None else packed_calibration(factors), projector)
     return {
         "format": format,
-        "frames": len(shots.manifest.patterns.captures),
+        "frames": sum(len(part.manifest.patterns.captures) for part in shots),
         "calibration": None if calibration is None else str(calibration),
         "notes": list(notes),
         "output": str(place),
     }
+
+
+def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:
+    """Names of a coloured run's lines, which are its calibration's too; none of another run."""
+    if not is_coloured(run):
+        if calibration is not None and is_coloured(calibration):
+            raise ArgumentError("calibration", f"{calibration}: is coloured, but {run} is not; give a line's folder")
+        return ()
+    return (read_colours(run, RUN) if calibration is None else same_lines(run, calibration)).names

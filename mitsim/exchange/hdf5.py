@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim import __version__
-from mitsim.core.errors import MitsimError
+from mitsim.core.colours import CALIBRATION, RUN
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import Channels, Metadata, Value
 from mitsim.core.jsonfile import parse_json
 from mitsim.core.manifests import CalibrationManifest, RunManifest
@@ -23,6 +24,7 @@ from mitsim.core.output import whole_file
 from mitsim.core.plainfile import MOST_SIDE, check_plain
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture
+from mitsim.exchange.coloured import Coloured, line_of, unpacked_colours
 from mitsim.exchange.packed import (
     FACTORS,
     Packed,
@@ -38,6 +40,10 @@ if TYPE_CHECKING:
 
     from mitsim.reconstruct.factors import Factors
 
+Run = Packed[RunManifest] | Coloured[RunManifest]
+Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
+_LINES = "lines"
+"""Group that has a group of each line of a coloured run."""
 LAYOUT = 1
 """Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
 _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
@@ -62,22 +68,36 @@ def write_hdf5(path: Path, run: Packed[RunManifest], calibration: Packed[Calibra
     MitsimError
         for shots that differ in shape or channels, or a file that cannot be read or written.
     """
-    import h5py
+    with _begun(path) as file:
+        _write_folders(file, run, calibration)
 
-    with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
-        file.attrs["mitsim_exchange"] = LAYOUT
-        file.attrs["mitsim_version"] = __version__
-        group = _begin(file, "run", run)
-        _write_shots(group, run)
-        ambient = run.manifest.ambient_frame
-        named = {} if ambient is None else {"ambient": ambient.file}
-        for name, source in {**named, "truth": TRUTH}.items():
-            if source in run.names:
-                _write_frame(group.create_group(name), *run.read(source))
+
+def write_hdf5_lines(
+    path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest] | None = None
+) -> None:
+    """Write a coloured run to one file, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        whose lines have shots of one shape each.
+    calibration
+        of the same lines.
+
+    Raises
+    ------
+    MitsimError
+        as for :func:`write_hdf5`.
+    """
+    with _begun(path) as file:
+        _write_text(file, RUN, run.text)
         if calibration is not None:
-            group = _begin(file, "calibration", calibration)
-            for name in FACTORS:
-                _write_frame(group.create_group(Path(name).stem), *calibration.read(name))
+            _write_text(file, CALIBRATION, calibration.text)
+        lines = file.create_group(_LINES, track_order=True)
+        for name, shots in run.lines.items():
+            _write_folders(lines.create_group(name, track_order=True), shots, line_of(calibration, name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +131,26 @@ class ExchangeFile:
 
 
 @contextmanager
-def open_hdf5(path: Path | str) -> Iterator[ExchangeFile]:
-    """The file ``path`` of :func:`write_hdf5`, while the context lasts.
+def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFile]:
+    """The file ``path`` of :func:`write_hdf5`, or one ``line`` of that of :func:`write_hdf5_lines`, while the context
+    lasts.
 
-    MitsimError for a file that is missing or damaged, is none of these, or leads to other files.
+    MitsimError for a file that is missing or damaged, is none of these, or leads to other files; and for a line that it
+    does not have.
     """
+    with open_folders(path) as (run, calibration):
+        runs = {**run.lines} if isinstance(run, Coloured) else {"": run}
+        factors = {**calibration.lines} if isinstance(calibration, Coloured) else {"": calibration}
+        name = line or ""
+        if name not in runs:
+            known = f"{', '.join(runs)}; give one" if isinstance(run, Coloured) else "no lines; leave it out"
+            raise ArgumentError("line", f"{line!r}: {path} has {known}")
+        yield ExchangeFile(runs[name], factors.get(name))
+
+
+@contextmanager
+def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
+    """The folders in the file ``path``, coloured or not, while the context lasts. MitsimError as :func:`open_hdf5`."""
     import h5py
 
     path = Path(path)
@@ -129,9 +164,8 @@ def open_hdf5(path: Path | str) -> Iterator[ExchangeFile]:
                 raise MitsimError(
                     f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
                 )
-            run = _run(file, path)
-            calibration = _calibration(file, path) if "calibration" in file else None
-        yield ExchangeFile(run, calibration)
+            held = _of_lines(file, path) if _LINES in file else _of_one(file, path)
+        yield held
 
 
 class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
@@ -152,12 +186,42 @@ class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
         return len(dict.fromkeys(self._packed.names))
 
 
-def _begin(file: h5py.File, name: str, packed: Packed[Any]) -> h5py.Group:
-    group = file.create_group(name, track_order=True)
-    # Of bytes with their length: manifests outgrow an attribute, and an HDF5 text ends at its first zero.
-    text = np.frombuffer(manifest_text(packed.manifest, packed.text).encode(), dtype=np.uint8)
-    group.create_dataset("manifest", data=text, **_PACKED)
+@contextmanager
+def _begun(path: Path) -> Iterator[h5py.File]:
+    """A file of this layout that takes its place at ``path`` when all is written."""
+    import h5py
+
+    with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
+        file.attrs["mitsim_exchange"] = LAYOUT
+        file.attrs["mitsim_version"] = __version__
+        yield file
+
+
+def _write_folders(
+    place: h5py.Group, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None
+) -> None:
+    group = _begin(place, "run", run)
+    _write_shots(group, run)
+    ambient = run.manifest.ambient_frame
+    named = {} if ambient is None else {"ambient": ambient.file}
+    for name, source in {**named, "truth": TRUTH}.items():
+        if source in run.names:
+            _write_frame(group.create_group(name), *run.read(source))
+    if calibration is not None:
+        group = _begin(place, "calibration", calibration)
+        for name in FACTORS:
+            _write_frame(group.create_group(Path(name).stem), *calibration.read(name))
+
+
+def _begin(place: h5py.Group, name: str, packed: Packed[Any]) -> h5py.Group:
+    group = place.create_group(name, track_order=True)
+    _write_text(group, "manifest", manifest_text(packed.manifest, packed.text))
     return group
+
+
+def _write_text(group: h5py.Group, name: str, text: str) -> None:
+    # Of bytes with their length: manifests outgrow an attribute, and an HDF5 text ends at its first zero.
+    group.create_dataset(name, data=np.frombuffer(text.encode(), dtype=np.uint8), **_PACKED)
 
 
 def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
@@ -171,7 +235,7 @@ def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
                 stacks.create_dataset(name, shape, values.dtype, chunks=(1, *values.shape), **_PACKED)
             stacks[name][index] = values
         metadata.append(json.dumps(dict(known)))
-    group.create_dataset("metadata", data=np.array(metadata, dtype=object), dtype=_text())
+    group.create_dataset("metadata", data=np.array(metadata, dtype=object), dtype=_strings())
     group.create_dataset("pattern", data=np.array([(shot.row, shot.column, shot.sign) for shot in captures], np.int32))
     group["pattern"].attrs["columns"] = "column of P_L from 0, column of P_R from 0, sign"
     for name, matrix in zip(("P_L", "P_R"), run.manifest.patterns.matrices, strict=True):
@@ -181,18 +245,39 @@ def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
 def _write_frame(group: h5py.Group, channels: Channels, metadata: Metadata) -> None:
     for name, values in channels.items():
         group.create_dataset(name, data=values, **_PACKED)
-    group.create_dataset("metadata", data=np.array([json.dumps(dict(metadata))], dtype=object), dtype=_text())
+    group.create_dataset("metadata", data=np.array([json.dumps(dict(metadata))], dtype=object), dtype=_strings())
 
 
-def _text() -> Any:
+def _strings() -> Any:
     import h5py
 
     return h5py.string_dtype("utf-8")
 
 
-def _run(file: h5py.File, path: Path) -> Packed[RunManifest]:
+def _of_one(place: h5py.Group, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
+    return _run(place, path), _calibration(place, path) if "calibration" in place else None
+
+
+def _of_lines(file: h5py.File, path: Path) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
+    text, group = _text_in(file, RUN, path), _group(file, _LINES, path)
+    colours = unpacked_colours(text, RUN, path)
+    held = {name: _of_one(_group(group, name, path), path) for name in colours.names}
+    run = Coloured(colours, text, {name: shots for name, (shots, _) in held.items()})
+    if CALIBRATION not in file:
+        return run, None
+    text = _text_in(file, CALIBRATION, path)
+    colours, calibrations = unpacked_colours(text, CALIBRATION, path), {}
+    for name in colours.names:
+        calibration = held.get(name, (None, None))[1]
+        if calibration is None:
+            raise MitsimError(f"{path}: has no calibration of {name}; export it again")
+        calibrations[name] = calibration
+    return run, Coloured(colours, text, calibrations)
+
+
+def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
     group = _group(file, "run", path)
-    text = _manifest(group, path)
+    text = _text_in(group, "manifest", path)
     manifest = unpacked_run(text, path)
     captures, ambient = manifest.patterns.captures, manifest.ambient_frame
     stacks = _group(group, "shots", path)
@@ -220,9 +305,9 @@ def _run(file: h5py.File, path: Path) -> Packed[RunManifest]:
     return Packed(manifest, text, (*(shot.file for shot in captures), *others), read, path)
 
 
-def _calibration(file: h5py.File, path: Path) -> Packed[CalibrationManifest]:
+def _calibration(file: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
     group = _group(file, "calibration", path)
-    text = _manifest(group, path)
+    text = _text_in(group, "manifest", path)
 
     def read(name: str) -> tuple[Channels, Metadata]:
         with _told(path):
@@ -231,8 +316,8 @@ def _calibration(file: h5py.File, path: Path) -> Packed[CalibrationManifest]:
     return Packed(unpacked(text, CalibrationManifest, path), text, FACTORS, read, path)
 
 
-def _manifest(group: h5py.Group, path: Path) -> str:
-    return str(np.asarray(_dataset(group, "manifest", path)[()], dtype=np.uint8).tobytes().decode("utf-8"))
+def _text_in(group: h5py.Group, name: str, path: Path) -> str:
+    return str(np.asarray(_dataset(group, name, path)[()], dtype=np.uint8).tobytes().decode("utf-8"))
 
 
 def _frame(group: h5py.Group, path: Path) -> tuple[Channels, Metadata]:

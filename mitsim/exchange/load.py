@@ -15,6 +15,7 @@ from mitsim.exchange.planes import check_channel
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import CalibrationManifest, RunManifest
+    from mitsim.exchange.coloured import Coloured
     from mitsim.exchange.packed import Packed
 
 
@@ -30,30 +31,32 @@ class Loaded:
         parts of a run that the file does not hold.
     """
 
-    run: Packed[RunManifest] | None
-    calibration: Packed[CalibrationManifest] | None
+    run: Packed[RunManifest] | Coloured[RunManifest] | None
+    calibration: Packed[CalibrationManifest] | Coloured[CalibrationManifest] | None
     left_out: tuple[str, ...] = ()
 
 
 @contextmanager
 def _hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
-    from mitsim.exchange.hdf5 import open_hdf5
+    from mitsim.exchange.hdf5 import open_folders
 
     if channel is not None:
         raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
-    with open_hdf5(path) as file:
-        yield Loaded(file.run, file.calibration)
+    with open_folders(path) as (run, calibration):
+        yield Loaded(run, calibration)
 
 
 @contextmanager
 def _matlab(path: Path, channel: str | None) -> Iterator[Loaded]:
     from mitsim.exchange.flatcam import flatcam_calibration, read_flatcam
-    from mitsim.exchange.matlab import ELECTRONS, names_in, read_matlab
+    from mitsim.exchange.matlab import COLOURED, ELECTRONS, names_in, read_matlab, read_matlab_lines
 
     if channel is not None:
         yield Loaded(None, flatcam_calibration(path, channel))
     else:
-        run, calibration = (read_flatcam if "meas" in names_in(path) else read_matlab)(path)
+        names = names_in(path)
+        read: Any = read_flatcam if "meas" in names else read_matlab_lines if COLOURED in names else read_matlab
+        run, calibration = read(path)
         yield Loaded(run, calibration, (ELECTRONS,))
 
 
@@ -83,7 +86,8 @@ def import_file(
     Returns
     -------
     dict
-        `frames`, `output`, `calibration_output`, `holds`, `left_out`, `warnings`: what the command line prints.
+        `frames` (of all lines), `output`, `calibration_output`, `holds`, `left_out`, `warnings`: what the command line
+        prints.
 
     Raises
     ------
@@ -102,13 +106,20 @@ def import_file(
             folders = [(stack.enter_context(whole_folder(place)), held) for place, held in wanted.values() if place]
             for folder, held in folders:
                 held.fill(folder)
+    from mitsim.exchange.coloured import parts_of
+
+    runs = {} if loaded.run is None else parts_of(loaded.run)
+    calibrations = {} if loaded.calibration is None else parts_of(loaded.calibration)
     return {
-        "frames": None if loaded.run is None else len(loaded.run.manifest.patterns.captures),
+        "frames": sum(len(part.manifest.patterns.captures) for part in runs.values()) if runs else None,
         "output": None if output is None else str(output),
         "calibration_output": None if calibration_output is None else str(calibration_output),
         "holds": [name for name, (_, held) in zip(("run", "calibration"), wanted.values(), strict=True) if held],
         "left_out": list(loaded.left_out),
-        "warnings": []
-        if calibration_output is None or not loaded.calibration
-        else [*loaded.calibration.manifest.warnings],
+        "warnings": [
+            f"{line}{text}"
+            for line, part in calibrations.items()
+            for text in part.manifest.warnings
+            if calibration_output is not None
+        ],
     }

@@ -7,7 +7,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.colours import CALIBRATION, RUN
+from mitsim.core.errors import MitsimError, cut
 from mitsim.core.framefile import Channel, Channels, Metadata
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
 from mitsim.core.output import whole_file
 from mitsim.core.plainfile import check_plain
 from mitsim.core.recorders import TRUTH
+from mitsim.exchange.coloured import Coloured, line_of, unpacked_colours
 from mitsim.exchange.packed import FACTORS, Packed, checked_channel, manifest_text, shots_of, unpacked, unpacked_run
 
 Variables = Mapping[str, Any]
@@ -28,6 +31,10 @@ LARGEST_VARIABLE = (1 << 31) - 1
 """Bytes of an array in a file of version 5."""
 _TEXTS = {"run_manifest": "run", "calibration_manifest": "calibration"}
 """Variables that hold manifests."""
+COLOURED, _CALIBRATED = "colour_run", "colour_calibration"
+"""Variables that hold the colour.json of a coloured run and calibration."""
+_LONGEST_LINE = 31
+"""Letters of a line's name: a variable of MATLAB has 63 at most, truth_board_reflectance_ half of them."""
 ELECTRONS = "expected electrons of the frames"
 """What such a file does not hold of a simulated run."""
 
@@ -49,13 +56,35 @@ def write_matlab(path: Path, run: Packed[RunManifest], calibration: Packed[Calib
     MitsimError
         for a run that mixes whole shots and pairs, or is larger than such a file may be.
     """
-    variables = _frames(run)
-    variables["PL"], variables["PR"] = run.manifest.patterns.matrices
+    write_variables(path, _variables(run, calibration))
+
+
+def write_matlab_lines(
+    path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest] | None
+) -> None:
+    """Write a coloured run with the paper's variables of each line, their names ending in its: `phi_left_638nm`.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        with lines called as `mitsim capture` calls them.
+    calibration
+        of the same lines; without one `phi_left_638nm` and so on are left out.
+
+    Raises
+    ------
+    MitsimError
+        for lines whose names cannot end one of a variable, and as for :func:`write_matlab`.
+    """
+    variables: dict[str, Any] = {COLOURED: run.text}
     if calibration is not None:
-        scale = dn_per_rate(run.manifest.digital)
-        for side, factor in factors_in_dn(calibration, scale).items():
-            variables[f"phi_{side}"] = factor
-    write_variables(path, {**variables, **of_folders(run, calibration)})
+        variables[_CALIBRATED] = calibration.text
+    for name, end in _endings(run.colours.names, path).items():
+        held = _variables(run.lines[name], line_of(calibration, name))
+        variables.update({f"{key}{end}": values for key, values in held.items()})
+    write_variables(path, variables)
 
 
 def read_matlab(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
@@ -63,7 +92,55 @@ def read_matlab(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationMani
 
     MitsimError for a file that is none, or is damaged.
     """
+    return _folders_in(read_variables(path), path)
+
+
+def read_matlab_lines(path: Path) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
+    """Coloured run and calibration in the file ``path`` of :func:`write_matlab_lines`.
+
+    MitsimError for a file that is none, or is damaged.
+    """
     variables = read_variables(path)
+    text = text_in(variables, COLOURED, path)
+    colours = unpacked_colours(text, RUN, path)
+    runs, calibrations = {}, {}
+    for name, end in _endings(colours.names, path).items():
+        own = {key.removesuffix(end): values for key, values in variables.items() if key.endswith(end)}
+        runs[name], calibrations[name] = _folders_in(own, path)
+    run = Coloured(colours, text, runs)
+    if _CALIBRATED not in variables:
+        return run, None
+    text = text_in(variables, _CALIBRATED, path)
+    colours = unpacked_colours(text, CALIBRATION, path)
+    lines = {name: held for name, held in calibrations.items() if held is not None}
+    if {*lines} != {*colours.names}:
+        raise MitsimError(f"{path}: has calibrations of {', '.join(lines)}, not of {', '.join(colours.names)}")
+    return run, Coloured(colours, text, lines)
+
+
+def _endings(names: Sequence[str], path: Path) -> dict[str, str]:
+    """What variables of each line end in, by the line's name: of letters, digits and _, as MATLAB wants it."""
+    ends = {name: "_" + re.sub(r"[^0-9A-Za-z_]", "_", name) for name in names}
+    for name in names:
+        # Beginning with a digit, they are no end of another variable: truth_standard_error is not of a line `error`.
+        if not (name[0].isdigit() and len(name) <= _LONGEST_LINE) or [*ends.values()].count(ends[name]) > 1:
+            raise MitsimError(
+                f"{path}: a line is called {cut(name)}, which no variable of MATLAB can end in; use the format hdf5"
+            )
+    return ends
+
+
+def _variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
+    variables = _frames(run)
+    variables["PL"], variables["PR"] = run.manifest.patterns.matrices
+    if calibration is not None:
+        scale = dn_per_rate(run.manifest.digital)
+        for side, factor in factors_in_dn(calibration, scale).items():
+            variables[f"phi_{side}"] = factor
+    return {**variables, **of_folders(run, calibration)}
+
+
+def _folders_in(variables: Variables, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
     manifest = unpacked_run(text_in(variables, "run_manifest", path), path)
     return _run(variables, manifest, path), calibration_in(variables, manifest.digital, path)
 

@@ -18,11 +18,14 @@ from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest
 from mitsim.core.output import whole_file
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture, load_run
+from mitsim.exchange.coloured import Coloured, line_of
 from mitsim.exchange.packed import FACTORS, Packed
 
 if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
+_PATTERNS = ("P_L", "P_R")
+"""Tensors of the patterns' factors."""
 Tensor = Any
 """A torch.Tensor."""
 
@@ -52,14 +55,57 @@ def write_tensors(path: Path, run: Packed[RunManifest], calibration: Packed[Cali
     MitsimError
         where PyTorch is not installed, or a frame cannot be read.
     """
-    torch = extra("torch")
+    extra("torch")
+    _save(path, _arrays(run, calibration))
+
+
+def write_tensors_lines(
+    path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest] | None
+) -> None:
+    """Write a coloured run as tensors with an axis of lines before the others, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        whose lines were captured under the same patterns.
+    calibration
+        of the same lines.
+
+    Raises
+    ------
+    MitsimError
+        as for :func:`write_tensors`, and for lines that differ in their patterns or in the shape of a tensor.
+    """
+    extra("torch")
+    lines = {name: _arrays(run.lines[name], line_of(calibration, name)) for name in run.colours.names}
+    first, *others = lines.values()
+    for arrays in others:
+        if arrays.keys() != first.keys() or any(arrays[key].shape != first[key].shape for key in first):
+            raise MitsimError(f"{path}: lines differ in shape; use the format hdf5")
+        if not all(np.array_equal(arrays[key], first[key]) for key in _PATTERNS):
+            raise MitsimError(f"{path}: lines differ in their patterns; use the format hdf5")
+    joined = {key: first[key] for key in _PATTERNS}
+    for key in first.keys() - joined.keys():
+        # The truth has an axis of one channel, which the lines take.
+        joined[key] = (np.concatenate if key == "x" else np.stack)([arrays[key] for arrays in lines.values()])
+    _save(path, {**joined, "wavelengths_nm": np.array(run.colours.wavelengths_nm)})
+
+
+def _arrays(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, FloatArray]:
     shots = Capture(run.manifest, None, {name: run.read(name) for name in dict.fromkeys(run.names)})
-    arrays = {"y": measured(shots), **dict(zip(("P_L", "P_R"), shots.patterns, strict=True))}
+    arrays = {"y": measured(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
     if shots.truth is not None:
         arrays["x"] = shots.truth[None]
     if calibration is not None:
         factors = {side: calibration.read(name)[0]["factor"] for side, name in zip(SIDES, FACTORS, strict=True)}
         arrays.update({side: np.asarray(factor, np.float64) for side, factor in factors.items()})
+    return arrays
+
+
+def _save(path: Path, arrays: Mapping[str, FloatArray]) -> None:
+    torch = extra("torch")
     with whole_file(path) as part:
         torch.save({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, part)
 
@@ -110,14 +156,28 @@ def physics(factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> Any:
 
 def load_physics(path: Path | str) -> tuple[Any, Mapping[str, Tensor]]:
     """The physics in the file ``path`` of `mitsim export --format deepinv`, and its tensors: `y`, and `x` where the
-    truth is known. MitsimError where deepinv is not installed, or the file is none."""
+    truth is known. Of a coloured run it takes x (batch, lines, n, n') to y (batch, lines, K K', rows, columns), every
+    line by its own factors. MitsimError where deepinv is not installed, or the file is none."""
     torch = extra("torch")
     try:
         tensors = torch.load(path, weights_only=True)
-        sides = [tensors[name].numpy() for name in (*SIDES, "P_L", "P_R")]
+        left, right, *patterns = (tensors[name].numpy() for name in (*SIDES, *_PATTERNS))
     except Exception as error:  # torch.load raises of all kinds
         raise MitsimError(f"{path}: no file of `mitsim export --format deepinv` ({error}); export it again") from error
-    return _physics(*sides), tensors
+    if left.ndim == 2:
+        return _physics(left, right, *patterns), tensors
+    lines = [_physics(*sides, *patterns) for sides in zip(left, right, strict=True)]
+
+    def forward(x: Tensor, **_: Any) -> Tensor:
+        """A x."""
+        return torch.stack([line.A(x[:, i : i + 1]) for i, line in enumerate(lines)], 1)
+
+    def adjoint(y: Tensor, **_: Any) -> Tensor:
+        """A^T y."""
+        return torch.cat([line.A_adjoint(y[:, i]) for i, line in enumerate(lines)], 1)
+
+    size = len(lines), left.shape[2], right.shape[2]
+    return extra("deepinv").physics.LinearPhysics(A=forward, A_adjoint=adjoint, img_size=size), tensors
 
 
 def _physics(left: FloatArray, right: FloatArray, p_left: FloatArray, p_right: FloatArray) -> Any:

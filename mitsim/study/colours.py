@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colours import CALIBRATION, COLOUR, IMAGE, RUN, ColourManifest, read_colours, write_colours
+from mitsim.core.colours import COLOUR, IMAGE, ColourManifest, read_colours, same_lines, write_colours
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.manifests import CalibrationManifest, read_manifest
@@ -151,18 +151,6 @@ def _board(calibration: Path, lines: ColourManifest) -> float:
             f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
         )
     return boards.pop() or 1.0
-
-
-def same_lines(run: Path, calibration: Path) -> ColourManifest:
-    """The lines of a coloured ``run``; MitsimError where its ``calibration`` has others, or either is not coloured."""
-    lines, calibrated = read_colours(run, RUN), read_colours(calibration, CALIBRATION)
-    ours, theirs = (dict(zip(each.names, each.wavelengths_nm, strict=True)) for each in (lines, calibrated))
-    if ours != theirs:
-        raise MitsimError(
-            f"calibration {calibration}: its lines are {', '.join(theirs)}, but {run} has {', '.join(ours)}; "
-            "calibrate each line of this projector"
-        )
-    return lines
 
 
 def stacked(images: Mapping[str, Judged]) -> FloatArray:
