@@ -70,6 +70,9 @@ class RealBench:
         with Image.open(path) as picture:
             assert picture.size == (where["columns"], where["rows"])
             values = np.asarray(picture, float) / 255
-        n, cell = self.bench.n, where["cell"]
-        rows, columns = (slice(where[first], where[first] + n * cell) for first in ("first_row", "first_column"))
-        return values[rows, columns].reshape(n, cell, n, cell).mean(axis=(1, 3)).ravel()
+        n, cell = self.bench.n, (where["cell"], where["cell_columns"])
+        rows, columns = (
+            slice(where[first], where[first] + n * side)
+            for first, side in zip(("first_row", "first_column"), cell, strict=True)
+        )
+        return values[rows, columns].reshape(n, cell[0], n, cell[1]).mean(axis=(1, 3)).ravel()

@@ -200,6 +200,7 @@ def test_a_refusal_imports_no_numpy(tmp_path: Path) -> None:
         "calibrate --frames bad -o c",
         "calibrate photograph --model wave --frames bad -o c",
         "reconstruct bad --calibration bad",
+        "patterns dotz:3 -o p",
     )
     program = f"""
 import sys

@@ -32,7 +32,7 @@ from mitsim.cli.options import (
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.rig.families import NAMES
+from mitsim.rig.families import NAMES, read_name
 
 app = typer.Typer()
 
@@ -170,7 +170,9 @@ def patterns(
     quiet: Quiet = False,
 ) -> int:
     """Draw patterns, or a calibration's stripes, as pictures to show on a real projector."""
-    from mitsim.exchange.drawn import SESSION, draw_family, draw_stripes, session_of
+    if family != "stripes":
+        read_name(family, projector_pixels)  # refused before numpy is imported
+    from mitsim.exchange.drawn import SESSION, cells_told, draw_family, draw_stripes, session_of
 
     of_stripes = {"camera": camera, "exposure": exposure}
     if family == "stripes":
@@ -193,7 +195,7 @@ def patterns(
     where = payload["projector"]
     lines = [
         f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
-        f"{where['cell']} pixels a side: {output}",
+        f"{cells_told(where)}: {output}",
         after,
     ]
     return finish(as_json, payload, lines, ())

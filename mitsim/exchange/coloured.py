@@ -55,9 +55,21 @@ def coloured_calibration(folder: Path) -> Coloured[CalibrationManifest]:
 
 
 def unpacked_colours(text: str, kind: str, place: Path) -> ColourManifest:
-    """The lines in the ``text`` of a colour.json of that ``kind``, which the exchanged file ``place`` holds.
+    """The lines that an exchanged file has.
 
-    MitsimError when it is not JSON, breaks a rule of its format, or names a folder that cannot be.
+    Parameters
+    ----------
+    text
+        of the colour.json that it holds.
+    kind
+        of folder that this is to be of, one of :data:`mitsim.core.colours.KINDS`.
+    place
+        the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when the text is not JSON, breaks a rule of its format, or names a folder that cannot be.
     """
     try:
         data = parse_json(text)

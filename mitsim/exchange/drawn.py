@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +27,41 @@ PATTERNS = "patterns.json"
 """Which picture shows what, and where the grid lies in it."""
 SESSION = "session.json"
 """The list of a session's frames, as `mitsim calibrate --frames` reads it."""
+SQUARE = 0.01
+"""How far a cell's width on the scene may be off its height, as a logarithm, to count as square: a hundredth, which
+nobody sees in an image."""
 _WHITE = 255
 """Of a picture for the projector; black is 0, so that its gamma plays no part."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A projector's own pixels.
+
+    Attributes
+    ----------
+    rows, columns
+        how many there are.
+    aspect
+        width of one on the scene, over its height.
+    """
+
+    rows: int
+    columns: int
+    aspect: float = 1.0
+
+    @classmethod
+    def of(cls, projector: str) -> Raster:
+        """Of the ``projector``, a name or TOML file. MitsimError where it does not say its rows and columns."""
+        return cls.known(load_model(locate(projector, "calibration", ".toml"), ProjectorModel).model_dump())
+
+    @classmethod
+    def known(cls, model: Mapping[str, Any]) -> Raster:
+        """Of a projector's ``model``, as a run's manifest has it; MitsimError as :meth:`of`."""
+        rows, columns = model.get("rows"), model.get("columns")
+        if not (isinstance(rows, int) and isinstance(columns, int)):
+            raise ArgumentError("projector", "does not say its rows and columns; give one that does")
+        return cls(rows, columns, float(model.get("pixel_aspect", 1.0)))
 
 
 def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) -> dict[str, Any]:
@@ -57,7 +92,7 @@ def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) 
     """
     family = parse_patterns(name, n, seed)
     names = [frame_name(index) for index in range(len(family.shots))]
-    patterns, raster = Patterns.of(family, names), raster_of(projector)
+    patterns, raster = Patterns.of(family, names), Raster.of(projector)
     light = pictures_of(patterns, f"patterns {name}")
     with whole_folder(folder) as place:
         where = draw(place, light, raster, f"projector {projector}")
@@ -88,7 +123,7 @@ def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, A
     MitsimError
         for a projector of unknown or too few pixels, and where no Hadamard matrix has so many rows.
     """
-    n, raster, signs = listed.n, raster_of(projector), stripe_signs(listed.n)
+    n, raster, signs = listed.n, Raster.of(projector), stripe_signs(listed.n)
     light, shots = [], []
     for number, (side, index, sign) in enumerate(taken(signs.shape[1], listed.signed_capture == "pair")):
         stripes = signs[:, index, None] if side == "horizontal" else signs[None, :, index]
@@ -138,20 +173,7 @@ def picture_name(index: int) -> str:
     return f"patterns/pattern_{index:05d}.png"
 
 
-def raster_of(projector: str) -> tuple[int, int]:
-    """Rows and columns of the ``projector``, a name or TOML file. MitsimError where it does not say them."""
-    model = load_model(locate(projector, "calibration", ".toml"), ProjectorModel)
-    return known_raster(model.rows, model.columns)
-
-
-def known_raster(rows: object, columns: object) -> tuple[int, int]:
-    """``rows`` and ``columns`` of a projector, where both are known; MitsimError otherwise."""
-    if not (isinstance(rows, int) and isinstance(columns, int)):
-        raise ArgumentError("projector", "does not say its rows and columns; give one that does")
-    return rows, columns
-
-
-def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: tuple[int, int], place: str) -> dict[str, int]:
+def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: Raster, place: str) -> dict[str, Any]:
     """Write a picture for each shot to `patterns/` in a folder that this process holds, and a black and a white one.
 
     Parameters
@@ -161,7 +183,7 @@ def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: tuple[int, int
     light
         (n, n') of 0 and 1 for each shot.
     raster
-        rows and columns of the projector.
+        of the projector.
     place
         what the grid is of, for messages.
 
@@ -182,16 +204,19 @@ def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: tuple[int, int
         write_png(folder / picture_name(index), shown(shot, grid, raster))
     for name, level in (("black", 0), ("white", 1)):
         write_png(folder / "patterns" / f"{name}.png", shown(np.full(sides, level), grid, raster))
-    return {"rows": raster[0], "columns": raster[1], **grid}
+    return {"rows": raster.rows, "columns": raster.columns, **grid}
 
 
-def grid_in(raster: tuple[int, int], sides: tuple[int, int], place: str) -> dict[str, int]:
-    """Where the patterns' grid lies in a projector's raster: whole pixels a cell, as large as fits, in the middle.
+def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any]:
+    """Where the patterns' grid lies in a projector's raster: whole pixels a cell, in the middle.
+
+    On the scene a cell is square to :data:`SQUARE`, and of such cells as large as fits; where none is, it is the
+    squarest.
 
     Parameters
     ----------
     raster
-        rows and columns of the projector.
+        of the projector.
     sides
         rows and columns of the grid.
     place
@@ -200,24 +225,48 @@ def grid_in(raster: tuple[int, int], sides: tuple[int, int], place: str) -> dict
     Returns
     -------
     dict
-        `cell` [pixels a side], `first_row`, `first_column` of its first cell.
+        `cell`, `cell_columns`: rows and columns of a cell [pixels]; `cell_shape`: its width on the scene over its
+        height; `first_row`, `first_column` of the first cell.
 
     Raises
     ------
     MitsimError
         where a cell would have no pixel.
     """
-    cell = min(pixels // side for pixels, side in zip(raster, sides, strict=True))
-    if cell < 1:
+    most = raster.rows // sides[0], raster.columns // sides[1]
+    if min(most) < 1:
         raise MitsimError(
-            f"{place}: patterns of {sides[0]} x {sides[1]} pixels do not fit a projector of {raster[0]} rows x "
-            f"{raster[1]} columns; give a larger projector"
+            f"{place}: patterns of {sides[0]} x {sides[1]} pixels do not fit a projector of {raster.rows} rows x "
+            f"{raster.columns} columns; give a larger projector"
         )
-    first = [(pixels - cell * side) // 2 for pixels, side in zip(raster, sides, strict=True)]
-    return {"cell": cell, "first_row": first[0], "first_column": first[1]}
+    found: tuple[float, int, int] | None = None
+    for rows in range(most[0], 0, -1):
+        columns = min(max(round(rows / raster.aspect), 1), most[1])
+        off = abs(math.log(columns * raster.aspect / rows))
+        if found is None or (off < found[0] and found[0] > SQUARE):
+            found = off, rows, columns
+    if found is None:
+        raise AssertionError  # a row fits
+    _, rows, columns = found
+    return {
+        "cell": rows,
+        "cell_columns": columns,
+        "cell_shape": columns * raster.aspect / rows,
+        "first_row": (raster.rows - rows * sides[0]) // 2,
+        "first_column": (raster.columns - columns * sides[1]) // 2,
+    }
 
 
-def shown(light: npt.NDArray[Any], grid: dict[str, int], raster: tuple[int, int]) -> npt.NDArray[np.uint8]:
+def cells_told(where: Mapping[str, Any]) -> str:
+    """How large a cell is, and its shape on the scene, of the place ``where`` of a grid as of :func:`grid_in`."""
+    rows, columns, shape = where["cell"], where["cell_columns"], where["cell_shape"]
+    size = f"{rows} pixels a side" if rows == columns else f"{rows} x {columns} pixels"
+    if abs(math.log(shape)) > SQUARE:
+        return f"{size}, {shape:.3g} times as wide as high on the scene, but square in an image"
+    return size if rows == columns else f"{size}, square on the scene"
+
+
+def shown(light: npt.NDArray[Any], grid: Mapping[str, Any], raster: Raster) -> npt.NDArray[np.uint8]:
     """A picture for the projector, (rows, columns), black around the grid.
 
     Parameters
@@ -227,8 +276,8 @@ def shown(light: npt.NDArray[Any], grid: dict[str, int], raster: tuple[int, int]
     grid, raster
         as of :func:`grid_in`.
     """
-    picture = np.zeros(raster, np.uint8)
-    cells = (_WHITE * light).astype(np.uint8).repeat(grid["cell"], axis=0).repeat(grid["cell"], axis=1)
+    picture = np.zeros((raster.rows, raster.columns), np.uint8)
+    cells = (_WHITE * light).astype(np.uint8).repeat(grid["cell"], axis=0).repeat(grid["cell_columns"], axis=1)
     rows, columns = cells.shape
     picture[grid["first_row"] :, grid["first_column"] :][:rows, :columns] = cells
     return picture
@@ -264,7 +313,7 @@ def pictures_of(patterns: Patterns, place: str) -> list[npt.NDArray[Any]]:
     return found
 
 
-def described(patterns: Patterns, names: Sequence[str], where: dict[str, int]) -> dict[str, Any]:
+def described(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
     """What `patterns.json` says of a family.
 
     Parameters

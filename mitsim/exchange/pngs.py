@@ -12,12 +12,12 @@ from mitsim.core.manifests import RunManifest
 from mitsim.core.output import whole_folder
 from mitsim.exchange.drawn import (
     PATTERNS,
+    Raster,
+    cells_told,
     described,
     draw,
     frame_name,
-    known_raster,
     pictures_of,
-    raster_of,
     write_png,
 )
 from mitsim.exchange.packed import Packed, shots_of
@@ -41,7 +41,7 @@ def write_pngs(folder: Path, run: Packed[RunManifest], projector: str | None = N
     Returns
     -------
     tuple of str
-        how the frames are read again.
+        how large the patterns' cells are, and how the frames are read again.
 
     Raises
     ------
@@ -71,13 +71,15 @@ def write_pngs(folder: Path, run: Packed[RunManifest], projector: str | None = N
     again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
     if manifest.ambient_frame is not None:
         again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {manifest.ambient_frame.shots}"
-    return (f"Read again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN",)
+    return (
+        f"Patterns in cells of {cells_told(where)}",
+        f"Read again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN",
+    )
 
 
-def _raster(run: Packed[RunManifest], projector: str | None) -> tuple[int, int]:
-    """Rows and columns of the ``projector``, or of the one that took part in the ``run``."""
+def _raster(run: Packed[RunManifest], projector: str | None) -> Raster:
+    """That of the ``projector``, or of the one that took part in the ``run``."""
     if projector is not None:
-        return raster_of(projector)
+        return Raster.of(projector)
     known = run.manifest.configuration.get("projector_model")
-    model = known if isinstance(known, dict) else {}
-    return known_raster(model.get("rows"), model.get("columns"))
+    return Raster.known(known if isinstance(known, dict) else {})

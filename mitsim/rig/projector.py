@@ -160,6 +160,10 @@ class ProjectorModel(BaseModel):
     """0.2 beside the screen, 15 across a hall."""
     columns: int | None = Field(None, ge=1, le=65536, description="pixels a row of the device's own raster")
     rows: int | None = Field(None, ge=1, le=65536, description="rows of the device's own raster")
+    pixel_aspect: float = Field(
+        1.0, ge=0.1, le=10, description="width of a pixel of this raster on the scene, over its height; 1: square"
+    )
+    """0.1 to 10: a picture of 16:9 in a raster ten times too wide or too high."""
     laser_class: Literal["1", "1C", "1M", "2", "2M", "3R", "3B", "4"] | None = Field(
         None, description="class printed on the device (IEC 60825-1)"
     )

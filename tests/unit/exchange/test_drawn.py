@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from mitsim.core.errors import MitsimError
-from mitsim.exchange.drawn import draw_family, draw_stripes, session_of
+from mitsim.exchange.drawn import SQUARE, Raster, cells_told, draw_family, draw_stripes, grid_in, session_of
 from mitsim.reconstruct.measured import calibrate_frames
 from mitsim.rig.patterns import parse_patterns
 from tests.real_session import RealSession, write_image
@@ -60,7 +60,8 @@ def test_frames_of_the_stripes_give_the_cameras_factors(mode: str, devices: tupl
     result = draw_stripes(tmp_path / "stripes", devices[0], session_of(devices[1], 0.02, N, mode))
     shown, session = lights(tmp_path / "stripes"), RealSession()
     assert result["pictures"] == len(shown) == (16 if mode == "pair" else 10)
-    assert result["projector"] == {"rows": 14, "columns": 30, "cell": 3, "first_row": 1, "first_column": 9}
+    cell = {"cell": 3, "cell_columns": 3, "cell_shape": 1.0}
+    assert result["projector"] == {"rows": 14, "columns": 30, **cell, "first_row": 1, "first_column": 9}
     (tmp_path / "frames").mkdir()
     for number, light in enumerate(shown):
         write_image(tmp_path / "frames" / f"shot {number}.png", session.frame(light))
@@ -84,6 +85,48 @@ def test_a_family_is_drawn_shot_by_shot(devices: tuple[str, str], tmp_path: Path
         assert [(shot["row"], shot["column"], shot["sign"]) for shot in described["shots"]] == [
             (shot.row, shot.column, shot.sign) for shot in family.shots
         ]
+
+
+def test_a_cell_is_square_on_the_scene_where_pixels_are_not(tmp_path: Path) -> None:
+    """Of the MP-CL1, 1920 x 720 pixels in a picture of 16:9: the lit part is as wide as high, and so is every cell.
+    (Planted: the aspect left out; its inverse.)"""
+    result = draw_family(tmp_path / "dots", "dots:2", 128, "mp_cl1")
+    with Image.open(tmp_path / "dots" / "patterns" / "white.png") as picture:
+        white = np.asarray(picture)
+    with Image.open(tmp_path / "dots" / "patterns" / "pattern_00000.png") as picture:
+        dots = np.asarray(picture)
+    width, height = 16 / 1920, 9 / 720
+    for light, side in ((white, 128), (dots, 127)):  # of every second pixel, from the first on
+        rows, columns = (np.flatnonzero(light.any(axis=axis)) for axis in (1, 0))
+        assert (np.ptp(columns) + 1) * width == pytest.approx((np.ptp(rows) + 1) * height, rel=1e-12)
+        assert np.ptp(rows) + 1 == side * result["projector"]["cell"]
+    assert (result["projector"]["cell"], result["projector"]["cell_columns"]) == (4, 6)
+    assert result["projector"]["cell_shape"] == pytest.approx(1, abs=1e-5)
+    assert cells_told(result["projector"]) == "4 x 6 pixels, square on the scene"
+
+
+@pytest.mark.parametrize("aspect", [0.31, 2 / 3, 0.9, 1.0, 1.05, 1.4, 3.0])
+@pytest.mark.parametrize("raster", [(14, 30), (64, 64), (720, 1280), (1280, 720)])
+def test_of_square_cells_the_largest_is_drawn_else_the_squarest(raster: tuple[int, int], aspect: float) -> None:
+    """Against all cells of whole pixels that fit. (Planted: the smallest square one; the
+    squarest in any case; columns not held to the raster.)"""
+    sides = (7, 10)
+    where = grid_in(Raster(*raster, aspect), sides, "here")
+    most = [pixels // side for pixels, side in zip(raster, sides, strict=True)]
+    off = {
+        (rows, columns): abs(np.log(columns * aspect / rows))
+        for rows in range(1, most[0] + 1)
+        for columns in range(1, most[1] + 1)
+    }
+    square = [cell for cell, by in off.items() if by <= SQUARE]
+    found = where["cell"], where["cell_columns"]
+    assert found[0] == max(rows for rows, _ in square) if square else off[found] == min(off.values())
+    assert where["cell_shape"] == pytest.approx(found[1] * aspect / found[0])
+    assert ("times as wide" in cells_told(where)) == (not square)
+    ends = where["first_row"] + sides[0] * found[0], where["first_column"] + sides[1] * found[1]
+    assert all(
+        0 <= raster[axis] - ends[axis] - where[name] <= 1 for axis, name in enumerate(("first_row", "first_column"))
+    )
 
 
 def test_what_cannot_be_drawn_is_refused_and_leaves_nothing(devices: tuple[str, str], tmp_path: Path) -> None:

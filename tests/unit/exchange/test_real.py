@@ -130,7 +130,8 @@ def test_pictures_show_each_pattern_in_the_middle_of_the_projector(signed: bool,
     projector.write_text('name = "p"\neffective_wavelength_nm = 550.0\ncolumns = 96\nrows = 54\n')
     export_run(bench.run, "png", tmp_path / "out", projector=str(projector))
     described = json.loads((tmp_path / "out" / "patterns.json").read_text())
-    assert described["projector"] == {"rows": 54, "columns": 96, "cell": 5, "first_row": 2, "first_column": 13}
+    cell = {"cell": 5, "cell_columns": 5, "cell_shape": 1.0}
+    assert described["projector"] == {"rows": 54, "columns": 96, **cell, "first_row": 2, "first_column": 13}
     left, right = (np.array(described[name]) for name in ("P_L", "P_R"))
     assert (len(left), len(right)) == SCENE and len(described["shots"]) == (8 if signed else 6)
     for shot in described["shots"]:
