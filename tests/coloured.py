@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,9 @@ def folders(place: Path, patterns: str = "dots:4", peak: float = 3e4) -> tuple[P
         folder.mkdir()
         (folder / "colour.json").write_text(json.dumps(manifest(kind)))
     for seed, (name, scene) in enumerate(scenes().items()):
-        bench.run(patterns, scene, seed).save(run / name)
-        bench.calibrated(seed, 1e-5).save(calibration / name)
+        shots, factors = bench.run(patterns, scene, seed), bench.calibrated(seed, 1e-5)
+        camera = {"camera": {"projector": {"n": N, "lines_nm": [LINES[seed]], "radiant_shares": [1.0]}}}
+        shots.manifest = shots.manifest.model_copy(update=camera)
+        shots.save(run / name)
+        replace(factors, manifest=factors.manifest.model_copy(update=camera)).save(calibration / name)
     return run, calibration

@@ -480,8 +480,9 @@ class Bench:
         return {}
 
     def identity(self) -> dict[str, Any]:
-        """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid."""
-        grid = self.loaded.pixels
+        """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid, and the
+        lines of its light, of which the mask's diffraction depends."""
+        grid, lines = self.loaded.pixels, self.projector.lines
         return {
             "geometry": self.geometry.identity,
             "sensor": self.sensor.identity,
@@ -490,6 +491,8 @@ class Bench:
                 "n": grid.n,
                 "row_tan": [round(value, 7) for value in grid.row_tan],
                 "column_tan": [round(value, 7) for value in grid.column_tan],
+                "lines_nm": list(lines.wavelengths_nm),
+                "radiant_shares": [round(share, 7) for share in lines.shares],
             },
         }
 

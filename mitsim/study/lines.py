@@ -170,13 +170,14 @@ def respectred(scene: str, folder: Path, weigh: Weigh) -> Path:
 
 
 def serving(line: LitLine, other: LitLine) -> Factors:
-    """The factors of an ``other`` line for a ``line``, with the gain that is nearest to the line's own factors."""
+    """The factors of an ``other`` line, said to be of a ``line``, with the gain that is nearest to its own factors."""
     own, model = line.factors, other.factors
     gain = 1.0
     for mine, theirs in ((own.left, model.left), (own.right, model.right)):
         gain *= float(np.vdot(mine, theirs) / np.vdot(theirs, theirs))
     root = np.sqrt(gain)
-    return replace(model, left=root * model.left, right=root * model.right)
+    manifest = model.manifest.model_copy(update={"camera": own.manifest.camera})
+    return replace(model, left=root * model.left, right=root * model.right, manifest=manifest)
 
 
 def _opened(setup: Setup, scene: Path) -> Bench:

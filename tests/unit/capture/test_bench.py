@@ -1,6 +1,7 @@
 """The bench: files that fit together, and the board in place of the scene."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,11 @@ def test_identity_and_provenance(small_scene: Callable[..., Path]) -> None:
     # The same camera before another scene is the same camera.
     assert open_bench(path).identity() == identity
     assert open_bench(small_scene("other", mask_distance=2.5)).identity() != identity
+    # Its light is what the mask diffracts: that of one line is other light. (Planted: left out.)
+    assert identity["projector"]["lines_nm"] == [638.0, 520.0, 445.0]
+    assert identity["projector"]["radiant_shares"] == [0.4757, 0.3348, 0.1895]
+    red = replace(bench, rig=replace(bench.rig, projector=bench.projector.at(638.0))).identity()
+    assert red["projector"] == {**identity["projector"], "lines_nm": [638.0], "radiant_shares": [1.0]}
 
 
 @pytest.mark.parametrize("rig", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,8 +12,12 @@ from PIL import Image
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame
+from mitsim.core.runs import load_run
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
+from mitsim.reconstruct.factors import load_calibration
 from mitsim.study.colours import reconstruct_colours
+from mitsim.study.exposures import LitScene
+from mitsim.study.lines import LitLine, serving
 from mitsim.study.quality import reconstruct
 from tests.coloured import LINES, PLACE, folders
 
@@ -107,6 +113,35 @@ def test_a_chart_of_a_grey_run_is_refused(pair: tuple[Path, Path], capsys: pytes
     run, calibration = (str(folder / "638nm") for folder in pair)
     assert main(["reconstruct", run, "--calibration", calibration, "--chart", "colour_checker"]) == 2
     assert "is not coloured; leave out --chart" in capsys.readouterr().err
+
+
+def test_a_calibration_of_another_line_is_refused(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """(Planted: light left out of what is compared.) Folders that state none are taken, on either side."""
+    run, calibration = pair
+    image = ["-o", str(tmp_path / "image")]
+    assert main(["reconstruct", str(run / "638nm"), "--calibration", str(calibration / "520nm"), *image]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "projector.lines_nm is [520.0], but" in line and "638nm has [638.0]; calibrate in this light" in line
+    assert not (tmp_path / "image").exists()
+    shutil.copytree(run / "638nm", tmp_path / "old")
+    path = tmp_path / "old" / "manifest.json"
+    kept = json.loads(path.read_text())
+    path.write_text(json.dumps({**kept, "camera": {"projector": {"n": kept["camera"]["projector"]["n"]}}}))
+    assert main(["reconstruct", str(tmp_path / "old"), "--calibration", str(calibration / "520nm"), *image]) != 2
+
+
+def test_one_calibration_for_all_lines_is_taken_where_it_is_asked_for(pair: tuple[Path, Path]) -> None:
+    """As `study colour` does, with the gain that is nearest. (Planted: its light kept.)"""
+    lit = cast(LitScene, None)
+    red, green = (LitLine(name, float(name[:3]), lit, load_calibration(pair[1] / name)) for name in ("638nm", "520nm"))
+    green = replace(green, factors=replace(green.factors, left=3 * green.factors.left))
+    served = serving(red, green)
+    served.check_fit(load_run(pair[0] / "638nm"))
+    assert np.allclose(served.left @ served.left.T, green.factors.left @ green.factors.left.T / 3, rtol=1e-3)
+    with pytest.raises(MitsimError, match=r"lines_nm is \[638.0\], but .* has \[520.0\]"):
+        served.check_fit(load_run(pair[0] / "520nm"))
 
 
 def test_the_board_counts_with_its_reflectance(pair: tuple[Path, Path], tmp_path: Path) -> None:
