@@ -21,6 +21,7 @@ SHEET, BOARD = {638: 0.9, 520: 0.3, 445: 0.5}, {638: 0.2, 520: 0.8, 445: 0.6}
 PROJECTOR = 'name = "lines"\neffective_wavelength_nm = {mean}\nwavelengths_nm = {lines}\nradiant_shares = {shares}\n'
 POWER = 111000.0
 ACCURACY = 1e-2
+LAMP = '<emitter type="constant"><spectrum name="radiance" value="0.1"/></emitter>'
 
 
 def spectrum(parts: dict[int, float]) -> str:
@@ -39,11 +40,11 @@ def projector(path: Path, lines: dict[int, float]) -> Path:
 
 @pytest.fixture(scope="module")
 def coloured(shared_scene: Callable[..., Path]) -> Callable[[str], Path]:
-    """A coloured sheet, with or without a coloured wall; ``-D`` sets both spectra, and the projector's power."""
+    """A coloured sheet, alone, beside a coloured wall or under a lamp; ``-D`` sets spectra and power."""
 
     def write(name: str) -> Path:
         bsdf = '<bsdf type="diffuse"><spectrum name="reflectance" value="$wall"/></bsdf>'
-        extra = WALL.format(turn=90, x=-30, bsdf=bsdf) if name == "corner" else ""
+        extra = {"corner": WALL.format(turn=90, x=-30, bsdf=bsdf), "lamp": LAMP}.get(name, "")
         path = shared_scene(f"coloured {name}", extra=extra)
         text = path.read_text().replace('value="111000"', 'value="$power"')
         known = f'<default name="power" value="{POWER}"/><default name="wall" value="{spectrum(BOARD)}"/>'
@@ -130,15 +131,22 @@ def test_each_line_is_calibrated_for_itself(
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("name", "options", "words"),
     [
-        (("--colour", "bands"), "--colour 'bands': use no or lines"),
-        (("--colour", "lines", "--seconds", "5"), "not planned by time"),
+        ("sheet", ("--colour", "bands"), "--colour 'bands': use no or lines"),
+        ("sheet", ("--colour", "lines", "--seconds", "5"), "not planned by time"),
+        ("lamp", ("--colour", "lines"), "ambient light is not simulated in colour; switch it off"),
     ],
 )
 def test_what_colour_cannot_do_is_refused(
-    shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, options: tuple[str, ...], words: str
+    shell: Callable[..., Any],
+    coloured: Callable[[str], Path],
+    tmp_path: Path,
+    name: str,
+    options: tuple[str, ...],
+    words: str,
 ) -> None:
-    scene = coloured("sheet")
+    """(Planted: lamps let through, whose light would have the projector's lines.)"""
+    scene = coloured(name)
     assert words in shell("capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", *options).refusal
     assert not (tmp_path / "run").exists()
