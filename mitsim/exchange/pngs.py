@@ -41,7 +41,7 @@ def write_pngs(folder: Path, run: Packed[RunManifest], projector: str | None = N
     Returns
     -------
     tuple of str
-        how large the patterns' cells are, and how the frames are read again.
+        how the frames are read again, and how large the patterns' cells are.
 
     Raises
     ------
@@ -72,8 +72,8 @@ def write_pngs(folder: Path, run: Packed[RunManifest], projector: str | None = N
     if manifest.ambient_frame is not None:
         again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {manifest.ambient_frame.shots}"
     return (
-        f"Patterns in cells of {cells_told(where)}",
         f"Read again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN",
+        f"Patterns in cells of {cells_told(where)}",
     )
 
 
