@@ -122,13 +122,17 @@ def test_of_a_curve_the_efficiency_is_found_at_the_light_s_wavelength() -> None:
 
 
 def test_noise_that_rounding_hides_is_the_standard_s_limit_and_of_real_numbers_what_was_set() -> None:
-    """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself."""
+    """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself, known as the variance of a pair and the gain
+    are. (Planted: either of the sessions, drawn and expected, of real numbers as if rounded.)"""
     quiet = {**PLAIN, "read_noise_e": 0.5, "dark_current_e_per_s": 0.0, "gain_dn_per_e": 0.2}
     for bits, expected, limit in ((12, 0.39581 / 0.2, True), (None, 0.5, False)):
         done = characterise(sensor(**{**quiet, "bits": bits}), SMALL)
         (row,) = (row for row in done.rows if row.name == "dark_noise")
         assert not done.warnings and row.set == 0.5 and (row.expected is not None) == limit
         assert row.found == pytest.approx(expected, abs=5 * row.standard_error)
+    gain = next(row for row in done.rows if row.name == "system_gain")
+    alone = math.hypot(1 / math.sqrt(2 * SMALL.pixels**2), gain.standard_error / gain.set)
+    assert row.standard_error == pytest.approx(0.5 * alone, rel=0.05)
 
 
 def test_what_cannot_be_characterised_is_refused() -> None:
