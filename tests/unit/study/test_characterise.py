@@ -122,7 +122,7 @@ def test_of_a_curve_the_efficiency_is_found_at_the_light_s_wavelength() -> None:
 
 
 def test_noise_that_rounding_hides_is_the_standard_s_limit_and_of_real_numbers_what_was_set() -> None:
-    """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself, known as the variance of a pair and the gain
+    """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself, known as a pair's variance and the gain
     are. (Planted: either of the sessions, drawn and expected, of real numbers as if rounded.)"""
     quiet = {**PLAIN, "read_noise_e": 0.5, "dark_current_e_per_s": 0.0, "gain_dn_per_e": 0.2}
     for bits, expected, limit in ((12, 0.39581 / 0.2, True), (None, 0.5, False)):
