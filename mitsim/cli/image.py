@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -32,6 +32,14 @@ def reconstruct(
             metavar="auto|MM|map",
         ),
     ] = None,
+    margin: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="cells round the window that are solved for too: they take up light from outside it",
+            metavar="K",
+        ),
+    ] = 0,
     chart: Annotated[
         str | None,
         typer.Option(
@@ -51,7 +59,7 @@ def reconstruct(
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
     if is_coloured(run):
-        options = {"lam": strength, "method": method, "overwrite": overwrite, "focus": depth}
+        options = {"lam": strength, "method": method, "overwrite": overwrite, "focus": depth, "margin": margin}
         return reconstruct_lines(run, calibration, output or run / "reconstruction", chart, options, as_json)
     if chart is not None:
         raise MitsimError(f"--chart {chart}: {run} is not coloured; leave out --chart")
@@ -62,7 +70,10 @@ def reconstruct(
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
     held = memory_from_here()
-    result = reconstruct_folder(run, calibration, output or run / "reconstruction", strength, method, overwrite, depth)
+    place: dict[str, Any] = {"focus": depth, "margin": margin}
+    result = reconstruct_folder(
+        run, calibration, output or run / "reconstruction", strength, method, overwrite, **place
+    )
     payload = {**result.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
     lines = [payload["status"]]
     if result.quality is not None:

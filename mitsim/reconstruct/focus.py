@@ -36,7 +36,7 @@ _DEGREE = 4
 """Of the polynomial that brightness over columns is: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
 """Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
-_LEAST_PART = 0.5
+LEAST_PART = 0.5
 """Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
 
 
@@ -70,7 +70,7 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
     left, rows = FactorOfDepths(factors.left, parallax, 0).at(shift)
     right, columns = FactorOfDepths(factors.right, parallax, 1).at(shift)
     for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
-        if known.stop - known.start < _LEAST_PART * size:
+        if known.stop - known.start < LEAST_PART * size:
             raise ArgumentError(
                 "focus",
                 f"{depth_mm:g}: {max(known.stop - known.start, 0)} of {size} sensor rows or columns know the shadow "
@@ -135,15 +135,16 @@ class FactorOfDepths:
         place = (np.arange(rows) - (rows - 1) / 2) * self.parallax.pixel_pitch_mm
         column = np.arange(count) + (self.edges - self._parallax_pixels[2] * place[:, None]) * shift
         shadows, known = self._seen(column, np.arange(count))
-        inside = np.flatnonzero(known.all(axis=1))
-        return shadows, slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+        return shadows, _whole(known)
 
-    def beyond(self, margin: int) -> FloatArray:
+    def beyond(self, margin: int) -> tuple[FloatArray, slice]:
         """(m, ``margin`` + n + ``margin``) columns at the calibrated depth, with those beside the window, which no
-        projector pixel lights; what there is to see beyond the sensor's edge is taken from the last pixel."""
+        projector pixel lights; what there is to see beyond the sensor's edge is taken from the last pixel. And the
+        sensor rows where that is nothing."""
         rows, count = self.factor.shape
         column = np.arange(-margin, count + margin)
-        return self._seen(np.broadcast_to(column, (rows, column.size)), column)[0]
+        shadows, known = self._seen(np.broadcast_to(column, (rows, column.size)), column)
+        return shadows, _whole(known)
 
     def _seen(
         self, column: npt.NDArray[np.floating | np.integer], own: npt.NDArray[np.integer]
@@ -209,6 +210,12 @@ class FactorOfDepths:
         parallax = self.parallax
         inverse = 1 / parallax.mask_distance_mm - 1 / parallax.depth_mm
         return parallax.pixel_pitch_mm * inverse * self._parallax_pixels[2]
+
+
+def _whole(known: npt.NDArray[np.bool_]) -> slice:
+    """Rows of which all numbers are ``known``."""
+    inside = np.flatnonzero(known.all(axis=1))
+    return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
 
 
 def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:

@@ -23,6 +23,7 @@ from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import focused
+from mitsim.reconstruct.margin import Margin
 from mitsim.reconstruct.misfit import Misfit, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.result import Reconstruction
@@ -41,6 +42,7 @@ def reconstruct(
     lam: float | Literal["auto"] = "auto",
     method: str = "tikhonov",
     focus: float | Literal["auto", "map"] | None = None,
+    margin: int = 0,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -59,15 +61,22 @@ def reconstruct(
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
         ``tikhonov``.
+    margin
+        cells round the projector's window that are solved for too, lit in every pattern, and left out of the image:
+        they take up light from outside the window (:mod:`mitsim.reconstruct.margin`). By ``tikhonov``, without focus.
 
     Raises
     ------
     MitsimError
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
-        another lambda, method or focus, or a calibration that does not state its parallax.
+        another lambda, method, focus or margin, or a calibration that does not state its parallax.
     """
-    asked = inputs(shots, factors, lam, method, focus)
+    asked = inputs(shots, factors, lam, method, focus, margin)
     factors.check_fit(shots)
+    beside = Margin(margin) if margin else None
+    if beside:
+        wider = beside.factors(factors)
+        shots, factors = beside.of(wider.of(shots)), wider.factors
     # Depths that are looked for, and total variation, take as long as the data ask for.
     cost = predicted(shots, factors) if method == "tikhonov" and focus not in ("auto", "map") else None
     _check_factorising(shots, factors)
@@ -96,8 +105,14 @@ def reconstruct(
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status
     flags = (*status.flags, *((depth.doubt,) if depth and depth.doubt else ()), *_flags(shots, factors))
+    image = solution.image
+    if beside:
+        image = beside.inside(image)
+        uncertainties = uncertainties and Uncertainty(
+            {name: beside.inside(values) for name, values in uncertainties.sources.items()}
+        )
     return Reconstruction(
-        image=solution.image,
+        image=image,
         lam=solution.lam,
         rank=prepared.rank,
         condition=prepared.condition,
@@ -221,7 +236,12 @@ def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:
 
 
 def inputs(
-    shots: Capture, factors: Factors, lam: float | str, method: str, focus: float | str | None = None
+    shots: Capture,
+    factors: Factors,
+    lam: float | str,
+    method: str,
+    focus: float | str | None = None,
+    margin: int = 0,
 ) -> dict[str, str | float]:
     """What decides an image.
 
@@ -229,8 +249,8 @@ def inputs(
     ----------
     shots, factors
         told by their fingerprints.
-    lam, method, focus
-        as asked for; ArgumentError for an unknown method, or another lambda or focus than reconstruct takes.
+    lam, method, focus, margin
+        as asked for; ArgumentError for an unknown method, or another lambda, focus or margin than reconstruct takes.
     """
     if method not in METHODS:
         raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
@@ -240,8 +260,18 @@ def inputs(
         raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
     if focus == "map" and method != "tikhonov":
         raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
-    asked = {"run": shots.fingerprint, "calibration": factors.fingerprint, "lambda": lam, "method": method}
-    return asked if focus is None else {**asked, "focus": focus}
+    if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
+        raise ArgumentError("margin", f"{margin}: give a whole number of cells, at least 0")
+    if margin and (focus is not None or method != "tikhonov"):
+        raise ArgumentError("margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus")
+    asked: dict[str, str | float] = {
+        "run": shots.fingerprint,
+        "calibration": factors.fingerprint,
+        "lambda": lam,
+        "method": method,
+    }
+    asked |= {} if focus is None else {"focus": focus}
+    return {**asked, "margin": margin} if margin else asked
 
 
 def _depth(

@@ -38,30 +38,33 @@ def reconstruct(
     lam: float | Literal["auto"] = "auto",
     method: str = "tikhonov",
     overwrite: bool = False,
-    focus: float | Literal["auto", "map"] | None = None,
+    **place: Any,
 ) -> Judged:
     """Recover the image of a run with a calibration; writes image.exr, image.png and result.json.
 
-    MitsimError for folders that do not fit, an unknown method, lambda or focus, or an output that cannot be written.
+    MitsimError for folders that do not fit, an unknown method, lambda, focus or margin, or an output that cannot be
+    written.
 
     Parameters
     ----------
     run, calibration, output
         RUN and CAL folders, and one for the image: new or empty, or with an earlier image of the same inputs.
-    lam, method, focus
+    lam, method
         as for :func:`mitsim.reconstruct.reconstruction.reconstruct`.
     overwrite
         whether an earlier image of other inputs may be replaced.
+    **place
+        ``focus`` and ``margin``, as there.
     """
     started = time.perf_counter()
     shots, factors = load_run(run), load_calibration(calibration)
     factors.check_fit(shots)
     board = factors.manifest.board_reflectance
     truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
-    replaces = may_replace(Path(output), inputs(shots, factors, lam, method, focus), overwrite)
+    replaces = may_replace(Path(output), inputs(shots, factors, lam, method, **place), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter() - started
-        image = solve(shots, factors, lam, method, focus)
+        image = solve(shots, factors, lam, method, **place)
         judged = Judged(
             reconstruction=replace(image, seconds={"read": read, **image.seconds}),
             quality=None if truth is None else Quality.of(image.image, truth, truth_error),

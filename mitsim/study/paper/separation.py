@@ -63,7 +63,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         raise MitsimError(f"study separation: light over several surfaces is not worth following in {point['subject']}")
     parallax = stated_parallax(studio.factors(point.setup, int(point["seed"])))
     margin = _MARGIN * max(frames.family.left.shape[1], frames.family.right.shape[1])
-    left, right = (FactorOfDepths(factor, parallax, axis).beyond(margin) for axis, factor in enumerate(frames.sides))
+    left, right = (FactorOfDepths(factor, parallax, axis).beyond(margin)[0] for axis, factor in enumerate(frames.sides))
     electrons = frames.exposer(1.0).electrons
     direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected(RENDERED, frames.family)]
     bounced = [electrons(frame) - own for frame, own in zip(frames.expected, direct, strict=True)]

@@ -114,7 +114,7 @@ def test_columns_beside_the_window_are_the_shadow_there() -> None:
     edges = centred_edges(N + 2 * margin, WINDOW / N) * 400
     wide = scene_factor(mls_mask().terms[0][1], 0.06, centred_edges(PIXELS, PITCH), edges, 2.0, 400.0)
     own = wide[:, margin:-margin]
-    found = FactorOfDepths(own, PARALLAX, 1).beyond(margin)
+    found = FactorOfDepths(own, PARALLAX, 1).beyond(margin)[0]
     assert np.array_equal(found[:, margin:-margin], own)
     inner = slice(8, -8)
     error = np.sqrt(np.mean(np.square((found - wide)[inner])))
