@@ -47,6 +47,8 @@ Result = TypeVar("Result")
 _NUMBERS_AT_ONCE = 2**15
 """Numbers of frames that become a response at a time: so few stay in the cache. Whole frames of a sensor of 2048 pixels
 took ten times as long."""
+SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
+"""Sources of a frame's noise."""
 _LINES = 4
 """Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
 
@@ -131,6 +133,11 @@ class Session:
     def signs(self) -> FloatArray:
         """(n, N) first n rows of the smallest Hadamard matrix that has them; column 0 is all +1."""
         return stripe_signs(self.bench.n).astype(np.float64)
+
+    @property
+    def lit_lines(self) -> float:
+        """Part of the lines that are +1, mean over patterns: about half."""
+        return float((1 + self.signs).mean()) / 2
 
     @property
     def pairs(self) -> bool:
@@ -253,25 +260,44 @@ class LitSession:
         return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
 
     def response_variance(self, side: str) -> FloatArray:
-        """(pixels, pixels) mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form.
+        """(pixels, pixels) mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
+        variance: FloatArray = np.zeros(self.uniform_rate.shape)
+        for parts in self.response_variances(side):
+            for part in parts.values():
+                variance += part
+        return variance
 
-        Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 read^2 / t^2 with dark electrons D;
-        with one shot of a part p of the lines, about half, and a uniform one, 2 Y(positive) - Y(uniform), it is
-        (4 p L + L + 5 D) / t + 5 read^2 / t^2, and that of a dark frame's mean is added. Means of repeated shots have
-        their number's part of it. Of several exposures each pixel has the sum of these by the squares of its weights.
+    def response_variances(self, side: str) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+        """The same by source, (pixels, pixels) or one number each: what each response has of its own, and what all of
+        the ``side`` share.
+
+        Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
+        variance R of reading and rounding. 2 Y(positive) - Y(uniform) of a part p of the lines, about half, has
+        (4 p L + 4 D) / t + 4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 is shared, and that of a dark
+        frame's mean. Means of repeated shots have their number's part of it. Of several exposures each pixel has the
+        sum of these by the squares of its weights.
         """
         sensor, recipe, ladder = self.session.bench.sensor, self.session.recipe, self.ladders[side]
-        dark, read = sensor.superpixel_dark_current_e_per_s, sensor.superpixel_reading_noise_e**2
-        lit_lines = float((1 + self.session.signs).mean()) / 2
-        light_parts, shots = (1.0, 2) if self.session.pairs else (4 * lit_lines + 1, 5)
-        variance: FloatArray = np.zeros(self.uniform_rate.shape)
+        rounding = 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2)
+        # As many times a uniform shot's light, and another shot's other noise, as a response has.
+        lines, own_shots, shared_shots = (0.5, 2.0, 0.0) if self.session.pairs else (self.session.lit_lines, 4.0, 1.0)
+        own, shared = (dict.fromkeys((SHOT, DARK, READ, ROUNDING), np.zeros(1)) for _ in range(2))
         for number, time in enumerate(self.exposures_s):
-            own = (light_parts * self.uniform_rate + shots * dark) / time + shots * read / time**2
-            own /= recipe.repeats
-            if recipe.dark_frames:
-                own += (dark / time + read / time**2) / recipe.dark_frames
-            variance += own if ladder.weights is None else np.square(ladder.weights[number]) * own
-        return variance
+            weight: FloatArray | float = 1.0 if ladder.weights is None else np.square(ladder.weights[number])
+            single: dict[str, FloatArray | float] = {
+                SHOT: self.uniform_rate / time,
+                DARK: sensor.superpixel_dark_current_e_per_s / time,
+                READ: sensor.superpixel_reading_noise_e**2 / time**2,
+                ROUNDING: rounding / time**2,
+            }
+            for source, one in single.items():
+                part = lines if source == SHOT else 1.0
+                own[source] = own[source] + own_shots * part * weight * one / recipe.repeats
+                shots = shared_shots / recipe.repeats
+                if source != SHOT and recipe.dark_frames:
+                    shots += 1 / recipe.dark_frames
+                shared[source] = shared[source] + shots * weight * one
+        return own, shared
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
         """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.

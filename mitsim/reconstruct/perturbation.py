@@ -15,7 +15,8 @@ What any change of the frames does to W is a product of small matrices:
 * noise of variance v in each datum: the variance of each number of W is v, as U_L and U_R are orthonormal; of a frame
   that is taken off all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
 * noise of variance nu^2 in each number of the left factor that the frames do not know of: that of G is
-  nu^2 |sum_i p_i(x) U_Li|^2, and so on through the product, and the same of the right one.
+  nu^2 |sum_i p_i(x) U_Li|^2, and so on through the product, and the same of the right one;
+* an error of variance e^2 in each scene pixel's light, equal in all frames: that of W is e^2 s_L^2 s_R^2^T.
 
 The expected squared error of X^ is that of its mean and, as V is orthonormal, the sum of F^2 times these variances.
 """
@@ -23,7 +24,7 @@ The expected squared error of X^ is that of its mean and, as V is orthonormal, t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -34,6 +35,12 @@ from mitsim.rig.patterns import PatternFamily
 
 Terms = Sequence[tuple[FloatArray, FloatArray]]
 """Separable terms of a camera, left (m, n) and right (m', n') each."""
+
+
+def check_foretold(family: PatternFamily) -> None:
+    """MitsimError for patterns of a ``family`` whose images are not foretold."""
+    if family.signed:
+        raise MitsimError(f"patterns {family.name!r}: are shown as pairs of frames; take uniform, dots or random")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +137,19 @@ class Noise:
         of each datum of a frame that is taken off all others.
     left, right
         of each number of the factors, as far as frames do not share it.
+    light
+        of each scene pixel's light, as parts of a white board's, in all frames alike.
     """
 
     datum: float = 0.0
     ambient: float = 0.0
     left: float = 0.0
     right: float = 0.0
+    light: float = 0.0
+
+    def __add__(self, other: Noise) -> Noise:
+        """Both, of sources that do not know of each other."""
+        return Noise(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +175,7 @@ class LinearImage:
     centre: bool = False
 
     def __post_init__(self) -> None:
-        if self.family.signed:
-            raise MitsimError(
-                f"patterns {self.family.name!r}: are shown as pairs of frames; take uniform, dots or random"
-            )
+        check_foretold(self.family)
 
     def expected(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
         """The image of a scene.
@@ -197,11 +208,11 @@ class LinearImage:
                 for row, column in np.ndindex(gain.shape):
                     part = left.slabs[row].T @ changed.added @ right.slabs[column]
                     variance += changed.added_flicker**2 * self._energy(np.square(part))
-        variance += self._energy(self._noise(scene, noise))
+        variance += self.variance(scene, noise)
         return Expected(left.basis @ (self._filter * weights) @ right.basis.T, variance)
 
-    def _noise(self, scene: FloatArray, noise: Noise) -> FloatArray:
-        """(r, r') variance of W."""
+    def variance(self, scene: FloatArray, noise: Noise) -> float:
+        """Sum of the variances of all numbers of the image of a ``scene`` (n, n') by ``noise``."""
         left, right = self._axes
         total = np.full(self._filter.shape, noise.datum)
         total += noise.ambient * np.outer(*(np.square(axis.total).sum(axis=0) for axis in (left, right)))
@@ -209,7 +220,9 @@ class LinearImage:
             total += noise.left * left.noise @ np.square(scene @ (right.basis * right.singular))
         if noise.right:
             total += noise.right * np.square(scene.T @ (left.basis * left.singular)).T @ right.noise.T
-        return total
+        if noise.light:
+            total += noise.light * np.outer(np.square(left.singular), np.square(right.singular))
+        return self._energy(total)
 
     def _energy(self, variance: FloatArray) -> float:
         """Sum over the image of what has this ``variance``, or squares, in W."""

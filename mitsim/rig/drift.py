@@ -25,6 +25,18 @@ UNITS: Mapping[str, str] = MappingProxyType({
 })  # fmt: skip
 """Unit of each kind of drift: every field of :class:`Drift` that moves something by itself."""
 
+WORDS: Mapping[str, str] = MappingProxyType({
+    "mask_rows_um": "mask down the rows", "mask_columns_um": "mask along the columns",
+    "mask_axis_um": "mask away from the sensor", "mask_rotation_mrad": "mask turns in its plane",
+    "vibration_um": "vibration of the mask", "temperature_k": "temperature", "exposure": "exposure time",
+    "power": "projector's power", "power_ramp": "power over the capture",
+    "power_flicker": "power from frame to frame", "session_ramp": "power over the session",
+    "session_flicker": "power from frame to frame of the session", "lamp": "lamp after its frame",
+    "lamp_flicker": "lamp from frame to frame", "projector_rows": "picture down the rows",
+    "projector_columns": "picture along the columns", "black_level_dn": "black level",
+})  # fmt: skip
+"""What each kind of drift is, for people."""
+
 
 class MaskMotion(BaseModel):
     """How a mask is turned in its plane about its centre, from rows to columns, and how it moves during an exposure."""

@@ -2,14 +2,16 @@
 
 Factors of noisy frames are compared with those of the expected frames of the same light, whose difference is noise
 alone; how large it may be is predicted from the sensor's closed form, before any frame is drawn. What no separable
-camera explains of the expected frames is told apart by forming them again with one cause left out.
+camera explains of the expected frames is told apart by forming them again with one cause left out. What the session's
+noise, the capture's, and each drift of the recipe cost an image of the scene is predicted beside one image that is
+solved (:mod:`mitsim.study.budget`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,25 +20,40 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.capture.light import Light
 from mitsim.capture.request import Exposure, Request
+from mitsim.capture.run import digital_scale
 from mitsim.capture.session import LitSession, Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.manifests import SIDES as FACTORS
+from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.calibration import Estimate, decibels
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.perturbation import check_foretold
 from mitsim.rig.board import BoardShape
+from mitsim.rig.drift import WORDS, Drift
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.study import plots
+from mitsim.study.budget import CAPTURE, DRIFT, SOLVER, LossRow, losses
+from mitsim.study.charts import bars
+from mitsim.study.drift import SESSION, DriftStand
+from mitsim.study.exposures import LitScene
 from mitsim.study.knobs import reformed, without
-from mitsim.study.table import Table
+from mitsim.study.page import Part
+from mitsim.study.table import Mean, Table
 
 _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 """Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
 _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
 and bias and angle to first order do not hold."""
+_WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", DRIFT: "drift", SOLVER: "the solver"}
+"""Where a loss comes from, in words."""
+_NO_DRIFT = " The recipe has no table [drift]: calibration/drift.toml is one that has."
+_SAID_DB = 0.005
+"""Loss from which it is told in text: less is 0.00 there."""
 _SHOWN_DEVIATIONS = 4.0
 """Range of the maps: one of 16 000 entries lies beyond."""
 
@@ -93,6 +110,13 @@ class CalibrationFindings:
         separability residual of the expected frames, and of the noisy ones.
     session
         frames, seconds of exposure, photoelectrons and photons.
+    image
+        of a capture with these factors: ``patterns``, ``psnr_db``, and ``frames``, ``exposure_seconds``,
+        ``photoelectrons`` and ``photons`` of the capture; empty where none was made.
+    losses
+        what each source of noise and each drift costs it.
+    not_predicted
+        drifts whose cost is not, each with the reason.
     """
 
     entries: tuple[EntryRow, ...]
@@ -101,6 +125,10 @@ class CalibrationFindings:
     maps: dict[str, FloatArray]
     residual: tuple[float, float]
     session: dict[str, float]
+    image: dict[str, Any] = field(default_factory=dict)
+    losses: tuple[LossRow, ...] = ()
+    not_predicted: tuple[str, ...] = ()
+    title: ClassVar[str] = "What a calibration session leaves to be wished for"
 
     def payload(self) -> dict[str, Any]:
         """The JSON of the command line."""
@@ -111,6 +139,9 @@ class CalibrationFindings:
             "singular": [asdict(row) for row in self.singular],
             "causes": [asdict(row) for row in self.causes],
             "session": self.session,
+            "image": self.image,
+            "losses": [asdict(row) for row in self.losses],
+            "not_predicted": self.not_predicted,
         }
 
     def lines(self) -> list[str]:
@@ -136,7 +167,23 @@ class CalibrationFindings:
             *causes,
             f"{self.session['frames']:.0f} frames, {self.session['exposure_seconds']:.3g} s of exposure, "
             f"{self.session['photons']:.3g} photons on the sensor",
+            *self._image_lines(),
         ]
+
+    def _image_lines(self) -> Iterator[str]:
+        if not self.image:
+            return
+        image = self.image
+        yield (
+            f"image under {image['patterns']}: PSNR {image['psnr_db']:.2f} dB, {image['frames']} frames, "
+            f"{image['exposure_seconds']:.3g} s of exposure, {image['photons']:.3g} photons; it loses by"
+        )
+        yield from (
+            f"{row.name:>42}: {row.lost_db:.2f} +- {row.error_db:.2f} dB"
+            for row in self.losses
+            if row.lost_db >= _SAID_DB
+        )
+        yield from (f"not predicted: {text}" for text in self.not_predicted)
 
     def figures(self) -> dict[str, Figure]:
         """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
@@ -149,13 +196,106 @@ class CalibrationFindings:
             for name in self.maps
         }
         found["singular.png"] = plots.singular_errors(rows)
-        return {**found, "causes.png": plots.error_bars(parts)} if parts else found
+        if parts:
+            found["causes.png"] = plots.error_bars(parts)
+        rated = {row.name: Mean(row.lost_db, row.error_db, 1) for row in self.losses if row.lost_db >= _SAID_DB}
+        if rated:
+            found["losses.png"] = bars(rated, "PSNR lost [dB]")
+        return found
+
+    def parts(self) -> Sequence[Part]:
+        """Of the page: what an image loses, light and time, errors of the factors, what is not separable."""
+        found = [self._light_part()]
+        if self.losses:
+            found.insert(0, self._losses_part())
+        entries = [
+            (
+                row.factor,
+                f"{row.error:.2e}",
+                f"{row.predicted_error:.2e}",
+                f"{row.chi_square:.3f}",
+                f"{row.largest:.1f}",
+            )
+            for row in self.entries
+        ]
+        found.append(
+            Part(
+                "Errors of the factors",
+                "Noisy factors against those of expected frames of the same light: error, found and predicted "
+                "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
+                "in predicted deviations. Maps: sensor pixels down, scene pixels across. Then each "
+                "singular value's error, beside its predicted standard error.",
+                ("Factor", "Error", "Predicted", "Chi-square", "Largest"),
+                tuple(entries),
+                (*self.maps_files, "singular.png"),
+            )
+        )
+        causes = [
+            (row.cause, f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}") for row in self.causes
+        ]
+        found.append(
+            Part(
+                "What is not separable",
+                f"No separable camera explains {self.residual[1]:.2e} of the noisy responses, {self.residual[0]:.2e} "
+                "of those without noise (relative rms). Without each cause alone, so much is left; its part is the "
+                "root of the difference of the squares, below 0 where more is left without it.",
+                ("Cause", "Residual without it", "Part"),
+                tuple(causes),
+                ("causes.png",),
+            )
+        )
+        return found
+
+    @property
+    def maps_files(self) -> tuple[str, ...]:
+        """Figures of the maps."""
+        return tuple(f"{name}.png" for name in self.maps)
+
+    def _losses_part(self) -> Part:
+        ordered = sorted(self.losses, key=lambda row: -row.lost_db)
+        rows = [
+            (
+                _WHERE[row.of],
+                WORDS.get(row.source, row.source),
+                row.amount,
+                f"{row.lost_db:.2f} \N{PLUS-MINUS SIGN} {row.error_db:.2f}",
+            )
+            for row in ordered
+        ]
+        untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
+        return Part(
+            "What an image loses",
+            f"The image of this scene under {self.image['patterns']} has a PSNR of {self.image['psnr_db']:.2f} dB with "
+            "these factors. Noise: what it would gain without that source alone. Drift between calibration and "
+            "capture, by the amounts of the recipe: what it would lose. All are predicted in closed form with lambda "
+            "as it is; the uncertainty is the prediction's own. Losses do not add up."
+            + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
+            + untold,
+            ("Where", "Source", "Amount", "PSNR lost [dB]"),
+            tuple(rows),
+            ("losses.png",),
+        )
+
+    def _light_part(self) -> Part:
+        columns = {"session": self.session, "capture": self.image}
+        names = ("frames", "exposure_seconds", "photoelectrons", "photons")
+        rows = [
+            (where, *(f"{facts[name]:.4g}" for name in names)) for where, facts in columns.items() if "frames" in facts
+        ]
+        return Part(
+            "Light and time",
+            "Frames, their exposure without read-out, and what the whole sensor gets in all of them. How much a wanted "
+            "PSNR needs: mitsim calibrate SCENE --plan --psnr DB.",
+            ("", "Frames", "Exposure [s]", "Photoelectrons", "Photons"),
+            tuple(rows),
+        )
 
     def tables(self) -> dict[str, Table]:
         """By file name."""
         return {
             "singular.csv": Table(tuple(asdict(row) for row in self.singular)),
             "causes.csv": Table(tuple(asdict(row) for row in self.causes)),
+            "losses.csv": Table(tuple(asdict(row) for row in self.losses)),
         }
 
 
@@ -172,19 +312,57 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     Raises
     ------
     MitsimError
-        for a recipe with depths, or whose patterns are taken with a uniform frame: its noise is shared.
+        for a recipe with depths, for light beyond what is allowed, and for patterns that losses are not predicted for.
+
+    Notes
+    -----
+    The session is taken without its drift: what that costs is predicted, as of all other drifts.
     """
     recipe = recipe or load_recipe()
-    if recipe.depths or recipe.signed_capture != "pair":
+    if recipe.depths:
         raise MitsimError(
-            "study calibration: takes a session at one depth whose signed_capture is 'pair'; give such a recipe"
+            f"study calibration: the recipe has {len(recipe.depths)} depths, and a report is of one session; leave "
+            "depths out, and move the board's plane by -D or the scene's scene_distance"
         )
+    family = bench.family(request.patterns, request.seed)
+    check_foretold(family)
     Exposure(None, recipe.exposure_fraction).check(bench.rig)
-    session = Session(bench, recipe, request.seed)
+    session = Session(bench, recipe.model_copy(update={"drift": Drift()}), request.seed)
     plan = session.plan(request.accuracy, job)
     lit = session.lit(session.trace(plan, job), job)
     (noisy, clean), _ = estimates(lit, job, (NOISY, NOISE_FREE))
-    return judged(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
+    found = judged(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
+    scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
+    stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
+    rows, refused = losses(stand, lit)
+    return replace(found, image=_image(stand), losses=tuple(rows), not_predicted=tuple(refused))
+
+
+def _factors(lit: LitSession, estimate: Estimate) -> Factors:
+    """The ``estimate`` of a session ``lit`` as factors of its camera."""
+    session = lit.session
+    manifest = CalibrationManifest(
+        camera=session.bench.identity(),
+        centre=session.centre,
+        board_reflectance=session.recipe.board_reflectance,
+        digital=digital_scale(session.bench, lit.exposure_s),
+        parallax=session.bench.parallax,
+    )
+    return Factors.of(estimate, manifest)
+
+
+def _image(stand: DriftStand) -> dict[str, Any]:
+    """PSNR of the image without a drift, and what its capture takes."""
+    frames = len(stand.family.shots)
+    electrons = stand.electrons
+    return {
+        "patterns": stand.family.name,
+        "psnr_db": stand.before_db,
+        "frames": frames,
+        "exposure_seconds": frames * stand.exposure_s,
+        "photoelectrons": electrons,
+        "photons": electrons / (stand.lit.bench.sensor.quantum_efficiency or np.nan),
+    }
 
 
 @single_threaded_blas()
@@ -206,10 +384,10 @@ def judged(lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[Caus
         # Factors are known up to a common scale and sign; this one is not drawn towards zero by the noise.
         found = found * (np.vdot(exact, exact) / np.vdot(found, exact))
         deviation = entry_deviation(lit, clean, side)
-        off = (found - exact) / deviation[:, None]
+        off = (found - exact) / deviation
         maps[name] = off
         norm = float(np.linalg.norm(exact))
-        predicted = float(np.linalg.norm(deviation)) * np.sqrt(exact.shape[1]) / norm
+        predicted = float(np.linalg.norm(deviation)) / norm
         error = float(np.linalg.norm(found - exact)) / norm
         entries.append(EntryRow(name, error, predicted, float(np.abs(off).max()), float(np.square(off).mean())))
         singular += list(singular_rows(name, exact, found, deviation))
@@ -224,10 +402,11 @@ def judged(lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[Caus
 
 
 def entry_deviation(lit: LitSession, clean: Estimate, side: str) -> FloatArray:
-    """(m,) predicted standard deviation of the entries of each row of a factor, of all columns alike.
+    """(m, n) predicted standard deviation of the entries of a factor.
 
     u_i = Y_i v / |v|^2 has the variance sum_c V_rc v_c^2 / |v|^4 in row r, V being that of a response's pixels, and
-    U H^T / N averages N of them with signs.
+    U H^T / N averages N of them with signs. Noise that all responses share comes into column p by the mean of its
+    signs: all of it where they are all +1, and nothing elsewhere.
 
     Parameters
     ----------
@@ -237,18 +416,25 @@ def entry_deviation(lit: LitSession, clean: Estimate, side: str) -> FloatArray:
         whose stripes give the factor.
     """
     common = (clean.right if side == SIDES[0] else clean.left).sum(axis=1)
-    variance = lit.response_variance(side)
-    variance = variance if side == SIDES[0] else variance.T
-    spread = variance @ np.square(common)
-    return np.asarray(np.sqrt(spread / lit.session.signs.shape[1]) / np.dot(common, common))
+    own, shared = (_spread(lit, parts, side, np.square(common)) for parts in lit.response_variances(side))
+    signs = lit.session.signs
+    spread = np.add.outer(own / signs.shape[1], np.zeros(len(signs))) + np.outer(shared, signs.mean(axis=1) ** 2)
+    return np.asarray(np.sqrt(spread) / np.dot(common, common))
+
+
+def _spread(lit: LitSession, parts: dict[str, FloatArray], side: str, weights: FloatArray) -> FloatArray:
+    """(m,) sum over the other side's pixels of the variance of all ``parts``, by ``weights``."""
+    variance = np.broadcast_to(sum(parts.values(), np.zeros(1)), lit.uniform_rate.shape)
+    return np.asarray((variance if side == SIDES[0] else variance.T) @ weights)
 
 
 def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: FloatArray) -> Iterator[SingularRow]:
     """Singular values and vectors of a factor with noise beside those without.
 
-    To first order s_k moves by u_k^T E v_k, to second order by the mean s^2 ((m - n) / (2 s_k) + sum_j s_k / (s_k^2 -
-    s_j^2)) of noise of the deviation s; v_k turns by sqrt(sum_j s^2 (s_k^2 + s_j^2)) / |s_k^2 - s_j^2| (Stewart and Sun
-    1990, Matrix Perturbation Theory, chapter V). Both want gaps between values that are larger than their errors.
+    With a_jk = u_j^T E v_k, to first order s_k moves by a_kk, to second order by the mean of sum_j (s_k (a_jk^2 +
+    a_kj^2) + 2 s_j a_jk a_kj) / (2 (s_k^2 - s_j^2)) + |(1 - U U^T) E v_k|^2 / (2 s_k), and v_k turns by the root of
+    sum_j (s_k a_kj + s_j a_jk)^2 / (s_k^2 - s_j^2)^2 (Stewart and Sun 1990, Matrix Perturbation Theory, chapter V).
+    Both want gaps between values that are larger than their errors.
 
     Parameters
     ----------
@@ -257,29 +443,35 @@ def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: 
     exact, found
         (m, n) without and with noise.
     deviation
-        (m,) of each row's entries.
+        (m, n) of each entry, independent.
     """
     left, values, right = np.linalg.svd(exact, full_matrices=False)
     _, noisy, turned = np.linalg.svd(found, full_matrices=False)
-    errors = np.sqrt(np.square(deviation) @ np.square(left))
-    variance = float(np.square(deviation).mean())
-    rows, columns = exact.shape
-    squares = np.square(values)
+    variance = np.square(deviation)
+    # Means of a_jk^2 and of a_jk a_kj, at [j, k]; and of what leaves the span of U, by k.
+    squares = np.square(left).T @ variance @ np.square(right).T
+    products = np.zeros_like(squares)
+    for column, vector in zip(variance.T, right.T, strict=True):
+        products += (left.T * column) @ left * np.outer(vector, vector)
+    beyond = (1 - np.square(left).sum(axis=1)) @ variance @ np.square(right).T
     for number, value in enumerate(values):
-        others = np.delete(squares, number)
-        gaps = squares[number] - others
-        with np.errstate(divide="ignore", over="ignore"):
-            bias = variance * ((rows - columns) / (2 * value) + float(np.sum(value / gaps)))
-            angle = float(np.sqrt(variance * np.sum((squares[number] + others) / np.square(gaps))))
+        others = np.arange(len(values)) != number
+        rest, gaps = values[others], value**2 - np.square(values[others])
+        to, back, both = (each[others] for each in (squares[:, number], squares[number], products[:, number]))
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            bias = float(np.sum((value * (to + back) + 2 * rest * both) / (2 * gaps)) + beyond[number] / (2 * value))
+            turns = (value**2 * back + rest**2 * to + 2 * value * rest * both) / np.square(gaps)
+            angle = float(np.sqrt(turns.sum()))
         cosine = min(abs(float(np.dot(right[number], turned[number]))), 1.0)
+        error = float(np.sqrt(squares[number, number]))
         yield SingularRow(
             factor=factor,
             number=number,
             value=float(value),
             noisy=float(noisy[number]),
-            standard_error=float(errors[number]),
+            standard_error=error,
             bias=bias,
-            off=float((noisy[number] - value - bias) / errors[number]),
+            off=float((noisy[number] - value - bias) / error),
             predicted_angle=min(angle, float(np.pi / 2)),
             angle=float(np.arccos(cosine)),
         )
@@ -287,12 +479,14 @@ def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: 
 
 def spent(lit: LitSession) -> dict[str, float]:
     """Frames, seconds of exposure, expected photoelectrons and photons of a session ``lit``, without its read-out."""
-    recipe, pairs = lit.session.recipe, len(lit.session.order) / 2
+    recipe, order = lit.session.recipe, len(lit.session.order)
     lit_s = sum(lit.exposures_s) * recipe.repeats
-    electrons = float(lit.uniform_rate.sum()) * pairs * lit_s
+    # Shots of uniform light: both of a pair together are one.
+    uniform = order / 2 if lit.session.pairs else 2 + (order - 2) * lit.session.lit_lines
+    electrons = float(lit.uniform_rate.sum()) * uniform * lit_s
     return {
         "frames": lit.session.shots,
-        "exposure_seconds": 2 * pairs * lit_s + recipe.dark_frames * sum(lit.exposures_s),
+        "exposure_seconds": order * lit_s + recipe.dark_frames * sum(lit.exposures_s),
         "photoelectrons": electrons,
         "photons": electrons / (lit.session.bench.sensor.quantum_efficiency or np.nan),
     }

@@ -151,6 +151,20 @@ def paired(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: 
     return figure
 
 
+def bars(values: Mapping[str, Mean], x: str) -> Figure:
+    """A bar and its error for each of some ``values``, the largest on top; ``x`` names the axis, with its unit."""
+    ordered = sorted(values.items(), key=lambda item: item[1].value)
+    figure, axes = figure_of(0.9 + _ROW * len(ordered))
+    rows, lengths = np.arange(len(ordered)), [mean.value for _, mean in ordered]
+    axes.barh(rows, lengths, 0.66, xerr=[mean.error for _, mean in ordered], color=_END, capsize=3)
+    axes.set_yticks(rows, [name for name, _ in ordered])
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlim(0, 1.1 * max(mean.value + mean.error for _, mean in ordered) or 1.0)
+    axes.set_ylim(-0.6, len(ordered) - 0.4)
+    label_axes(axes, x, "", grid="x")
+    return figure
+
+
 @dataclass(frozen=True)
 class Step:
     """Change [dB] that an effect called ``name`` brings: as a step in order, alone, and to the whole without it; None

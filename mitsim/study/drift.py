@@ -11,6 +11,7 @@ truth, the mean noise of a datum and, for lamps, the frame of their light.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,7 +25,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.perturbation import Changed, LinearImage, Noise
+from mitsim.reconstruct.perturbation import Changed, Expected, LinearImage, Noise
 from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.rig.drift import Drift
 from mitsim.rig.order import SIDES
@@ -36,6 +37,8 @@ from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed, ac
 from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import psnr
 
+AMBIENT, SESSION = "ambient frame", "session"
+"""Sources of noise beside those of frames."""
 _STEP_MM = 5e-4
 """Shift over which a shadow's slope is taken either way: half a micrometre, a twentieth of a pixel."""
 _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
@@ -43,22 +46,49 @@ _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Foretold:
+    """What a drift is predicted to cost.
+
+    Attributes
+    ----------
+    before_db
+        PSNR [dB] without the drift, measured.
+    predicted_before_db, predicted_db
+        without the drift, and with it and the same lambda, as predicted.
+    """
+
+    before_db: float
+    predicted_before_db: float
+    predicted_db: float
+
+    @property
+    def predicted_lost_db(self) -> float:
+        """The squared error that the drift adds, beside that of the image without it."""
+        added = squared_error(self.predicted_db) - squared_error(self.predicted_before_db)
+        return 10 * math.log10(1 + added / squared_error(self.before_db))
+
+    @property
+    def predicted_error_db(self) -> float:
+        """How sure that is: what changes if the image without the drift is as predicted as well.
+
+        What the model leaves out of it, such as detail inside projector pixels, may have any share in the error that
+        the drift adds.
+        """
+        return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
+
+
+@dataclass(frozen=True)
+class Outcome(Foretold):
     """Images with and without a drift.
 
     Attributes
     ----------
-    before_db, after_db, auto_db
-        PSNR [dB] without the drift, with it and the same lambda, and with it and a lambda of its own.
-    predicted_before_db, predicted_db
-        the first two as predicted.
+    after_db, auto_db
+        PSNR [dB] with the drift, by the lambda from before it and by one of its own.
     """
 
-    before_db: float
     after_db: float
     auto_db: float
-    predicted_before_db: float
-    predicted_db: float
 
     @property
     def lost_db(self) -> float:
@@ -69,21 +99,6 @@ class Outcome:
     def lost_auto_db(self) -> float:
         """The same where the solver chooses lambda again."""
         return self.before_db - self.auto_db
-
-    @property
-    def predicted_lost_db(self) -> float:
-        """The same, predicted: the squared error that the drift adds, beside that of the image without it."""
-        added = _square(self.predicted_db) - _square(self.predicted_before_db)
-        return 10 * math.log10(1 + added / _square(self.before_db))
-
-    @property
-    def predicted_error_db(self) -> float:
-        """How sure that is: what changes if the image without the drift is as predicted as well.
-
-        What the model leaves out of it, such as detail inside projector pixels, may have any share in the error that
-        the drift adds.
-        """
-        return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +136,16 @@ class DriftStand:
             the scene in light of the projector that moved; None: its light as it was.
         """
         after, auto = self.measured(drift, session, lit)
-        return Outcome(
-            before_db=psnr(self._before.image, self.lit.truth),
-            after_db=after,
-            auto_db=auto,
-            predicted_before_db=self._predicted(Drift()),
-            predicted_db=self._predicted(drift),
-        )
+        return Outcome(**vars(self.foretold(drift)), after_db=after, auto_db=auto)
+
+    def foretold(self, drift: Drift) -> Foretold:
+        """What a ``drift`` is predicted to do; MitsimError for one that the bench cannot have."""
+        return Foretold(self.before_db, self._predicted(Drift()), self._predicted(drift))
+
+    @property
+    def before_db(self) -> float:
+        """PSNR [dB] without a drift."""
+        return psnr(self._before.image, self.lit.truth)
 
     def measured(
         self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None
@@ -150,7 +168,7 @@ class DriftStand:
         bench = scene.bench
         moved = any(drift.mask_mm) or drift.motion is not None
         expected = scene.expected(RENDERED, self.family, bench=drifted(bench, drift) if moved else None)
-        base = self._frames.exposer(self._seconds)
+        base = self._frames.exposer(self.exposure_s)
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
         exposer = DriftedExposer(bench.rig, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
         (sums,) = accumulate(exposer, self.family, expected, [model])
@@ -161,7 +179,8 @@ class DriftStand:
         return self.lit.rendered(self.factors, self.family, self.seed)
 
     @cached_property
-    def _seconds(self) -> float:
+    def exposure_s(self) -> float:
+        """Exposure time of each frame [s]."""
         return self._frames.seconds(EQUAL_PEAK)
 
     @cached_property
@@ -171,12 +190,18 @@ class DriftStand:
     @cached_property
     def _before(self) -> Solution:
         """The image without any drift."""
-        (sums,) = accumulate(self._frames.exposer(self._seconds), self.family, self._expected, [self._model])
+        (sums,) = accumulate(self._frames.exposer(self.exposure_s), self.family, self._expected, [self._model])
         return self._model.solve(sums, "auto")
 
     @property
     def _expected(self) -> ExpectedFrames:
         return self._frames.expected
+
+    @property
+    def electrons(self) -> float:
+        """Expected photoelectrons of all frames without a drift, on the whole sensor."""
+        exposer = self._frames.exposer(self.exposure_s)
+        return float(sum(exposer.electrons(frame).sum() for frame in self._expected))
 
     def session_mixes(self, drift: Drift) -> tuple[FloatArray, FloatArray]:
         """(n, n) that each factor of a session is multiplied by, on the right, as its power drifts by a ``drift``.
@@ -204,7 +229,7 @@ class DriftStand:
 
     def _predicted(self, drift: Drift) -> float:
         """PSNR [dB] that an image is expected to have after a ``drift``."""
-        image, changed = self._linear, self._changed(drift)
+        image, changed = self.linear, self._changed(drift)
         if drift.session_ramp or drift.session_flicker:
             left, right = self.session_mixes(drift)
             image = replace(image, left=self.factors.left @ left, right=self.factors.right @ right)
@@ -212,20 +237,34 @@ class DriftStand:
             changed = replace(changed, terms=[*changed.terms, *others])
         return image.expected(self.lit.truth, changed, self._noise).psnr_db(self.lit.truth)
 
+    @property
+    def still(self) -> Expected:
+        """What the image without a drift and without any noise is expected to be."""
+        return self.linear.expected(self.lit.truth, self._changed(Drift()))
+
     @cached_property
-    def _linear(self) -> LinearImage:
+    def linear(self) -> LinearImage:
+        """The solver, its lambda that of the image without a drift."""
         factors = self.factors
         return LinearImage(factors.left, factors.right, self.family, self._before.lam, factors.manifest.centre)
 
-    @cached_property
+    @property
     def _noise(self) -> Noise:
         """Of the frames, of the ambient frame, and of the session."""
-        known, exposer, ambient = self.factors.manifest.noise, self._frames.exposer(self._seconds), 0.0
+        return sum(self.noises.values(), Noise())
+
+    @cached_property
+    def noises(self) -> Mapping[str, Noise]:
+        """The same by source: those of the frames by name, ``ambient frame`` and ``session``."""
+        found = {name: Noise(datum=variance) for name, variance in self._frames.noises(self.exposure_s).items()}
         if self._takes_ambient:
+            exposer = self._frames.exposer(self.exposure_s)
             off = exposer.electrons(self._expected.projector_off)
-            ambient = (exposer.sensor_noise(off) / self._seconds) ** 2 / shots_for(self.family)
-        left, right = (known.left**2, known.right**2) if known else (0.0, 0.0)
-        return Noise(self._frames.noise(self._seconds) ** 2, ambient, left, right)
+            variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / shots_for(self.family)
+            found[AMBIENT] = Noise(ambient=variance)
+        if known := self.factors.manifest.noise:
+            found[SESSION] = Noise(left=known.left**2, right=known.right**2)
+        return found
 
     @property
     def _takes_ambient(self) -> bool:
@@ -259,7 +298,7 @@ class DriftStand:
     def _offset(self, drift: Drift) -> float:
         """What every datum reads beyond its light [electrons/s]."""
         sensor = self.lit.bench.sensor
-        black = drift.black_level_dn * sensor.codes / sensor.gain_dn_per_e / self._seconds
+        black = drift.black_level_dn * sensor.codes / sensor.gain_dn_per_e / self.exposure_s
         dark = warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
         return black + dark - sensor.superpixel_dark_current_e_per_s
 
@@ -308,7 +347,7 @@ class DriftStand:
         return self.lit.light.simulation.physics.spectrum
 
 
-def _square(db: float) -> float:
+def squared_error(db: float) -> float:
     """Mean squared error of a PSNR ``db``, peak 1."""
     return float(10 ** (-db / 10))
 

@@ -22,6 +22,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer, peak_irradiance
 from mitsim.capture.light import Light
 from mitsim.capture.request import Exposure
+from mitsim.capture.session import DARK, READ, ROUNDING, SHOT
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
@@ -29,10 +30,13 @@ from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.rig.patterns import PatternFamily
+from mitsim.sensor.specimen import response_variance
 from mitsim.study.ideal import IdealCamera, Plane
 from mitsim.study.metrics import Quality, psnr
 
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
+NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
+"""Sources of noise beside those of :mod:`mitsim.capture.session`."""
 DIM_E = 5600
 """Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
 dots, mask at 2000 um: 22.8 and 34.8 (`benchmarks/noise_reading.py --distance 2`)."""
@@ -208,11 +212,23 @@ class Unexposed:
 
     def noise(self, seconds: float) -> float:
         """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
+        return float(np.sqrt(sum(self.noises(seconds).values())))
+
+    def noises(self, seconds: float) -> dict[str, float]:
+        """Its variance [(electrons/s)^2] by source. What pixels' responses differ by is fixed, and counts as noise:
+        factors know nothing of it."""
         exposer, sensor = self.exposer(seconds), self.lit.bench.sensor
-        rounding = 0.0 if sensor.bits is None else 1 / (12 * sensor.gain_dn_per_e**2)
-        read = sensor.superpixel_reading_noise_e**2 + sensor.superpixel_dark_current_e_per_s * seconds + rounding
-        variances = [exposer.electrons(frame).mean() + read for frame in self.expected]
-        return float(np.sqrt(np.mean(variances))) / seconds
+        light = [exposer.electrons(frame) for frame in self.expected]
+        square = float(np.mean([np.square(frame).mean() for frame in light]))
+        parts = {
+            SHOT: float(np.mean([frame.mean() for frame in light])),
+            DARK: sensor.superpixel_dark_current_e_per_s * seconds,
+            READ: sensor.superpixel_reading_noise_e**2,
+            ROUNDING: 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2),
+            NONUNIFORMITY: response_variance(sensor) * square,
+            SPECKLE: exposer.speckle**2 * square,
+        }
+        return {name: variance / seconds**2 for name, variance in parts.items()}
 
 
 def peak_time(bench: Bench, expected: ExpectedFrames) -> float:

@@ -66,6 +66,36 @@ class Section:
         )
 
 
+@dataclass(frozen=True)
+class Part:
+    """Of a page of one study: a table of ``rows`` under ``head``, in words, and ``figures`` by file name."""
+
+    title: str
+    lead: str
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    figures: tuple[str, ...] = ()
+
+
+def build_findings(name: str, title: str, where: str, parts: Sequence[Part], figures: Mapping[str, Figure]) -> str:
+    """The page of a study of one bench, as HTML.
+
+    Parameters
+    ----------
+    name, title
+        of the study, and the page's head.
+    where
+        of which scene and patterns it is.
+    parts
+        of the page, in order.
+    figures
+        by file name.
+    """
+    pictures = {file: (_address(figure), _width(figure)) for file, figure in figures.items()}
+    template = _environment().get_template("findings.html")
+    return template.render(name=name, title=title, where=where, parts=parts, pictures=pictures, versions=versions())
+
+
 def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     """Write a page, all or nothing, and return its path.
 
@@ -78,12 +108,15 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     path
         where.
     """
-    loader = PackageLoader("mitsim.study")
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    text = environment.get_template("study.html").render(title=title, sections=sections, versions=versions())
+    text = _environment().get_template("study.html").render(title=title, sections=sections, versions=versions())
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
     return path
+
+
+def _environment() -> Environment:
+    loader = PackageLoader("mitsim.study")
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
 
 
 def _options(scope: Scope) -> list[str]:

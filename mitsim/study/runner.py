@@ -17,6 +17,7 @@ from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, sweep, whole_file
 from mitsim.core.versions import versions
+from mitsim.study.page import Part, build_findings
 from mitsim.study.table import Table
 
 DPI = 150
@@ -42,6 +43,16 @@ class Tabled(Protocol):
 
     def tables(self) -> Mapping[str, Table]:
         """By file name."""
+
+
+@runtime_checkable
+class Paged(Protocol):
+    """Findings with a page."""
+
+    title: str
+
+    def parts(self) -> Sequence[Part]:
+        """Of the page."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +86,7 @@ def run_study(
     request: Request | None = None,
     job: Job | None = None,
 ) -> StudyResult:
-    """Measure, and write NAME.json, figures and tables to a folder.
+    """Measure, and write NAME.json, figures, tables and a page, where there are such, to a folder.
 
     MitsimError for an output that cannot be written or holds something else, and for what the study itself refuses.
 
@@ -89,15 +100,21 @@ def run_study(
         new or empty folder, or one with an earlier study of that name, which is replaced.
     """
     request = request or Request.of()
-    with study_folder(output, name, ("*.png", "*.csv")) as folder:
+    with study_folder(output, name, ("*.png", "*.csv", f"{name}.html")) as folder:
         findings = measure(bench, request, job or Job())
         scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
         result = StudyResult(findings, scene, patterns, str(folder))
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
-        for file, figure in findings.figures().items():
+        figures = findings.figures()
+        for file, figure in figures.items():
             with whole_file(folder / file) as part:
                 figure.savefig(part, dpi=DPI, format="png")
+        if isinstance(findings, Paged):
+            where = f"{scene}, patterns {patterns}, seed {request.seed}"
+            page = build_findings(name, findings.title, where, findings.parts(), figures)
+            with whole_file(folder / f"{name}.html") as part:
+                part.write_text(page, encoding="utf-8")
         for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():
             table.write(folder / file)
         return result

@@ -107,17 +107,21 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
         one[place] = 1
         return one
 
+    pixels = np.eye(N * N).reshape(-1, N, N)
     data = [single(place) for place in np.ndindex(dark.shape)]
     common = [single((slice(None), slice(None), *place)) for place in np.ndindex(PIXELS, PIXELS)]
     alone = [single((row, column)) for row, column in np.ndindex(count)]
     of_frames, of_added = ([frames * one for one in alone] for frames in (seen, FRAME))
     left = [shadow(unit(place), RIGHT, shown) for place in np.ndindex(PIXELS, N)]
     right = [shadow(LEFT, unit(place), shown) for place in np.ndindex(PIXELS, N)]
+    light = [np.einsum("mn,ni,nN,Nj,MN->ijmM", LEFT, shown.left, one, shown.right, RIGHT) for one in pixels]
     cases = [
         (None, Noise(datum=0.7), 0.7, data),
         (None, Noise(ambient=0.7), 0.7, common),
         (None, Noise(left=0.7), 0.7, left),
         (None, Noise(right=0.7), 0.7, right),
+        (None, Noise(light=0.7), 0.7, light),
+        (None, Noise(datum=0.2, light=0.1) + Noise(datum=0.5, light=0.6), 0.7, data + light),
         (Changed(flicker=0.3), None, 0.09, of_frames),
         (Changed(added=FRAME, added_gain=0.0, added_flicker=0.3), None, 0.09, of_added),
         (Changed(added=FRAME, added_gain=0.0, added_common=0.3), None, 0.09, [dark + FRAME]),

@@ -8,42 +8,53 @@ import numpy as np
 import pytest
 
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimates
+from mitsim.capture.request import Request
+from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.study.calibration import _row, judged, singular_rows, spent
-from tests.unit.capture.test_responses import CLIPPED, lit_session
+from mitsim.rig.recipe import load_recipe
+from mitsim.study.budget import LossRow, gained
+from mitsim.study.calibration import CalibrationFindings, _row, judged, measure, singular_rows, spent
+from mitsim.study.page import build_findings
+from tests.unit.capture.test_responses import CLIPPED, EXPOSURE_S, lit_session
 
 SEEDS = 40
 
 
-def test_errors_of_factors_are_those_that_are_predicted() -> None:
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_errors_of_factors_are_those_that_are_predicted(mode: str) -> None:
     """Over 40 sessions of their own noise: 168 and 189 entries of unit variance each, less what a common scale takes.
-    (Planted: the other side's common vector, N left out.)"""
-    lit = lit_session(7)
+    What the uniform shot brings to all responses is in one column alone, and there as much as predicted. (Planted: the
+    other side's common vector, N left out; shared noise over all columns, and left out.)"""
+    lit = lit_session(7, mode)
     squares: dict[str, list[float]] = {"left": [], "right": []}
-    found_errors, stated_errors = [], []
+    found_errors, stated_errors, columns = [], [], []
     for seed in range(SEEDS):
         own = replace(lit, session=replace(lit.session, seed=seed))
         (noisy, clean), _ = estimates(own, Job(), (NOISY, NOISE_FREE))
         report = judged(own, noisy, clean)
+        columns.append(np.square(report.maps["left"]).mean(axis=0))
         for row in report.entries:
             squares[row.factor].append(row.chi_square)
             found_errors.append(row.error)
             stated_errors.append(row.predicted_error)
     for values in squares.values():
         assert np.mean(values) == pytest.approx(1, abs=0.06)
+    # 40 x 24 squares of unit variance: 5 standard errors.
+    assert np.mean(columns, axis=0) == pytest.approx(1, abs=5 * np.sqrt(2 / (SEEDS * 24)))
     assert np.sqrt(np.mean(np.square(found_errors))) == pytest.approx(np.mean(stated_errors), rel=0.03)
 
 
 def test_singular_values_and_vectors_move_as_their_perturbation_says() -> None:
-    """300 draws of noise on a factor of 40 x 4, whose rows have different noise: mean and spread of each value, and the
-    angle of each right vector. (Planted: bias of the other sign, angles without the gaps.)"""
+    """300 draws of noise on a factor of 40 x 4, whose rows, and one column, have different noise: mean and spread of
+    each value, and the angle of each right vector. (Planted: bias of the other sign, angles without the gaps, products
+    left out, the noise of the first column for all.)"""
     rng = np.random.default_rng(5)
     left, _ = np.linalg.qr(rng.standard_normal((40, 4)))
     right, _ = np.linalg.qr(rng.standard_normal((4, 4)))
     exact = left * [40.0, 25.0, 12.0, 6.0] @ right.T
-    deviation = rng.uniform(0.3, 0.5, 40)
+    deviation = np.outer(rng.uniform(0.3, 0.5, 40), [1.0, 1.0, 2.5, 1.0])
     draws = [
-        list(singular_rows("left", exact, exact + deviation[:, None] * rng.standard_normal(exact.shape), deviation))
+        list(singular_rows("left", exact, exact + deviation * rng.standard_normal(exact.shape), deviation))
         for _ in range(300)
     ]
     for rows in zip(*draws, strict=True):
@@ -63,6 +74,69 @@ def test_light_and_time_of_a_session_are_counted() -> None:
     assert found["photons"] == pytest.approx(2 * found["photoelectrons"])
     dark = lit_session(7, "uniform", rig=CLIPPED, dark_frames=5)
     assert spent(dark)["exposure_seconds"] == pytest.approx((18 + 5) * 0.02)
+    shown = 2 + 2 * float((1 + dark.session.signs).sum()) / 2 / 7
+    assert spent(dark)["photoelectrons"] == pytest.approx(float(dark.uniform_rate.sum()) * shown * 0.02)
+
+
+def test_a_part_of_the_error_gains_what_is_left_without_it() -> None:
+    """A quarter of an image's error is 1.25 dB; a model that has half of that error has it for half of its own, 3.01
+    dB. Where twice as much is predicted as there is, it is an eighth, and it may be that all of what is too much is
+    this part. (Planted: the sum over the part; uncertainty of the predicted image alone.)"""
+    assert gained(1.0, 4.0, 2.0) == pytest.approx((1.2494, 3.0103 - 1.2494), abs=1e-4)
+    assert gained(1.0, 4.0, 8.0) == pytest.approx((0.5799, 0.5799), abs=1e-4)
+    assert gained(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
+    assert gained(0.0, 4.0, 0.0) == (0.0, 0.0) and gained(4.0, 4.0, 4.0)[0] == pytest.approx(90)
+
+
+def test_noise_by_source_is_all_noise() -> None:
+    """Of a session whose exposures, dark frames and repeats are several, in both ways to take signed patterns: the
+    shares of shot, dark and read noise and of rounding, and that only a uniform shot is shared. (Planted: dark frames
+    in the shot noise; repeats left out of what is shared.)"""
+    fields = {"repeats": 2, "exposure_ladder": (1.0, 2.0)}
+    for mode, extra in (("pair", {}), ("uniform", {"dark_frames": 3})):
+        lit = lit_session(7, mode, rig=CLIPPED, **fields, **extra)
+        own, shared = lit.response_variances("horizontal")
+        assert set(own) == set(shared) == {"shot noise", "dark current", "read noise", "quantisation"}
+        whole = sum(part.mean() for parts in (own, shared) for part in parts.values())
+        assert whole == pytest.approx(lit.response_variance("horizontal").mean())
+        assert all(part.any() == (mode == "uniform") for part in shared.values())
+    sensor, time = CLIPPED.sensor, EXPOSURE_S
+    own, shared = lit_session(7, "uniform", rig=CLIPPED, repeats=2, dark_frames=3).response_variances("vertical")
+    dark, read = sensor.dark_current_e_per_s / time, sensor.read_noise_e**2 / time**2
+    assert own["dark current"] == pytest.approx(4 * dark / 2)
+    assert shared["dark current"] == pytest.approx(dark / 2 + dark / 3)
+    assert own["read noise"] == pytest.approx(4 * read / 2) and shared["read noise"] == pytest.approx(read * 5 / 6)
+    assert own["quantisation"] == pytest.approx(own["read noise"] / 12 / sensor.read_noise_e**2)
+
+
+def test_the_page_has_every_loss_in_one_table() -> None:
+    """With its uncertainty, the largest first; what could not be predicted is said. (Planted: the order of the rows;
+    losses that are 0.00 left out of the table.)"""
+    rows = (
+        LossRow("capture", "shot noise", "", 2.0, 0.1),
+        LossRow("drift", "mask_rows_um", "0.4 um", 3.0, 0.2),
+        LossRow("session", "read noise", "", 0.0, 0.0),
+    )
+    image = {"patterns": "dots:7", "psnr_db": 40.0, "frames": 49, "exposure_seconds": 4.0, "photoelectrons": 1e9,
+             "photons": 2e9}  # fmt: skip
+    spent_ = {"frames": 512.0, "exposure_seconds": 3.0, "photoelectrons": 1e10, "photons": 2e10}
+    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), spent_, image, rows, ("vibration_um: no",))
+    part = found.parts()[0]
+    assert [row[3] for row in part.rows] == ["3.00 \N{PLUS-MINUS SIGN} 0.20", "2.00 \N{PLUS-MINUS SIGN} 0.10",
+                                             "0.00 \N{PLUS-MINUS SIGN} 0.00"]  # fmt: skip
+    assert part.rows[0][:3] == ("drift", "mask down the rows", "0.4 um") and "vibration_um: no" in part.lead
+    assert set(found.figures()) >= {"losses.png"} and len(found.tables()["losses.csv"]) == 3
+    text = " ".join(found.lines())
+    assert "mask down the rows, 0.4 um: 3.00 +- 0.20 dB" in text and "read noise" not in text
+    assert "mask down the rows" in build_findings("calibration", found.title, "toy", found.parts(), found.figures())
+    assert not CalibrationFindings((), (), (), {}, (0.1, 0.2), spent_).parts()[0].figures
+
+
+def test_a_recipe_with_depths_is_refused_before_anything_is_traced() -> None:
+    """(Planted: let pass.)"""
+    recipe = load_recipe().model_copy(update={"depths": (350.0, 400.0)})
+    with pytest.raises(MitsimError, match="2 depths, and a report is of one session"):
+        measure(None, Request.of(), Job(), recipe)  # type: ignore[arg-type]
 
 
 def test_a_cause_has_the_part_by_which_the_squared_residual_falls_without_it() -> None:
