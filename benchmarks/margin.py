@@ -49,7 +49,8 @@ def factors(bench: ms.Bench, margin: int) -> tuple[np.ndarray, np.ndarray]:
         cell = (last - first) / bench.n
         edges = np.linspace(first - margin * cell, last + margin * cell, bench.n + 2 * margin + 1)
         sides.append(Directions.cells(edges))
-    best = best_term(shadow_terms(bench.geometry, *sides, bench.geometry.scene_distance))
+    rows, columns = sides
+    best = best_term(shadow_terms(bench.geometry, rows, columns, bench.geometry.scene_distance))
     return best.left, best.right
 
 
@@ -117,9 +118,12 @@ WALL = """
 </scene>"""
 
 
-def rendered() -> list[dict[str, object]]:
+Row = dict[str, object]
+
+
+def rendered() -> list[Row]:
     """Rows of images of the photograph with a wall and without, by patterns and margin."""
-    source, rows = Path(ms.open_bench("photograph").loaded.path), []
+    source, rows = Path(ms.open_bench("photograph").loaded.path), list[Row]()
     calibration = ms.open_bench("photograph").calibrate()
     with tempfile.TemporaryDirectory() as folder:
         walled = shutil.copytree(source.parent, Path(folder) / "wall") / source.name
@@ -130,6 +134,7 @@ def rendered() -> list[dict[str, object]]:
                 shots = bench.capture(patterns)
                 for margin in (0, *MARGINS):
                     image = ms.reconstruct(shots, calibration, margin=margin)
+                    assert shots.truth is not None
                     found = ms.psnr(image.image, shots.truth)
                     rows.append({"scene": name, "patterns": patterns, "margin": margin, "psnr": found, "ok": image.ok})
                     print(f"{name} {patterns:>8} margin {margin:2}: {found:.1f} dB{'' if image.ok else ', flagged'}")
@@ -147,7 +152,7 @@ def main() -> None:
         report(rendered(), options.json)
         return
     bench = ms.open_bench("photograph")
-    side, rows = bench.n, []
+    side, rows = bench.n, list[Row]()
     scene = picture(TEST_IMAGES[0]).reshape(side, SIDE // side, side, SIDE // side).mean(axis=(1, 3)) / 255
     for patterns in ("uniform", "dots:7"):
         for kind in ("steady", "indirect"):
@@ -162,7 +167,7 @@ def main() -> None:
     report(rows, options.json)
 
 
-def report(rows: list[dict[str, object]], path: Path | None) -> None:
+def report(rows: list[Row], path: Path | None) -> None:
     """Write ``rows`` to ``path``."""
     if path:
         path.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
