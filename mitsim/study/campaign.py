@@ -20,7 +20,7 @@ from mitsim.core.output import whole_file
 from mitsim.core.resources import workers
 from mitsim.core.versions import versions
 from mitsim.study import ALL, PAPER, find_experiment
-from mitsim.study.experiment import Claim, Experiment, Found, Point, Scope
+from mitsim.study.experiment import HEADS, Claim, Experiment, Found, Point, Scope
 from mitsim.study.page import Section, build_page
 from mitsim.study.points import FOLDER, Shard, Store, batches
 from mitsim.study.runner import DPI, study_folder
@@ -85,7 +85,8 @@ class CampaignResult:
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
-        said = [f"{claim.verdict}: {claim.claim} ({claim.figures})" for claim in self.claims]
+        heads = self.section.heads if self.section else HEADS
+        said = [f"{claim.verdict}: {claim.claim} ({claim.told(heads)})" for claim in self.claims]
         return [*said, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
 
 

@@ -94,6 +94,10 @@ class Found:
     arrays: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
+HEADS = "Paper", "Idealised", "Rendered"
+"""Of the columns of a page's table of claims."""
+
+
 @dataclass(frozen=True)
 class Claim:
     """A claim of the paper, its number there, in the idealised model and rendered, and what becomes of it.
@@ -108,11 +112,10 @@ class Claim:
     rendered: str
     verdict: str
 
-    @property
-    def figures(self) -> str:
-        """All of them on a line."""
-        told = {"in the paper": self.paper, "idealised": self.idealised, "rendered": self.rendered}
-        return ", ".join(f"{figure} {whose}" for whose, figure in told.items() if figure)
+    def told(self, heads: tuple[str, str, str]) -> str:
+        """All of its figures on a line, each by its own of the ``heads``."""
+        figures = zip((self.paper, self.idealised, self.rendered), heads, strict=True)
+        return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)
 
 
 @dataclass(frozen=True)
@@ -190,6 +193,10 @@ class Experiment:
         from all results.
     figures
         from all results, by file name; each has one message.
+    about
+        what its figures are, for who knows nothing of it; empty for claims of the paper, which the page explains.
+    heads
+        of a claim's three figures; one without a head has no column.
     """
 
     name: str
@@ -199,6 +206,8 @@ class Experiment:
     measure: Callable[[Studio, Point], Found]
     claims: Callable[[Results], Sequence[Claim]]
     figures: Callable[[Results], Mapping[str, Figure]]
+    about: str = ""
+    heads: tuple[str, str, str] = HEADS
 
 
 def grouped(points: Sequence[Point]) -> list[Point]:

@@ -215,8 +215,10 @@ class Unexposed:
         return float(np.sqrt(sum(self.noises(seconds).values())))
 
     def noises(self, seconds: float) -> dict[str, float]:
-        """Its variance [(electrons/s)^2] by source. What pixels' responses differ by is fixed, and counts as noise:
-        factors know nothing of it."""
+        """Its variance [(electrons/s)^2] by source, of exposures of so many ``seconds``.
+
+        What pixels' responses differ by is fixed, and counts as noise: factors know nothing of it.
+        """
         exposer, sensor = self.exposer(seconds), self.lit.bench.sensor
         light = [exposer.electrons(frame) for frame in self.expected]
         square = float(np.mean([np.square(frame).mean() for frame in light]))

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri
 from mitsim.core.versions import versions
-from mitsim.study.experiment import Claim, Experiment, Results, Scope
+from mitsim.study.experiment import HEADS, Claim, Experiment, Results, Scope
 from mitsim.study.pictures import TEST_IMAGES
 
 _DPI, _SHOWN_DPI = 220, 110
@@ -22,7 +22,8 @@ _DPI, _SHOWN_DPI = 220, 110
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]."""
+    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``about``
+    and ``heads`` are the experiment's."""
 
     name: str
     title: str
@@ -31,6 +32,8 @@ class Section:
     pictures: Mapping[str, tuple[str, int]]
     count: str
     command: str
+    about: str = ""
+    heads: tuple[str, str, str] = HEADS
 
     @classmethod
     def of(
@@ -63,6 +66,8 @@ class Section:
             pictures={name: (_address(figure), _width(figure)) for name, figure in figures.items()},
             count=f"{len(results.table)} measurements{means}, light to {setup.accuracy:g}",
             command=" ".join(command),
+            about=experiment.about,
+            heads=experiment.heads,
         )
 
 

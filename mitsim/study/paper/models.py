@@ -167,4 +167,10 @@ EXPERIMENT = Experiment(
     "Modelled factors against measured ones",
     "How few frames of a calibration session suffice?",
     _points, _measure, _claims, _figures,
+    about="PSNR of images with three kinds of factors. Measured: each number of them by a session of striped light. "
+    "Wave and geometric: the closed-form shadow of the mask, with diffraction and without, whose distance, shift, "
+    "rotation, magnification and gain are fitted to a few frames of that session. The mask is 50 um too far off and 37 "
+    "and 21 um beside its place. A session's brightest pixel fills the stated part of the full well; the images' "
+    "frames are bright. Bars are one standard error over seeds.",
+    heads=("", "", "PSNR"),
 )  # fmt: skip
