@@ -91,7 +91,14 @@ def test_an_edit_moves_only_the_mutants_of_its_own_lines(mutations: ModuleType) 
 def test_the_list_names_modules_and_tests_that_are_there() -> None:
     settings = json.loads((BENCHMARKS / "mutants.json").read_text(encoding="utf-8"))
     listed = {module: names for room in settings["rooms"].values() for module, (_, names) in room.items()}
-    assert {module.partition("/")[0] for module in listed} == {"sensor", "optics", "reconstruct", "capture"}
+    assert {module.partition("/")[0] for module in listed} == {
+        "sensor",
+        "optics",
+        "reconstruct",
+        "capture",
+        "rig",
+        "study",
+    }
     assert sum(count for room in settings["rooms"].values() for count, _ in room.values()) >= 300
     for module, names in listed.items():
         assert (ROOT / "mitsim" / module).is_file()

@@ -65,6 +65,32 @@ def test_singular_values_and_vectors_move_as_their_perturbation_says() -> None:
         assert np.sqrt(np.mean(angles**2)) == pytest.approx(rows[0].predicted_angle, rel=0.2)
 
 
+def test_bias_and_angle_are_second_derivatives_by_every_entry() -> None:
+    """Of entries that differ in their noise without any order: the mean change of a value is half the sum of variance
+    times its second derivative, the mean square of a vector's turn the sum of variance times that of its slope.
+    (Planted: products left out of either, or of the other sign.)"""
+    rng = np.random.default_rng(6)
+    left, _ = np.linalg.qr(rng.standard_normal((6, 3)))
+    right, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    exact, deviation, step = left * [9.0, 5.0, 2.0] @ right.T, rng.uniform(1e-3, 1e-2, (6, 3)), 1e-4
+    bias, turn = np.zeros(3), np.zeros(3)
+    _, values, vectors = np.linalg.svd(exact, full_matrices=False)
+    for place in np.ndindex(exact.shape):
+        moved = []
+        for sign in (1, -1):
+            other = exact.copy()
+            other[place] += sign * step
+            moved.append(np.linalg.svd(other, full_matrices=False)[1:])
+        (up, ahead), (down, behind) = moved
+        bias += deviation[place] ** 2 * (up + down - 2 * values) / (2 * step**2)
+        for number, vector in enumerate(vectors):
+            slope = ahead[number] * np.sign(ahead[number] @ vector) - behind[number] * np.sign(behind[number] @ vector)
+            turn[number] += deviation[place] ** 2 * float(np.square(slope / (2 * step)).sum())
+    rows = list(singular_rows("left", exact, exact, deviation))
+    assert [row.bias for row in rows] == pytest.approx(bias, rel=1e-4)
+    assert [row.predicted_angle for row in rows] == pytest.approx(np.sqrt(turn), rel=1e-4)
+
+
 def test_light_and_time_of_a_session_are_counted() -> None:
     """8 patterns of either side, two halves, three repeats at 0.02 and 0.08 s; each pair is a uniform frame's light."""
     lit = lit_session(7, rig=CLIPPED, repeats=3, exposure_ladder=(1.0, 4.0))
