@@ -1,6 +1,6 @@
 """Light from outside the projector's window: what a margin of calibrated cells round it would buy, and what does.
 
-    python benchmarks/margin.py [--json FILE] [--seeds 4] [--rendered]
+    python benchmarks/margin.py [--json FILE] [--seeds 2] [--rendered]
 
 The photograph's bench in closed form (geometric shadow), the astronaut in the window, and beside it a white card that
 fills the ``CARD`` columns of cells that the field stop lets through, ``b`` times as bright as a white board in the
@@ -145,7 +145,7 @@ def rendered() -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--rendered", action="store_true")
     options = parser.parse_args()
     if options.rendered:

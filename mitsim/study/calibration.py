@@ -268,7 +268,8 @@ class CalibrationFindings:
             f"The image of this scene under {self.image['patterns']} has a PSNR of {self.image['psnr_db']:.2f} dB with "
             "these factors. Noise: what it would gain without that source alone. Drift between calibration and "
             "capture, by the amounts of the recipe: what it would lose. All are predicted in closed form with lambda "
-            "as it is; the uncertainty is the prediction's own. Losses do not add up."
+            "as it is; the uncertainty is the prediction's own. Losses do not add up. Rendering is the simulation's "
+            "own sampling, which no camera has."
             + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
             + untold,
             ("Where", "Source", "Amount", "PSNR lost [dB]"),

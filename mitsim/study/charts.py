@@ -146,7 +146,8 @@ def paired(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: 
     axes.set_yticks(rows, [name for name, _ in ordered])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(-0.6, len(ordered) - 0.4)
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right")
+    # Above the axes, where no bar is, however few there are.
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     label_axes(axes, x, "", grid="x")
     return figure
 
