@@ -160,6 +160,13 @@ def test_a_mask_moved_by_a_pixel_casts_the_same_shadow_a_pixel_on() -> None:
     assert np.allclose(frame[1:], before[:-1], rtol=1e-9) and not np.allclose(frame, before, rtol=1e-3)
 
 
+def test_a_mask_moves_along_the_axis_that_its_drift_names() -> None:
+    """(Planted: columns the other way; rows for columns.)"""
+    moved, still = drifted(bench(), Drift(mask_rows_um=3.0, mask_columns_um=-5.0)).geometry, bench().geometry
+    assert moved.mask_offset_row - still.mask_offset_row == pytest.approx(3e-3)
+    assert moved.mask_offset_column - still.mask_offset_column == pytest.approx(-5e-3)
+
+
 def test_warmth_moves_the_mask_away() -> None:
     moved = drifted(bench(), Drift(temperature_k=20.0, gap_um_per_k=0.5, mask_axis_um=2.0)).geometry
     assert moved.mask_distance == pytest.approx(2.012)
