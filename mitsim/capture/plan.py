@@ -214,10 +214,12 @@ class SceneFacts:
                 f"this one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is "
                 "meant"
             )
-        if geometry.tilt_shift_mm:
+        waves = geometry.diffracts and (switches or {}).get("diffraction") is not False
+        if geometry.tilt_left_out(waves) or (any(geometry.mask_tilt) and bench.loaded.mirrors):
+            whose = "" if geometry.tilt_left_out(waves) else " of light over mirrors"
             warnings.append(
-                f"the mask's tilt is left out: it moves shadows by up to {geometry.tilt_shift_mm * 1e3:.2g} um; render "
-                "--estimator reference has it, or set it to 0 in the camera's [mask]"
+                f"the mask's tilt is left out{whose}: it moves shadows by up to {geometry.tilt_shift_mm * 1e3:.2g} um; "
+                "render --estimator reference has it, or set it to 0 in the camera's [mask]"
             )
         longest = float(bench.spectrum.wavelengths_nm.max())
         if geometry.mask_feature * 1e6 < longest:

@@ -37,6 +37,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.optics.profile import Steps, smooth_box_means
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
+from mitsim.optics.tilt import nodes_between, polynomials
 from mitsim.rig.plate import FEW, Plate
 from mitsim.rig.projector import Spectrum
 
@@ -48,6 +49,8 @@ _STEPS_PER_FRESNEL_LENGTH = 130
 """Grid cells in sqrt(lambda D) where that is finer: what :data:`_STEP_MM` is of the anchor geometry's."""
 _THICK_STEPS = 2
 """Grid of a thick mask, whose every direction needs fields of its own, in steps of the thin one's."""
+_DISTANCES = 3
+"""Of a tilted mask at which waves are worked out: it changes by a few percent, and waves less."""
 _LARGEST_GRID = 1 << 24
 """Cells of a grid: 256 MiB for each of a few complex arrays."""
 
@@ -184,14 +187,30 @@ def _start(shadow: ShadowGeometry, step: float, low: float) -> float:
 def _thin_means(
     shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
 ) -> FloatArray:
-    """(pairs, m, c) mean products of fields; one grid serves all directions."""
-    crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
+    """(pairs, m, c) mean products of fields; one grid serves all directions. Behind a mask that is tilted along the
+    axis they are interpolated between those of some distances."""
+    growth, beyond = shadow.tilt[0]
+    if not growth:
+        return _thin_means_at(beyond, shadow, profiles, directions, wavelength_nm)
+    even = shadow.crossings(directions)
+    nodes = nodes_between(even, _DISTANCES)
+    at_nodes = (
+        _thin_means_at(beyond + growth * float(node), shadow, profiles, directions, wavelength_nm) for node in nodes
+    )
+    return np.asarray(sum(weight * means for weight, means in zip(polynomials(even, nodes), at_nodes, strict=True)))
+
+
+def _thin_means_at(
+    beyond: float, shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
+) -> FloatArray:
+    """The same of waves from ``beyond`` [mm] the mask's distance."""
+    met, half_cell = shadow.met(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
-    low, high = crossings.min() - reach, crossings.max() + reach
-    waves = _prepare(shadow, wavelength_nm, low, high)
+    low, high = met.min() - reach, met.max() + reach
+    waves = _prepare(replace(shadow, distance_mm=shadow.distance_mm + beyond), wavelength_nm, low, high)
     start = _start(shadow, waves.step_mm, float(low))
     products = _products([waves.field(clear, start) for clear in shadow.clear(profiles, 0.0)])
-    return smooth_box_means(products, start, waves.step_mm, crossings, shadow.half_pixel, half_cell)
+    return smooth_box_means(products, start, waves.step_mm, met, shadow.half_pixel, half_cell)
 
 
 def _thick_means(

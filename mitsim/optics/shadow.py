@@ -17,7 +17,9 @@ is a function of s alone, whatever the sensor point::
 So each direction has its own clear profile M(s) M(s') on the exit face, and that profile's shadow is the thin mask's.
 A cell takes the clear profile of its centre.
 
-A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z.
+A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. One that is
+tilted along the axis, its distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
+times sqrt(1 + a^2) along it (:mod:`mitsim.optics.tilt`).
 
 All coordinates are index coordinates, centred, in mm; tau is a pure number.
 """
@@ -38,6 +40,8 @@ from mitsim.rig.mask import Mask
 from mitsim.rig.plate import Plate
 
 SeparableTerms = list[tuple[FloatArray, FloatArray]]
+EVEN = ((0.0, 0.0), (0.0, 0.0))
+"""The tilt of a mask that has none."""
 _WIDE = 32
 """Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel to 1e-11."""
 
@@ -94,6 +98,9 @@ class ShadowGeometry:
         sensor to scene, z [mm], beyond the mask; ``inf`` is allowed.
     offset_mm
         (row, column) of the mask's centre.
+    tilt
+        along rows, and along columns, how its distance grows with the coordinate, and by how much it is greater at the
+        mask's centre [mm].
     """
 
     mask: Mask | Plate
@@ -103,6 +110,7 @@ class ShadowGeometry:
     thickness_mm: float
     depth_mm: float
     offset_mm: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[tuple[float, float], tuple[float, float]] = EVEN
 
     @classmethod
     def of(cls, camera: CameraGeometry, depth_mm: float) -> ShadowGeometry:
@@ -132,15 +140,23 @@ class ShadowGeometry:
 
         In them the sensor is off the axis by as much the other way.
         """
-        offset = self.offset_mm[axis]
+        offset, tilt = self.offset_mm[axis], (self.tilt[axis],) * 2
         if not offset:
-            return self, directions
-        moved = replace(self, pixel_centres_mm=self.pixel_centres_mm - offset, offset_mm=(0.0, 0.0))
+            return (self if tilt == self.tilt else replace(self, tilt=tilt)), directions
+        moved = replace(self, pixel_centres_mm=self.pixel_centres_mm - offset, offset_mm=(0.0, 0.0), tilt=tilt)
         return moved, Directions(directions.centres - offset / self.depth_mm, directions.width)
 
     def crossings(self, directions: Directions) -> FloatArray:
-        """(m, c) mask coordinates [mm] of rays from pixel centres toward ``directions``."""
+        """(m, c) mask coordinates [mm] of rays from pixel centres toward ``directions``, of an even mask."""
         return self.shrink * self.pixel_centres_mm[:, None] + self.distance_mm * directions.centres[None, :]
+
+    def met(self, directions: Directions) -> FloatArray:
+        """The same on the tilted mask, along an axis of :meth:`from_mask`."""
+        (growth, beyond), even = self.tilt[0], self.crossings(directions)
+        if not (growth or beyond):
+            return even
+        slope = directions.centres - self.pixel_centres_mm[:, None] / self.depth_mm
+        return np.asarray((even + slope * (growth * even + beyond) / (1 - growth * slope)) * np.hypot(1, growth))
 
     def weights(self) -> list[float]:
         """Weight of each term of the clear aperture: the mask's own, or for a thick mask products of two of them."""
@@ -176,7 +192,7 @@ def both_axes(
     row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
     by_row, seen_rows = shadow.from_mask(rows, 0)
     left = axis(by_row, row_profiles, seen_rows)
-    alike = rows == columns and shadow.offset_mm[0] == shadow.offset_mm[1]
+    alike = rows == columns and all(first == second for first, second in (shadow.offset_mm, shadow.tilt))
     if alike and np.array_equal(row_profiles, column_profiles):
         return left, left
     by_column, seen_columns = shadow.from_mask(columns, 1)
@@ -202,9 +218,9 @@ def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: 
     """(terms, m, c) mean transmissions."""
     feature, even = shadow.mask.feature_mm, shadow.mask.even
     if not even or shadow.half_pixel + shadow.half_cell(directions) > _WIDE * feature:
-        boxes = shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
+        boxes = shadow.met(directions), shadow.half_pixel, shadow.half_cell(directions)
         return np.stack([profile.box_means(*boxes) for profile in shadow.clear(profiles, 0.0)])
-    centre = shadow.crossings(directions) / feature
+    centre = shadow.met(directions) / feature
     half_pixel, half_cell = np.array(shadow.half_pixel / feature), np.array(shadow.half_cell(directions) / feature)
     return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])
 

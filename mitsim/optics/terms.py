@@ -11,6 +11,7 @@ from mitsim.optics.diffraction import wave_terms
 from mitsim.optics.motion import moving_terms
 from mitsim.optics.raster import raster
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
+from mitsim.optics.tilt import tilted_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
 
@@ -41,15 +42,22 @@ def shadow_terms(
     places
         (m,) pixels along an axis, increasing; None: all.
     """
-    shadow = ShadowGeometry.of(geometry, depth)
-    if geometry.correlated(spectrum is not None):
+    shadow, waves = ShadowGeometry.of(geometry, depth), spectrum is not None
+    if geometry.correlated(waves):
         shadow, spectrum = replace(shadow, mask=raster(geometry, depth, spectrum)), None
     if places is not None:
         shadow = replace(shadow, pixel_centres_mm=shadow.pixel_centres_mm[np.asarray(places)])
     if geometry.mask_motion is not None:
         others = rows, columns, depth, spectrum, places
         return moving_terms(geometry, shadow, rows, columns, lambda still: shadow_terms(still, *others))
-    terms = geometric_terms(shadow, rows, columns) if spectrum is None else wave_terms(shadow, rows, columns, spectrum)
+
+    def formed(shadow: ShadowGeometry) -> SeparableTerms:
+        if spectrum is None:
+            return geometric_terms(shadow, rows, columns)
+        return wave_terms(shadow, rows, columns, spectrum)
+
+    nodes = geometry.tilt_nodes(waves)
+    terms = tilted_terms(shadow, rows, columns, geometry.mask_tilt, nodes, formed) if nodes else formed(shadow)
     if geometry.pixel_fill_factor == 1:
         return terms
     return [(geometry.pixel_fill_factor * left, right) for left, right in terms]

@@ -20,6 +20,12 @@ from mitsim.rig.drift import MaskMotion
 from mitsim.rig.mask import CameraMask, Mask, mls_mask
 from mitsim.rig.plate import FEW, Plate, within
 
+_NODES_PER_PIXEL = 14
+"""Nodes of a tilted mask for each pixel that its shadow is moved by: 2 more leave 4e-5 of frames of dots:7, 2 to 20
+mrad at the paper's geometry (benchmarks/masks.py)."""
+_MOST_TILTED_TERMS = 64
+"""Separable terms that a tilted mask is formed of: 0.8 GB at 512 pixels and as many cells a side."""
+
 
 class CameraGeometry(BaseModel):
     """Bare sensor under a coded mask; the defaults are the geometry of Zheng & Asif, section IV-A."""
@@ -143,7 +149,8 @@ class CameraGeometry(BaseModel):
     def mask_reach(self) -> float:
         """How far from its centre a mask is seen [mm]."""
         seen = self.half_width + (self.mask_distance + self.mask_thickness) * self.tan_half_fov
-        return seen + self.pixel_pitch + max(map(abs, self.mask_offset))
+        leaning = 1 + self.tan_half_fov * sum(map(abs, self.mask_tilt))
+        return (seen + self.pixel_pitch + max(map(abs, self.mask_offset))) * leaning
 
     @property
     def centred(self) -> bool:
@@ -158,11 +165,34 @@ class CameraGeometry(BaseModel):
         return not isinstance(mask, Plate) or mask.diffracts
 
     @property
+    def mask_tilt(self) -> tuple[float, float]:
+        """How the mask's distance grows along rows and along columns, tangents; (0, 0) for a mask that is even."""
+        tilt = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
+        return math.tan(tilt[0] * 1e-3), math.tan(tilt[1] * 1e-3)
+
+    @property
     def tilt_shift_mm(self) -> float:
         """How far a tilt of the mask moves shadows at most, on the mask [mm]: a ray of slope t that leaves the even
         plane at s meets the tilted one t s tan(tilt) beside."""
-        tilt = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
-        return self.tan_half_fov * self.mask_reach * sum(math.tan(abs(angle) * 1e-3) for angle in tilt)
+        return self.tan_half_fov * self.mask_reach * sum(map(abs, self.mask_tilt))
+
+    def tilt_nodes(self, waves: bool) -> tuple[int, int] | None:
+        """Nodes of rows and of columns from which the shadow of a tilted mask is formed (:mod:`mitsim.optics.tilt`),
+        with ``waves`` or without; None where it is not: of an even mask, one that is drawn on a raster, and one that
+        would take too many terms."""
+        if not any(self.mask_tilt) or self.correlated(waves):
+            return None
+        farthest = self.tan_half_fov * self.mask_reach / self.pixel_pitch
+        by_column, by_row = (
+            1 if not growth else 2 + math.ceil(_NODES_PER_PIXEL * farthest * abs(growth))
+            for growth in self.mask_tilt[::-1]
+        )
+        many = by_column * by_row * len(self.build_mask().terms) > _MOST_TILTED_TERMS
+        return None if many else (by_column, by_row)
+
+    def tilt_left_out(self, waves: bool) -> bool:
+        """Whether the mask is tilted, and its shadow, with ``waves`` or without, that of an even one."""
+        return any(self.mask_tilt) and self.tilt_nodes(waves) is None
 
     @property
     def mask_words(self) -> str:
@@ -175,8 +205,10 @@ class CameraGeometry(BaseModel):
 
     @property
     def mask_terms(self) -> int:
-        """Separable terms of the mask, 1 where it has no closed form."""
-        return 1 if self.correlated(waves=False) else len(self.build_mask().terms)
+        """Separable terms of the mask as it is mounted, 1 where it has no closed form."""
+        if self.correlated(waves=False):
+            return 1
+        return len(self.build_mask().terms) * math.prod(self.tilt_nodes(waves=False) or (1,))
 
     def correlated(self, waves: bool) -> bool:
         """Whether frames behind the mask, with ``waves`` or without, are correlations with a drawn shadow: of what is
