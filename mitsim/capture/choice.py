@@ -146,7 +146,9 @@ class Candidates:
             rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
         given = _given(switches)
         self._tables = [
-            _Table(math.nan, evidence, effects, rows, given, sure) for effects in _subsets(evidence, switches)
+            _Table(math.nan, evidence, (effects, raster), rows, given, sure)
+            for effects in _subsets(evidence, switches)
+            for raster in evidence.forms(_in_waves(effects))
         ]
 
     def best(self, accuracy: float) -> tuple[_Table, int]:
@@ -181,7 +183,8 @@ def _table_of(
 ) -> _Table:
     """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
     row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
-    return _Table(accuracy, evidence, settings.effects, row, _given(switches), sure)
+    raster = settings.raster or evidence.raster[_in_waves(settings.effects)].needed
+    return _Table(accuracy, evidence, (settings.effects, raster), row, _given(switches), sure)
 
 
 def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
@@ -208,8 +211,8 @@ class _Table:
     ----------
     accuracy, evidence, sure
         as for :func:`cheapest`.
-    effects
-        that are on.
+    form
+        effects that are on, and whether frames are formed of a raster.
     rows
         (m, 8) anchors, layers, cells, anchors of followed light and of occluded pixels, width of cells of the former,
         coarse cells, and whether coarse light has all layers.
@@ -221,17 +224,19 @@ class _Table:
         self,
         accuracy: float,
         evidence: Evidence,
-        effects: frozenset[str],
+        form: tuple[frozenset[str], bool],
         rows: FloatArray,
         given: frozenset[Part],
         sure: float,
     ) -> None:
-        self.accuracy, self.evidence, self.effects, self.rows = accuracy, evidence, effects, rows
+        effects, self.raster = form
+        self.effects = effects
+        self.accuracy, self.evidence, self.rows = accuracy, evidence, rows
         self.given, self.sure = given, sure
         self.anchors, self.layers, self.cells, self.followed_anchors, self.occluded_anchors = rows.T[:5]
         self.followed_width, self.coarse, self._all_layers = rows.T[5:]
         indirect = float("interreflection" in effects)
-        waves = float(bool(effects & names(lambda effect: effect.in_shadow)))
+        waves = float(_in_waves(effects))
         layered = np.where(self._all_layers > 0, self.layers, 1.0)
         self.numbers = Numbers(
             anchors=self.anchors,
@@ -246,6 +251,7 @@ class _Table:
             mixed=float(MIXING in effects),
             occluded=float(len(evidence.occluded)),
             occluded_anchors=self.occluded_anchors,
+            raster=float(self.raster),
         )
         self._follows = bool(effects & names(lambda effect: effect.followed))
 
@@ -295,6 +301,7 @@ class _Table:
             sharp=self.evidence.sharp,
             occluded=self.evidence.occluded,
             occluded_anchors=occluded,
+            raster=self.raster,
         )
         samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.samples.items()}
         return replace(settings, **samples)
@@ -339,6 +346,8 @@ class _Table:
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
         drawn += [self.evidence.sharp.left**2] if self.evidence.sharp else []
+        of_raster = self.evidence.raster[_in_waves(self.effects)].error if self.raster else None
+        drawn += [of_raster[sure > 0] ** 2] if of_raster else []
         squared, spread = changes.squared(chosen)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
 
@@ -446,6 +455,11 @@ def _needed(kind: Effort, target: Number) -> Number:
 
 def _left(kind: Effort, samples: Number) -> Number:
     return kind.noise.left(samples)
+
+
+def _in_waves(effects: frozenset[str]) -> bool:
+    """Whether the shadow is wave-optical."""
+    return bool(effects & names(lambda effect: effect.in_shadow))
 
 
 def counted(settings: Settings) -> tuple[int, int, int, int, int, int]:

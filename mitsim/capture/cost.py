@@ -7,6 +7,7 @@ from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
 from mitsim.capture.exposer import frames_at_once
 from mitsim.capture.prices import Numbers, entries
+from mitsim.capture.rasters import raster_bytes
 from mitsim.core.resources import Cost
 from mitsim.optics.frames import PROBES, frames_in_memory
 from mitsim.rig.patterns import Lighting
@@ -24,9 +25,6 @@ _DEPOSIT_BYTES = 500.0
 """A path's light while it is filed; measured."""
 _TERM_BYTES = 3 * 16.0
 """A pixel and cell of a term of a mask of many: both sides in the shadow, stacked, and picked for a frame."""
-_RASTER_BYTES, _RASTERS = 600.0, 16
-"""A pixel of a shadow on a raster of 4 x 4 cells and of its spectra, and how many are held: the 8 that are kept,
-and as many for what is at work while they are made."""
 _EXPOSED = 6
 """Frames in double precision that each exposed frame takes as much as: its light, electrons, numbers and squares, and
 electrons and numbers of the chunk before, which is written meanwhile."""
@@ -103,8 +101,8 @@ def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
     geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
     terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
     factors = _TERM_BYTES * terms * geometry.pixels * cells * len(settings.depths)
-    if geometry.correlated(geometry.diffracts):
-        factors = _RASTER_BYTES * _RASTERS * geometry.pixels**2
+    if settings.raster or geometry.drawn(geometry.diffracts):
+        factors = max(0.0 if settings.raster else factors, raster_bytes(geometry))
     return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES
 
 

@@ -94,6 +94,8 @@ class Settings:
         than of light at ``depth``.
     sharp, sharp_samples
         pixels whose direct light is traced apart, and samples that each group is predicted to need of it.
+    raster
+        whether frames are correlations with a mask's shadow on a raster, by FFT, and not sums of separable terms.
     occluded, occluded_anchors, occluded_samples
         projector pixels whose light is hidden from part of the sensor, increasing, points a side from which what the
         sensor sees of them beyond the mean is evaluated, and samples of it that each group is predicted to need. With
@@ -122,6 +124,7 @@ class Settings:
     occluded: tuple[int, ...] = ()
     occluded_anchors: int = 1
     occluded_samples: float = 1.0
+    raster: bool = False
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -254,8 +257,8 @@ class Forming:
         a side of the sensor, and of the grid with one cell a projector pixel.
     lit
         part of the rows of cells that hold light in a frame.
-    terms
-        of the wave-optical shadow; a geometric one has one.
+    terms, geometric_terms
+        of the wave-optical shadow, and of the geometric one.
     shots, classes
         of the family.
     seconds
@@ -263,7 +266,12 @@ class Forming:
     product
         seconds of a multiplication in a large product of matrices, on all processors; 0 where nobody has timed it.
     correlated
-        whether frames are correlations with a shadow on a raster, and not sums of separable terms.
+        whether frames without diffraction, and with it, are always correlations with a shadow on a raster, and never
+        sums of separable terms.
+    phases
+        raster cells that a pixel has, where a shadow is drawn on one.
+    drawing
+        seconds of drawing a shadow, without diffraction and with it, for each layer.
     """
 
     pixels: int
@@ -274,7 +282,19 @@ class Forming:
     classes: int
     seconds: float = 0.0
     product: float = 0.0
-    correlated: bool = False
+    geometric_terms: float = 1.0
+    correlated: tuple[bool, bool] = (False, False)
+    phases: float = 16.0
+    drawing: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A mask's shadow on a raster: what that leaves of the frames, None where it is none to choose, and whether there
+    is no other way."""
+
+    error: Estimate | None = None
+    needed: bool = False
 
 
 @dataclass(frozen=True)
@@ -309,6 +329,8 @@ class Evidence:
         what that light takes (paths of the latter: to one anchor).
     followed
         what is followed takes at several anchors beyond its mean (paths: to one of them).
+    raster
+        what a shadow on a raster leaves of the frames, without diffraction and with it (:class:`Drawn`).
     """
 
     depth: float
@@ -332,6 +354,12 @@ class Evidence:
     followed: Effort = field(default_factory=lambda: Effort.none())
     occluded: tuple[int, ...] = ()
     occluded_light: Effort = field(default_factory=lambda: Effort.none())
+    raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
+
+    def forms(self, waves: bool) -> tuple[bool, ...]:
+        """Whether frames may be formed of a raster: by a sum, by FFT, or by what is cheaper; with ``waves`` or not."""
+        drawn = self.raster[waves]
+        return (drawn.needed,) if drawn.needed or drawn.error is None else (False, True)
 
     def error(self, *parts: Part) -> Estimate:
         """Relative change of the frames by all ``parts`` together."""

@@ -169,6 +169,9 @@ class Trays:
     ) -> None:
         self.bench, self.settings, self.places = bench, settings, places
         self.physics = Physics.simulated(bench, settings.effects)
+        if settings.raster:
+            by_fft = self.physics.geometry.model_copy(update={"mask_fft": True})
+            self.physics = replace(self.physics, geometry=by_fft)
         if one_line and self.physics.spectrum:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
         pixels = pixels or bench.n

@@ -30,7 +30,6 @@ from mitsim.capture.prices import (
 from mitsim.capture.request import Request, check_accuracy
 from mitsim.core.errors import MitsimError
 from mitsim.core.pictures import table
-from mitsim.rig.plate import RASTER_ERROR
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
@@ -179,15 +178,12 @@ class SceneFacts:
         what the model of the devices does not cover, and which of the scene's light frames are known to lack.
     shapes
         where the scene's shapes are written, if that is known.
-    raster
-        whether the mask's shadow is drawn on a raster, without diffraction and with it.
     """
 
     notes: Mapping[str, str]
     keystone: float
     warnings: tuple[str, ...] = ()
     shapes: tuple[Tag, ...] = ()
-    raster: tuple[bool, bool] = (False, False)
 
     @classmethod
     def of(cls, bench: Bench, switches: Mapping[str, bool] | None = None) -> SceneFacts:
@@ -228,8 +224,7 @@ class SceneFacts:
                 "of masks needs features above it, so the shadow is a guess"
             )
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        raster = geometry.correlated(waves=False), geometry.correlated(geometry.diffracts)
-        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes, raster)
+        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes)
 
 
 def decide(
@@ -267,7 +262,7 @@ def decide(
         sampling_target=chosen.target,
         systematic_error=chosen.systematic.value,
         systematic_bound=chosen.systematic.bound,
-        warnings=facts.warnings + words.of_raster + words.warnings,
+        warnings=facts.warnings + words.warnings,
         predicted=stages,
     )
 
@@ -301,19 +296,8 @@ class _Words:
         """A row for each effect and discretisation."""
         effects = (self._effect(effect) for effect in EFFECTS.values())
         anchors = self._anchors(), self._followed_anchors(), self._occluded_anchors()
-        counted = (anchors[0], self._layers(), self._cells(), *anchors[1:])
+        counted = (anchors[0], self._layers(), self._cells(), *anchors[1:], *self._shadow())
         return (*counted, *effects, *_fixed(self.facts))
-
-    @property
-    def of_raster(self) -> tuple[str, ...]:
-        """That the mask's shadow is no more exact than its raster, where that is coarser than the accuracy."""
-        drawn = self.facts.raster["diffraction" in self.chosen.settings.effects]
-        if not drawn or self.accuracy >= RASTER_ERROR:
-            return ()
-        return (
-            f"the mask's shadow is drawn on a raster, which leaves up to some {RASTER_ERROR:g} of the frames; ask for "
-            "an accuracy no finer, or take a mask of one or two separable terms that is not turned",
-        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -357,6 +341,7 @@ class _Words:
             f"cells ({cells}x{cells})": self._number("cells", cells).bound,
             f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
             f"cells of their light ({width} pixels)": self._number("followed_width", width).bound,
+            **({"the mask's raster": self._of_raster.bound} if self._of_raster and settings.raster else {}),
             **({f"anchors of sharp light ({sharp.anchors}x{sharp.anchors})": sharp.left} if sharp else {}),
             f"occluded anchors ({occluded}x{occluded})": self._number("occluded_anchors", occluded).bound,
             **self.chosen.lacking,
@@ -436,6 +421,37 @@ class _Words:
         reason = f"{reason}: {anchors}x{anchors} anchors leave {left}, one {_said(one)}"
         # To see them apart saves time: with as many anchors for all pixels, it would take far more.
         return PlanRow(name, "approximate", reason, one.value, 0.0)
+
+    @property
+    def _waves(self) -> bool:
+        """Whether the mask's shadow is wave-optical."""
+        return any(EFFECTS[name].in_shadow for name in self.chosen.settings.effects)
+
+    @property
+    def _of_raster(self) -> Estimate | None:
+        """What a raster leaves, where the mask may be drawn on one."""
+        return self.evidence.raster[self._waves].error
+
+    def _shadow(self) -> tuple[PlanRow, ...]:
+        """How frames behind a mask of more than two terms are formed."""
+        left, settings, forming = self._of_raster, self.chosen.settings, self.evidence.forming
+        if left is None:
+            return ()
+        if self.evidence.raster[self._waves].needed:
+            reason = f"the mask's shadow is drawn on a raster, and frames are formed by FFT: that leaves {_said(left)}"
+            return (PlanRow("mask-shadow", "approximate", reason, None, 0.0),)
+        paces = paces_of(self.evidence)
+        sums, by_fft = (
+            _stages(self.evidence, replace(settings, raster=raster), paces)["optics"] for raster in (False, True)
+        )
+        terms = f"{forming.geometric_terms:.0f} separable terms"
+        if settings.raster:
+            reason = (
+                f"{terms}: by FFT on a raster, {by_fft:.2g} s, which leaves {_said(left)}; their sum takes {sums:.2g} s"
+            )
+            return (PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0)),)
+        reason = f"{terms} are summed, {sums:.2g} s; by FFT on a raster, {by_fft:.2g} s, {_said(left)} would be left"
+        return (PlanRow("mask-shadow", "exact", reason, left.value, sums),)
 
     def _effect(self, effect: Effect) -> PlanRow:
         settings, name = self.chosen.settings, effect.name

@@ -18,6 +18,7 @@ from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, Settings
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import PROBES, formed_frames, mixes
+from mitsim.rig.plate import FEW
 
 ROUNDS, CHECKED_SHOTS = 1.5, 8
 """Rounds that sampling takes, one or two, of followed light one more; and shots that each looks at to see the error of
@@ -96,9 +97,12 @@ FIXED = Paces(
 decide. Direct light takes half as much where one cell a pixel holds it, and more in many fine ones."""
 
 
-_CORRELATION = 8e3
-"""Multiplications a pixel that a correlation with a raster takes as long as, for each pair of anchors and layer: 0.045
-processor seconds of 512 x 512 pixels (benchmarks/masks.py)."""
+_CORRELATION = 125.0
+"""Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
+layer: 0.034 to 0.053 processor seconds of 512 x 512 pixels and 16 phases, where sums take 8e-11 a multiplication
+(benchmarks/masks.py)."""
+_MANY_ENTRIES = 1.2
+"""An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
 SHARED_COST = 6
 """Paths that a path of shared indirect light takes as long as: corner 5.7, cookie_bag 3.4."""
 
@@ -120,6 +124,8 @@ class Numbers:
     occluded: Number = 0.0
     """Pixels of their own anchors."""
     occluded_anchors: Number = 1.0
+    raster: float = 0.0
+    """Whether frames are correlations by choice."""
 
     @property
     def of_followed(self) -> tuple[FloatArray, FloatArray]:
@@ -149,13 +155,14 @@ class Numbers:
             mixed=float(MIXING in settings.effects),
             occluded=float(len(settings.with_own_anchors)),
             occluded_anchors=float(settings.occluded_anchors),
+            raster=float(settings.raster),
         )
 
 
 def paces_of(evidence: Evidence) -> Paces:
     """Those that the ``evidence`` measured, where it measured any."""
     forming = evidence.forming
-    products = float(_products(forming, forming.lit, 1.0, 1.0, 1.0, 1.0))
+    products = float(_products(forming, Numbers.coarsest(), forming.lit, 1.0, 1.0, 1.0))
     slower = forming.seconds / (FIXED.frame + FIXED.product * products) if forming.seconds else 1.0
     product = forming.product or slower * FIXED.product
     # The frame that the pilot forms is small: beside its products there is what every frame takes.
@@ -210,22 +217,31 @@ def connections(name: str, numbers: Numbers) -> Number:
     return cast(Number, count**2 * (count > 1))
 
 
-def _products(forming: Forming, lit: Number, cells: Number, layers: Number, anchors: Number, waves: Number) -> Number:
+def _by_fft(forming: Forming, numbers: Numbers) -> bool:
+    """Whether frames are correlations, as they must be or as was chosen."""
+    return bool(numbers.raster) or forming.correlated[bool(numbers.waves)]
+
+
+def _products(
+    forming: Forming, numbers: Numbers, lit: Number, cells: Number, layers: Number, anchors: Number
+) -> Number:
     """Multiplications of one frame, ``lit`` of whose rows of cells hold light, and of the probes that tell its error.
 
     Parameters
     ----------
-    forming
-        what it depends on.
-    lit, cells, layers, anchors, waves
-        part of the rows, cells and layers, anchors, and whether the shadow is wave-optical.
+    forming, numbers
+        what it depends on, and whether the shadow is wave-optical, and on a raster.
+    lit, cells, layers, anchors
+        part of the rows, cells and layers, and anchors.
     """
     rows = lit * forming.cells * cells * anchors
     pixels = forming.pixels
-    if forming.correlated:
-        return cast(Number, _CORRELATION * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows)
+    if _by_fft(forming, numbers):
+        return cast(
+            Number, _CORRELATION * forming.phases * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows
+        )
     probes = GROUPS * (PROBES + 1) * (np.minimum(rows, pixels) + pixels) * rows
-    terms = 1 + (forming.terms - 1) * waves
+    terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
     return cast(Number, terms * layers * (pixels * rows**2 + pixels**2 * rows + probes))
 
 
@@ -234,7 +250,11 @@ def _entries(forming: Forming, numbers: Numbers) -> Number:
     coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
     followed = (np.asarray(numbers.followed_anchors) > 1) * math.prod(numbers.of_followed)
     sides = numbers.cells * numbers.layers + coarse * numbers.coarse_cells * numbers.coarse_layers + followed
-    terms = forming.terms * numbers.waves + _GEOMETRIC_ENTRIES * (1 - numbers.waves)
+    if _by_fft(forming, numbers):
+        return cast(Number, 0.0 * sides)
+    many = forming.geometric_terms > FEW
+    geometric = _MANY_ENTRIES * forming.geometric_terms if many else _GEOMETRIC_ENTRIES
+    terms = forming.terms * numbers.waves + geometric * (1 - numbers.waves)
     return cast(Number, 2 * forming.pixels * forming.cells * sides * terms)
 
 
@@ -260,13 +280,13 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
     coarse = numbers.coarse_cells, numbers.coarse_layers
     lit = forming.lit
     products = (
-        _products(forming, lit, numbers.cells, numbers.layers, 1.0, numbers.waves)
-        + several * _products(forming, lit, *coarse, numbers.anchors, numbers.waves)
+        _products(forming, numbers, lit, numbers.cells, numbers.layers, 1.0)
+        + several * _products(forming, numbers, lit, *coarse, numbers.anchors)
         + (np.asarray(numbers.occluded_anchors) > 1)
-        * _products(forming, _lit_by_occluded(forming, lit, numbers), *coarse, numbers.occluded_anchors, numbers.waves)
-        + numbers.indirect * _products(forming, 1.0, *coarse, 1.0, numbers.waves)
+        * _products(forming, numbers, _lit_by_occluded(forming, lit, numbers), *coarse, numbers.occluded_anchors)
+        + numbers.indirect * _products(forming, numbers, 1.0, *coarse, 1.0)
         + (np.asarray(numbers.followed_anchors) > 1)
-        * _products(forming, 1.0, *numbers.of_followed, numbers.followed_anchors, numbers.waves)
+        * _products(forming, numbers, 1.0, *numbers.of_followed, numbers.followed_anchors)
     )
     if mixes(forming.classes, forming.shots, forming.pixels):
         products = products + numbers.mixed * forming.classes * forming.pixels**2
@@ -282,6 +302,10 @@ def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
         as for :func:`forming_seconds`.
     """
     shadows = paces.entry * _entries(forming, numbers)
+    if _by_fft(forming, numbers):
+        drawing = forming.drawing[bool(numbers.waves)] * paces.product / FIXED.product
+        # Coarse light of several layers is seen at a depth of its own.
+        shadows = cast(Number, shadows + drawing * (numbers.layers + (np.asarray(numbers.layers) > 1)))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)
     seen = paces.pixel * forming.shots * forming.pixels**2
     return shadows + seen + forming_seconds(forming, numbers, frames, paces)

@@ -56,7 +56,8 @@ def session_seconds(board: Bench, count: int, shots: int, settings: Settings) ->
         terms=float(len(board.spectrum.weights) * board.geometry.mask_terms),
         shots=count,
         classes=n,
-        correlated=board.geometry.correlated(board.geometry.diffracts),
+        geometric_terms=float(board.geometry.mask_terms),
+        correlated=(board.geometry.drawn(waves=False), board.geometry.drawn(board.geometry.diffracts)),
     )
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
     seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _PACES))

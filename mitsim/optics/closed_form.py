@@ -37,6 +37,11 @@ _kept_shadow = lru_cache(maxsize=24)(shadow_terms)
 _KEPT_RASTERS = 8
 """The last shadows on rasters, some 40 MiB each at 512 pixels: layers of a scene, with one line and with all."""
 
+_JUDGED = 32
+"""Pixels a side on which a raster is judged: one of half the cells is drawn in a second."""
+_FINER = 2
+"""Times as many cells a side of the raster that judges."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Block:
@@ -279,6 +284,45 @@ def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
     """The shadow of ``geometry`` toward ``directions``; of masks of many terms, 100 MiB each, none is kept."""
     many = geometry.mask_terms > FEW or geometry.mask_motion is not None
     return (shadow_terms if many else _kept_shadow)(geometry, *directions)
+
+
+def raster_error(
+    geometry: CameraGeometry,
+    rows: Directions,
+    columns: Directions,
+    depth: float,
+    spectrum: Spectrum | None,
+    light: FloatArray,
+) -> tuple[float, bool]:
+    """What a shadow on a raster leaves of the frame of a ``light``, relative rms, on a few pixels about the axis; and
+    whether it is told from the sum of the mask's terms, else from a raster of half the cells.
+
+    Parameters
+    ----------
+    geometry, depth, spectrum
+        the camera, and depth and lines of the light.
+    rows, columns
+        r and c directions.
+    light
+        (r, c).
+    """
+    few = geometry.model_copy(update={"pixels": min(geometry.pixels, _JUDGED), "mask_fft": True})
+    places = np.flatnonzero(light)
+    known = not few.drawn(spectrum is not None)
+
+    def frame(camera: CameraGeometry) -> FloatArray:
+        return FrameOptics(camera, rows, columns, (depth,), 1, spectrum).frame(places, light.ravel()[places])
+
+    coarse = frame(few)
+    if known:
+        judge = frame(few.model_copy(update={"mask_fft": False}))
+    else:
+        row, column = (np.arange(len(each.centres)) for each in (rows, columns))
+        shadow = replace(ShadowGeometry.of(few, depth), mask=raster(few, depth, spectrum, _FINER))
+        judge = Correlation(shadow, rows, columns, few.pixel_fill_factor).image(light, row, column)
+    energy = float(np.square(judge).sum())
+    error = float(np.sqrt(np.square(coarse - judge).sum() / energy)) if energy else 0.0
+    return error, known
 
 
 @lru_cache(maxsize=_KEPT_RASTERS)

@@ -1,9 +1,10 @@
 """A mask that no few separable terms make up, and its light: the shadow of a point on a raster, at one depth, out.
 
 A turned mask, the light that waves leave behind a mask of many terms, and a picture of a point spread function have no
-short closed form. Each is drawn on square cells, a whole number of which is a sensor pixel seen on the mask, as
-:mod:`mitsim.optics.correlation` needs them; a cell's value is its mean. A point at depth z and tan-angle tau then
-shades sensor point u by what the raster has at s = u (1 - d/z) + d tau, as every mask does.
+short closed form; the geometric shadow of a mask of many terms has a long one. Each is drawn on square cells, a whole
+number of which is a sensor pixel seen on the mask, as :mod:`mitsim.optics.correlation` needs them; a cell's value is
+its mean. A point at depth z and tan-angle tau then shades sensor point u by what the raster has at s = u (1 - d/z) + d
+tau, as every mask does.
 
 Means over cells smear an edge by their own box and by that of the raster, h^2 / 6 of variance; a twelfth of the second
 difference along each axis is taken off, which takes half of it back where the raster is read within cells alone.
@@ -47,12 +48,12 @@ _LEAST_WAVE_POINTS = 2
 """Points along a cell at least."""
 _AROUND = 8
 """Cells that a raster is wider than its turned one, for the splines' ends."""
-_AT_ONCE = 2**24
-"""Points asked for at a time, 128 MiB of each of a few arrays."""
+_AT_ONCE = 2**20
+"""Points asked for at a time, 8 MiB of each of some ten arrays."""
 
 
 @lru_cache(maxsize=8)
-def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
+def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None, finer: int = 1) -> Plate:
     """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
 
     Parameters
@@ -63,6 +64,8 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
         of the point [mm].
     spectrum
         lines of its light; None: geometric.
+    finer
+        so many times as many cells a side.
 
     Raises
     ------
@@ -73,8 +76,8 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
     if not isinstance(mask, Plate):
         raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
     pixel = geometry.pixel_pitch * shadow.shrink
-    step = pixel / cells_per_pixel(geometry)
-    count = 2 * int(np.ceil(min(geometry.mask_reach, mask.flaws.reach(mask.extent_mm) / 2) / step))
+    step = pixel / (finer * cells_per_pixel(geometry))
+    count = _cells(geometry, mask, step)
     if count > _LARGEST:
         raise MitsimError(
             f"{mask.words}: its shadow needs a raster of {count} cells a side, more than {_LARGEST}; take fewer "
@@ -83,10 +86,29 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
     if mask.irradiance:
         values = _resampled(mask, step, count)
     elif spectrum is None:
-        values = sharpened(_turned(mask, step, count))
+        means = _turned if mask.flaws.turn_deg else _resampled
+        values = sharpened(means(mask, step, count))
     else:
         values = sharpened(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
     return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
+
+
+def cells_a_side(geometry: CameraGeometry) -> int:
+    """Raster cells a side of the shadow of far points behind a plate; that of nearer ones has a few more."""
+    mask = geometry.build_mask()
+    assert isinstance(mask, Plate)
+    return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry))
+
+
+def _cells(geometry: CameraGeometry, mask: Plate, step: float) -> int:
+    """Cells of a ``step`` [mm] a side of what can be seen of a ``mask``."""
+    return 2 * int(np.ceil(min(geometry.mask_reach, mask.flaws.reach(mask.extent_mm) / 2) / step))
+
+
+def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
+    """Points along a raster cell of ``step_mm`` at which waves are squared, from an effective ``distance_mm``."""
+    apart = (wavelength_nm * 1e-6 * distance_mm) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
+    return max(int(np.ceil(step_mm / apart)), _LEAST_WAVE_POINTS)
 
 
 def cells_per_pixel(geometry: CameraGeometry) -> int:
@@ -115,7 +137,7 @@ def _turned(mask: Plate, step: float, count: int) -> FloatArray:
 
 
 def _resampled(mask: Plate, step: float, count: int) -> FloatArray:
-    """(count, count) mean values of even features over cells of a ``step`` [mm]."""
+    """(count, count) mean values of a mask that is not turned over cells of a ``step`` [mm]."""
     start = -count * step / 2
     along = np.stack(
         [Steps(mask.lines[k : k + 2], np.ones(1)).cell_means(start, step, count) for k in range(len(mask.values))],
@@ -160,8 +182,7 @@ def _fields(
     """(points, K) and (K, points) fields of the mask's terms along rows and columns, weights in the first; and points a
     cell."""
     distance = shadow.distance_mm * shadow.shrink
-    apart = (wavelength_nm * 1e-6 * distance) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
-    points = max(int(np.ceil(step / apart)), _LEAST_WAVE_POINTS)
+    points = points_per_cell(wavelength_nm, distance, step)
     # An odd number of the grid's cells between two points, so that these lie in the middle of one.
     between = int(np.ceil(step / points / grid_step(shadow, wavelength_nm))) | 1
     half = count * step / 2

@@ -78,7 +78,7 @@ def wave_samplers(
     depth, tau
         of the source [mm], and its tan-angles along rows and columns.
     """
-    if geometry.correlated(spectrum is not None):
+    if geometry.drawn(spectrum is not None):
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
     reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + geometry.pixel_pitch
@@ -104,7 +104,7 @@ def _steps_sampler(profile: Steps) -> Sampler:
 
 def geometric_samplers(geometry: CameraGeometry) -> list[SeparableTerm]:
     """The geometric shadow of the mask of ``geometry``, as samplers."""
-    if geometry.correlated(waves=False):
+    if geometry.drawn(waves=False):
         return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
     return _of_plate(geometry.build_mask(), geometry.mask_offset)
 

@@ -43,7 +43,7 @@ def shadow_terms(
         (m,) pixels along an axis, increasing; None: all.
     """
     shadow, waves = ShadowGeometry.of(geometry, depth), spectrum is not None
-    if geometry.correlated(waves):
+    if geometry.drawn(waves):
         shadow, spectrum = replace(shadow, mask=raster(geometry, depth, spectrum)), None
     if places is not None:
         shadow = replace(shadow, pixel_centres_mm=shadow.pixel_centres_mm[np.asarray(places)])

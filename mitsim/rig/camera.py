@@ -68,6 +68,8 @@ class CameraGeometry(BaseModel):
     """The mask ``plate``, which no scene states."""
     mask_motion: SkipJsonSchema[MaskMotion | None] = Field(None, exclude=True, description="turn and vibration")
     """What a drift adds between calibration and capture, which no scene states."""
+    mask_fft: SkipJsonSchema[bool] = Field(False, exclude=True, description="frames by FFT where that is a choice")
+    """What a plan chooses, which no scene states."""
 
     @model_validator(mode="after")
     def _mask_lies_before_the_scene(self) -> CameraGeometry:
@@ -101,7 +103,7 @@ class CameraGeometry(BaseModel):
         known = {
             name: value
             for name, value in self
-            if value or not name.startswith(("mask_offset", "mask_plate", "mask_motion"))
+            if value or not name.startswith(("mask_offset", "mask_plate", "mask_motion", "mask_fft"))
         }
         if self.mask_motion is not None:
             known["mask_motion"] = self.mask_motion.model_dump()
@@ -180,7 +182,7 @@ class CameraGeometry(BaseModel):
         """Nodes of rows and of columns from which the shadow of a tilted mask is formed (:mod:`mitsim.optics.tilt`),
         with ``waves`` or without; None where it is not: of an even mask, one that is drawn on a raster, and one that
         would take too many terms."""
-        if not any(self.mask_tilt) or self.correlated(waves):
+        if not any(self.mask_tilt) or self.drawn(waves):
             return None
         farthest = self.tan_half_fov * self.mask_reach / self.pixel_pitch
         by_column, by_row = (
@@ -206,13 +208,25 @@ class CameraGeometry(BaseModel):
     @property
     def mask_terms(self) -> int:
         """Separable terms of the mask as it is mounted, 1 where it has no closed form."""
-        if self.correlated(waves=False):
+        if self.drawn(waves=False):
             return 1
         return len(self.build_mask().terms) * math.prod(self.tilt_nodes(waves=False) or (1,))
 
     def correlated(self, waves: bool) -> bool:
-        """Whether frames behind the mask, with ``waves`` or without, are correlations with a drawn shadow: of what is
-        turned, of a picture of light, and of the waves behind many terms."""
+        """Whether frames behind the mask, with ``waves`` or without, are correlations with a shadow that is drawn,
+        as it must be or as was chosen."""
+        return self.drawn(waves) or (self.mask_fft and self.may_be_drawn(waves))
+
+    def may_be_drawn(self, waves: bool) -> bool:
+        """Whether frames behind the mask, with ``waves`` or without, may as well be sums of terms as correlations with
+        a shadow on a raster: of a plate of more than two terms that is mounted straight, and at rest."""
+        mask = self.build_mask()
+        still = self.mask_motion is None and not any(self.mask_tilt)
+        return isinstance(mask, Plate) and still and not (waves or self.drawn(waves)) and mask.crosses is None
+
+    def drawn(self, waves: bool) -> bool:
+        """Whether the mask's shadow, with ``waves`` or without, is drawn on a raster because it has no short closed
+        form: of what is turned, of a picture of light, and of the waves behind many terms."""
         mask = self.build_mask()
         if not isinstance(mask, Plate):
             return False

@@ -24,9 +24,6 @@ LEFT_OUT = 1e-7
 """Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
 RASTER_LEFT_OUT = 1e-4
 """The same of light on a raster, which is no more exact itself."""
-RASTER_ERROR = 1e-3
-"""What a raster leaves of frames, relative rms: 9.2e-4 was found for a mask turned by 0.3 degrees and dots:7, 4.7e-4
-for uniform light, less at larger angles (benchmarks/masks.py), 7e-4 of waves (tests/physics/test_raster.py)."""
 FEW = 2
 """Terms that are looked for as exact crosses: FlatCam's, of whose fields diffraction makes four terms."""
 LARGEST = 4096

@@ -13,7 +13,7 @@ import numpy as np
 
 from mitsim.capture import effects
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import LOOKS, Changes, Effort, Evidence, Forming, Part, Settings
+from mitsim.capture.evidence import LOOKS, Changes, Drawn, Effort, Evidence, Forming, Part, Settings
 from mitsim.capture.pilot.direct import AnchoredLight, FineLight, OccludedLight
 from mitsim.capture.pilot.followed import FollowedLight
 from mitsim.capture.pilot.looks import GOOD_ENOUGH, Sample
@@ -210,6 +210,10 @@ class Look:
         return self.fine.forming(self.lighting)
 
     @cached_property
+    def _raster(self) -> tuple[Drawn, Drawn]:
+        return self.fine.raster()
+
+    @cached_property
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
@@ -248,6 +252,7 @@ class Look:
             followed=self.followed.effort(light),
             occluded=self._base.occluded,
             occluded_light=self.occluded.effort(light) if self.occluded else Effort.none(),
+            raster=self._raster,
         )
 
 

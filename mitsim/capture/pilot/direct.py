@@ -12,16 +12,20 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import GROUPS, LOOKS, Effort, Forming, Noise, Part, Settings
+from mitsim.capture.evidence import GROUPS, LOOKS, Drawn, Effort, Estimate, Forming, Noise, Part, Settings
 from mitsim.capture.filing import Tray
 from mitsim.capture.pilot.looks import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, known, ladder, noise, norm
+from mitsim.capture.rasters import drawing_seconds
 from mitsim.capture.simulation import Simulation, emitted
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
+from mitsim.optics.closed_form import raster_error
 from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.optics.raster import cells_per_pixel
 from mitsim.rig.patterns import Lighting
+from mitsim.rig.projector import Spectrum
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import Deposits
 
@@ -43,6 +47,11 @@ _STEEPEST = 0.9
 edges in the scene bring it to 0.75 in the end."""
 _SIDE, _TRIALS = 256, 4
 """Side and number of the products that tell how fast the machine multiplies: 0.13 Gflop, some 5 ms on two cores."""
+_SURE_OF_RASTER = 1.5
+"""Largest error of a raster over that of a few pixels about the axis (tests/physics/test_raster.py)."""
+_OF_FINER = (1.2, 2.0)
+"""Error of a raster, and its bound, over its difference from one of half the cells, whose own error is a third to a
+half of it (same test)."""
 _FARTHEST = 1e-4
 """Inverse depth, relative to the scene's, below which light counts as infinitely far."""
 
@@ -158,18 +167,41 @@ class FineLight:
         seconds = (time.perf_counter() - started) / len(timed)
         cells = max(simulation.fine.bundle.cells)
         geometry = self.bench.geometry
-        lines = len(self.bench.spectrum.weights) * geometry.mask_terms
+        waves = self.bench.spectrum if geometry.diffracts else None
         return Forming(
             pixels=geometry.pixels,
             cells=cells,
             lit=self._lit(simulation, light) / cells,
-            terms=float(lines),
+            terms=float(len(self.bench.spectrum.weights) * geometry.mask_terms),
             shots=len(family.weights),
             classes=family.weights.shape[1],
             seconds=seconds,
             product=_product_seconds(),
-            correlated=geometry.correlated(geometry.diffracts),
+            geometric_terms=float(geometry.mask_terms),
+            correlated=(geometry.drawn(waves=False), geometry.drawn(geometry.diffracts)),
+            phases=float(cells_per_pixel(geometry) ** 2),
+            drawing=(drawing_seconds(geometry, None), drawing_seconds(geometry, waves)),
         )
+
+    def raster(self) -> tuple[Drawn, Drawn]:
+        """What a shadow on a raster leaves of a frame, without diffraction and with it."""
+        simulation = Simulation(self.bench, self.base)
+        bundle, geometry = simulation.fine.bundle, self.bench.geometry
+        filed = simulation.fine.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ filed[: self.sample.lighting.weights.shape[1]]
+        light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
+
+        def drawn(spectrum: Spectrum | None) -> Drawn:
+            waves = spectrum is not None
+            if not (geometry.drawn(waves) or geometry.may_be_drawn(waves)):
+                return Drawn()
+            seen = light[0, :, 0]
+            error, known = raster_error(geometry, bundle.rows, bundle.columns, self.base.depth, spectrum, seen)
+            found = Estimate(error, _SURE_OF_RASTER * error) if known else Estimate(*(error * by for by in _OF_FINER))
+            return Drawn(found, geometry.drawn(waves))
+
+        without = drawn(None)
+        return without, drawn(self.bench.spectrum) if geometry.diffracts else without
 
     def _lit(self, simulation: Simulation, light: sparse.csr_array) -> float:
         """Rows of cells that hold light in a shot, their mean."""
