@@ -130,7 +130,15 @@ def _calibrated(
 
 
 def model_of(bench: Bench, model: Model) -> ModelledCamera:
-    """The ``model``, geometric or wave, of a ``bench`` as it was to be built."""
+    """The ``model``, geometric or wave, of a ``bench`` as it was to be built. MitsimError for a mask that is tilted, or
+    whose shadow is drawn on a raster: a fit moves a few profiles."""
+    geometry = bench.geometry
+    if geometry.drawn(model == "wave" and geometry.diffracts) or any(geometry.mask_tilt):
+        raise MitsimError(
+            f"calibrate: a {model} model has a mask of one or two separable terms, mounted straight, and "
+            f"{geometry.mask_words} is not; describe it so in the camera's [mask] (a fit finds its rotation), or "
+            "calibrate without a model"
+        )
     return ModelledCamera(bench.geometry, bench.windows, bench.n, bench.spectrum if model == "wave" else None)
 
 

@@ -37,7 +37,7 @@ _kept_shadow = lru_cache(maxsize=24)(shadow_terms)
 _KEPT_RASTERS = 8
 """The last shadows on rasters, some 40 MiB each at 512 pixels: layers of a scene, with one line and with all."""
 
-_JUDGED = 32
+_JUDGED = 64
 """Pixels a side on which a raster is judged: one of half the cells is drawn in a second."""
 _FINER = 2
 """Times as many cells a side of the raster that judges."""
@@ -306,20 +306,20 @@ def raster_error(
     light
         (r, c).
     """
-    few = geometry.model_copy(update={"pixels": min(geometry.pixels, _JUDGED), "mask_fft": True})
-    places = np.flatnonzero(light)
+    few = geometry.model_copy(update={"pixels": min(geometry.pixels, _JUDGED)})
+    row, column = (np.arange(len(each.centres)) for each in (rows, columns))
+
+    def frame(finer: int) -> FloatArray:
+        shadow = replace(ShadowGeometry.of(few, depth), mask=raster(few, depth, spectrum, finer))
+        return Correlation(shadow, rows, columns, few.pixel_fill_factor).image(light, row, column)
+
     known = not few.drawn(spectrum is not None)
-
-    def frame(camera: CameraGeometry) -> FloatArray:
-        return FrameOptics(camera, rows, columns, (depth,), 1, spectrum).frame(places, light.ravel()[places])
-
-    coarse = frame(few)
+    coarse = frame(1)
     if known:
-        judge = frame(few.model_copy(update={"mask_fft": False}))
+        terms = shadow_terms(few, rows, columns, depth, spectrum)
+        judge = np.asarray(sum(left @ light @ right.T for left, right in terms))
     else:
-        row, column = (np.arange(len(each.centres)) for each in (rows, columns))
-        shadow = replace(ShadowGeometry.of(few, depth), mask=raster(few, depth, spectrum, _FINER))
-        judge = Correlation(shadow, rows, columns, few.pixel_fill_factor).image(light, row, column)
+        judge = frame(_FINER)
     energy = float(np.square(judge).sum())
     error = float(np.sqrt(np.square(coarse - judge).sum() / energy)) if energy else 0.0
     return error, known

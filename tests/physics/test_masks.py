@@ -12,14 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
 
 from mitsim.capture.bench import open_bench
 from mitsim.capture.effects import EFFECTS
+from mitsim.capture.modelling import model_of
 from mitsim.capture.plan import SceneFacts
 from mitsim.capture.session import Session
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
+from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.reconstruction import reconstruct
@@ -193,6 +196,42 @@ def test_a_tilt_that_is_left_out_is_told_with_what_it_moves(
     random = open_bench(small_scene(), variant, path)
     assert any("tilt is left out" in told for told in SceneFacts.of(random).warnings)
     assert not SceneFacts.of(random, {"diffraction": False}).warnings
+
+
+def test_a_model_refuses_masks_that_it_has_not(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
+    """(Planted: let pass, which fits hundreds of terms of a raster.)"""
+    path = camera_file(tmp_path, "it", drawn("separable", 6))
+    plain = path.read_text()
+    assert model_of(open_bench(small_scene(), variant, path), "wave").spectrum is not None
+    for flaw in ("rotation_deg = 0.5", "tilt_row_mrad = 5.0"):
+        path.write_text(f"{plain}{flaw}\n")
+        with pytest.raises(MitsimError, match=r"^calibrate: a geometric model has a mask of one or two[^\n]*$"):
+            model_of(open_bench(small_scene(), variant, path), "geometric")
+
+
+def test_a_bitmap_of_the_mls_mask_casts_its_frames_and_a_turned_one_is_flagged(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path
+) -> None:
+    """A PNG of black and white, frames to 1e-6; turned by half a degree, a session says by how many dB it is off.
+    (Planted: rows for columns; grey of 8 bits as 0 to 255; no warning.)"""
+    bits = drawn("separable", 8)
+    Image.fromarray((255 * bits).astype(np.uint8)).save(tmp_path / "bitmap.png")
+    path = camera_file(tmp_path, "named", None)
+    named = open_bench(small_scene(mask_order=8), variant, path)
+    text = path.read_text() + '\n[mask]\nkind = "drawing"\nfeature_mm = 0.06\nfile = "bitmap.png"\n'
+    path.write_text(text)
+    bitmap = open_bench(small_scene(mask_order=8), variant, path)
+    at, light = Directions.cells(np.linspace(-0.15, 0.15, 17)), np.random.default_rng(0).random((16, 16))
+    for spectrum in (None, LINES):
+        own, expected = (
+            FrameOptics(bench.geometry, at, at, (400.0,), 1, spectrum).frame(np.arange(256), light.ravel())
+            for bench in (bitmap, named)
+        )
+        np.testing.assert_allclose(own, expected, rtol=1e-6)
+    assert Session(bitmap, load_recipe()).mask_warnings == ()
+    path.write_text(text + "rotation_deg = 0.5\n")
+    (found,) = Session(open_bench(small_scene(mask_order=8), variant, path), load_recipe()).mask_warnings
+    assert "is not separable" in found and 5 < float(re.findall(r"([0-9.]+) dB", found)[0]) < 40
 
 
 def turned(values: np.ndarray, degrees: float) -> np.ndarray:

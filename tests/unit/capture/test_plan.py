@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from mitsim.capture.effects import EFFECTS, SWITCHES
-from mitsim.capture.evidence import Estimate, Part
+from mitsim.capture.evidence import Drawn, Estimate, Part
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import check_accuracy
 from mitsim.core.errors import MitsimError
@@ -148,13 +148,34 @@ def test_warnings_of_the_devices_come_first() -> None:
     assert len(plan(1e-6, facts=facts).warnings) == 2
 
 
-def test_an_accuracy_finer_than_the_masks_raster_is_flagged() -> None:
-    """With waves alone where only these are drawn on one. (Planted: at any accuracy; without waves too.)"""
-    facts = replace(FACTS, raster=(False, True))
-    fine = plan(9e-4, facts=facts)
-    assert "diffraction" in fine.settings.effects and any("on a raster" in told for told in fine.warnings)
-    assert not any("on a raster" in told for told in plan(1e-3, facts=facts).warnings)
-    assert not any("on a raster" in told for told in plan(9e-4, facts=replace(facts, raster=(True, False))).warnings)
+def test_what_a_masks_raster_leaves_is_in_the_budget() -> None:
+    """With waves alone where only these are drawn on one: in the systematic error, and told as the largest part where
+    the accuracy is finer. (Planted: left out of the sum; without waves too; never chosen.)"""
+    drawn = replace(EVIDENCE, raster=(Drawn(), Drawn(Estimate(3e-3, 4e-3), needed=True)))
+    loose, without = plan(1e-2, drawn), plan(1e-2)
+    assert loose.settings.raster and not without.settings.raster and not loose.warnings
+    assert loose.systematic_bound >= 4e-3 and loose.systematic_error >= 3e-3
+    assert "on a raster" in loose.row("mask-shadow").reason
+    fine = plan(3.9e-3, drawn)
+    assert any("largest: the mask's raster, 4.0e-03" in told for told in fine.warnings)
+    assert not plan(3.9e-3, drawn, "-diffraction").settings.raster and not plan(3.9e-3).warnings
+
+
+def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
+    """At the accuracy. (Planted: always by FFT; the raster's error not counted; drawing for nothing.)"""
+
+    def shown(accuracy: float, terms: float, drawing: float = 0.05) -> Plan:
+        forming = replace(EVIDENCE.forming, geometric_terms=terms, drawing=(drawing, 0.0))
+        choice = replace(EVIDENCE, forming=forming, raster=(Drawn(Estimate(4e-4, 6e-4)), Drawn()))
+        return plan(accuracy, choice, "-diffraction")
+
+    few, many = shown(1e-2, 3.0), shown(1e-2, 200.0)
+    assert not few.settings.raster and many.settings.raster
+    assert not shown(5e-4, 200.0).settings.raster and not shown(1e-2, 200.0, drawing=100.0).settings.raster
+    assert few.row("mask-shadow").state == "exact" and "3 separable terms are summed" in few.row("mask-shadow").reason
+    row = many.row("mask-shadow")
+    assert row.state == "approximate" and "200 separable terms: by FFT" in row.reason
+    assert many.block()["settings"]["raster"] is True
 
 
 def test_settings_do_not_depend_on_the_machines_pace() -> None:

@@ -20,7 +20,7 @@ from tests.unit.capture.invented_evidence import EVIDENCE, SIZES, changes, plan,
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
     geometry = SimpleNamespace(
         wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True, mask_plate=None,
-        tilt_shift_mm=0.0, correlated=lambda waves: False,
+        tilt_shift_mm=0.0, tilt_left_out=lambda waves: False, mask_tilt=(0.0, 0.0),
     )  # fmt: skip
     return SimpleNamespace(  # type: ignore[return-value]
         field_stop_cuts=cuts,
