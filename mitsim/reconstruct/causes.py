@@ -16,6 +16,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Measurement
+from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.sides import IndexArray, group_pixels
 
@@ -63,6 +64,10 @@ class Cause(Enum):
         "another rig, mask or pattern than was calibrated, or light over mirrors",
         "calibrate this camera with this projector",
     )
+    MASK = (
+        "a camera that is not separable, which its calibration shows as well",
+        "straighten the mask, or take a separable one",
+    )
     UNKNOWN = (
         "unknown: depth, gloss, indirect light or print much finer than a projector pixel",
         "compare the map of the misfit with the scene",
@@ -99,6 +104,8 @@ class Evidence:
 
     def __init__(self, factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> None:
         self._factors = factors.sides
+        noise = factors.manifest.noise
+        self.of_factors = noise.unexplained if noise else 0.0
         sides = [_lit_groups(side) for side in patterns]
         places = {(int(row * len(sides[0])), int(column * len(sides[1]))) for row, column in _PLACES}
         self._groups = [(sides[0][row], sides[1][column]) for row, column in sorted(places)]
@@ -165,11 +172,21 @@ def _lit_groups(patterns: FloatArray) -> list[_Lit]:
     return [_Lit(np.flatnonzero(column), one) for column, one in zip(patterns.T, alone, strict=True) if column.any()]
 
 
-def likely_cause(signatures: Signatures, unexplained: float) -> Cause:
-    """The cause that the ``signatures`` point to; ``unexplained`` is a part of the measurements, rms."""
+def likely_cause(signatures: Signatures, unexplained: float, of_factors: float = 0.0) -> Cause:
+    """The cause that the signatures point to.
+
+    Parameters
+    ----------
+    signatures
+        parts of what is unexplained.
+    unexplained, of_factors
+        a part of the measurements, and of the responses that the factors were told from, rms.
+    """
     along, across = max(signatures.columns, signatures.rows), min(signatures.columns, signatures.rows)
     if signatures.saturated > _SATURATED:
         return Cause.SATURATION
+    if of_factors > max(SEPARABLE_RESIDUAL, unexplained):
+        return Cause.MASK
     # One axis explains what the other does not: a baseline. NaN compares as False throughout.
     if along > _MOST and along > 2 * across:
         return Cause.DEPTH

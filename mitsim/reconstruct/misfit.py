@@ -212,7 +212,7 @@ def judge(
     if not found.flagged:
         return found
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))
-    return replace(found, cause=likely_cause(signatures, found.unexplained), signatures=signatures)
+    return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,6 +122,20 @@ def test_another_rig_is_named() -> None:
     assert not image.ok and misfit(image).cause is Cause.RIG
 
 
+def test_a_camera_that_is_not_separable_is_named() -> None:
+    """Its calibration was left with more than the frames are; a part in a hundred, or less than they, is no reason.
+    (Planted: any calibration's; gloss first.)"""
+    glossy = bench(optics=lambda light: light * (1 + 0.05 * PLACE[:, None] * PLACE))
+
+    def cause(unexplained: float) -> Cause | None:
+        factors = bench().calibrated(0)
+        noise = factors.manifest.noise.model_copy(update={"unexplained": unexplained})
+        manifest = factors.manifest.model_copy(update={"noise": noise})
+        return misfit(reconstruct(glossy.run("dots:4", picture(), 0), replace(factors, manifest=manifest))).cause
+
+    assert [cause(each) for each in (0.0, 0.009, 0.05)] == [Cause.GLOSS, Cause.GLOSS, Cause.MASK]
+
+
 def test_without_stated_noise_only_gross_misfit_is_flagged() -> None:
     plain = bench(stated=False)
     image = recovered(bench(SHIFT / 3, stated=False), calibrated=plain)
