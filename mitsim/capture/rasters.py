@@ -14,7 +14,7 @@ _POINT_S, _TERM_S = 9e-9, 8e-11
 """A point at which waves are squared, and a term of their field there."""
 _AROUND = 2.0
 """Cells of the light that is turned over those of its turned square."""
-_HELD, _AT_WORK, _BLOCK_BYTES = 16, 14, 1.2e8
+_HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8
 """Numbers of 8 bytes that are held for each cell, of the 8 shadows that are kept and of their spectra; that are worked
 on while another is made or a frame formed; and what points that are asked for at a time take."""
 
