@@ -99,7 +99,7 @@ decide. Direct light takes half as much where one cell a pixel holds it, and mor
 
 _CORRELATION = 125.0
 """Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
-layer: 0.034 to 0.053 processor seconds of 512 x 512 pixels and 16 phases, where sums take 8e-11 a multiplication
+layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
 (benchmarks/masks.py)."""
 _MANY_ENTRIES = 1.2
 """An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
