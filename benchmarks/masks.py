@@ -128,11 +128,11 @@ def nodes() -> None:
         own = geometry.tilt_nodes(waves=False)
         assert own is not None
 
-        def frame(count: int, seen: ShadowGeometry = shadow, grows: tuple[float, float] = geometry.mask_tilt):
-            terms = tilted_terms(
-                seen, cells, cells, grows, (1, count), lambda each: geometric_terms(each, cells, cells)
-            )
-            return sum(left @ shown @ right.T for left, right in terms)
+        def frame(
+            count: int, seen: ShadowGeometry = shadow, grows: tuple[float, float] = geometry.mask_tilt
+        ) -> np.ndarray:
+            terms = tilted_terms(seen, cells, cells, grows, (1, count), lambda one: geometric_terms(one, cells, cells))
+            return np.asarray(sum(left @ shown @ right.T for left, right in terms))
 
         fine = frame(48)
         left = float(np.linalg.norm(frame(own[1]) - fine) / np.linalg.norm(fine))

@@ -7,9 +7,9 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.plate import Plate
 from mitsim.rig.projector import Spectrum
 
-_MEANS_S, _TURNED_S = 8e-8, 3.5e-7
+_MEANS_S, _TURNED_S = 8e-8, 5e-7
 """A cell of a shadow without diffraction, of a mask that is straight and of one that is turned; here and below 0.7 of
-the processor seconds of 2310 cells a side on a busy core (benchmarks/masks.py)."""
+the processor seconds of 2310 to 3466 cells a side on a busy core (benchmarks/masks.py)."""
 _POINT_S, _TERM_S = 9e-9, 8e-11
 """A point at which waves are squared, and a term of their field there."""
 _AROUND = 2.0
