@@ -45,5 +45,5 @@ def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> floa
 
 
 def raster_bytes(geometry: CameraGeometry) -> float:
-    """Memory of shadows on rasters behind a camera whose mask is drawn."""
+    """Memory of shadows on rasters behind a camera ``geometry`` whose mask is drawn [bytes]."""
     return 8.0 * (_HELD + _AT_WORK) * cells_a_side(geometry) ** 2 + _BLOCK_BYTES

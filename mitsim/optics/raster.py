@@ -97,7 +97,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 
 
 def cells_a_side(geometry: CameraGeometry) -> int:
-    """Raster cells a side of the shadow of far points behind a plate; that of nearer ones has a few more."""
+    """Raster cells a side of far points' shadow behind the plate of ``geometry``; that of nearer ones has a few more."""
     mask = geometry.build_mask()
     assert isinstance(mask, Plate)
     return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry))
@@ -109,7 +109,15 @@ def _cells(geometry: CameraGeometry, mask: Plate, step: float) -> int:
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
-    """Points along a raster cell of ``step_mm`` at which waves are squared, from an effective ``distance_mm``."""
+    """Points along a raster cell at which waves are squared.
+
+    Parameters
+    ----------
+    wavelength_nm, distance_mm
+        of the waves, and how far behind the mask plane waves would have the same fringes.
+    step_mm
+        the cell's side.
+    """
     apart = (wavelength_nm * 1e-6 * distance_mm) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
     return max(int(np.ceil(step_mm / apart)), _LEAST_WAVE_POINTS)
 

@@ -151,7 +151,7 @@ class ShadowGeometry:
         return self.shrink * self.pixel_centres_mm[:, None] + self.distance_mm * directions.centres[None, :]
 
     def met(self, directions: Directions) -> FloatArray:
-        """The same on the tilted mask, along an axis of :meth:`from_mask`."""
+        """The same on the tilted mask, for ``directions`` along an axis of :meth:`from_mask`."""
         (growth, beyond), even = self.tilt[0], self.crossings(directions)
         if not (growth or beyond):
             return even

@@ -73,7 +73,7 @@ def tilted_terms(
 
 
 def nodes_between(places: FloatArray, count: int) -> FloatArray:
-    """(count,) Chebyshev's nodes between the places that are farthest from 0; 0 for one."""
+    """(``count``,) Chebyshev's nodes between those of ``places`` that are farthest from 0; 0 for one."""
     reach = float(np.abs(places).max())
     return np.asarray(reach * np.cos(np.pi * (np.arange(count) + 0.5) / count) if count > 1 else np.zeros(1))
 
