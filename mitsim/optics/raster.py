@@ -97,7 +97,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 
 
 def cells_a_side(geometry: CameraGeometry) -> int:
-    """Raster cells a side of far points' shadow behind the plate of ``geometry``; that of nearer ones has a few more."""
+    """Raster cells a side of far points' shadow behind the plate of ``geometry``; of nearer ones it has some more."""
     mask = geometry.build_mask()
     assert isinstance(mask, Plate)
     return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry))
