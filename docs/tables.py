@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from mitsim.core.colours import ColourManifest, Line
+from mitsim.core.colours import ColourManifest, Line, MosaicManifest
 from mitsim.core.imagelist import Raw
 from mitsim.core.manifests import (
     AmbientFile,
@@ -45,6 +45,7 @@ MODELS = (
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile, Raw),
     *(ColourManifest, Line, ChartPlace),
+    MosaicManifest,
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 

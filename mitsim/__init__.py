@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mitsim.capture.request import Request
     from mitsim.core.errors import ArgumentError, MitsimError
     from mitsim.core.job import Clock, Job
+    from mitsim.core.mosaics import MosaicCapture, load_mosaic
     from mitsim.core.resources import Limits
     from mitsim.core.runs import Capture, load_run
     from mitsim.reconstruct.factors import Factors, load_calibration
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from mitsim.rig.modelling import Modelling
     from mitsim.rig.recipe import load_recipe
     from mitsim.study.calibration_plan import CalibrationPlan, plan_calibration
+    from mitsim.study.colours import reconstruct_colours
     from mitsim.study.metrics import psnr, ssim
 
 __version__ = "0.4.0"
@@ -42,12 +44,14 @@ __version__ = "0.4.0"
 _HOMES = {
     "open_bench": "capture.bench",
     "load_run": "core.runs",
+    "load_mosaic": "core.mosaics",
     "load_calibration": "reconstruct.factors",
     "load_recipe": "rig.recipe",
     "calibrate_frames": "reconstruct.measured",
     "calibrate_model": "capture.modelling",
     "plan_calibration": "study.calibration_plan",
     "reconstruct": "reconstruct.reconstruction",
+    "reconstruct_colours": "study.colours",
     "psnr": "study.metrics",
     "ssim": "study.metrics",
     "Bench": "capture.bench",
@@ -55,6 +59,7 @@ _HOMES = {
     "Request": "capture.request",
     "Light": "capture.light",
     "Capture": "core.runs",
+    "MosaicCapture": "core.mosaics",
     "CalibrationPlan": "study.calibration_plan",
     "Factors": "reconstruct.factors",
     "Reconstruction": "reconstruct.result",
@@ -78,6 +83,7 @@ __all__ = [
     "Limits",
     "MitsimError",
     "Modelling",
+    "MosaicCapture",
     "Plan",
     "Reconstruction",
     "Rendered",
@@ -85,12 +91,14 @@ __all__ = [
     "calibrate_frames",
     "calibrate_model",
     "load_calibration",
+    "load_mosaic",
     "load_recipe",
     "load_run",
     "open_bench",
     "plan_calibration",
     "psnr",
     "reconstruct",
+    "reconstruct_colours",
     "ssim",
 ]
 

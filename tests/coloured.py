@@ -9,8 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.core.colours import MosaicManifest
+from mitsim.core.manifests import Digital, Patterns, RunManifest
+from mitsim.core.mosaics import LineTruth, MosaicCapture
+from mitsim.core.recorders import RunMemory, frame_name
+from mitsim.core.runs import Capture
 from mitsim.reconstruct.colour import chart
 from mitsim.rig.chart import ChartPlace
+from mitsim.rig.patterns import parse_patterns
 from tests import ideal_sessions
 
 N, LINES = 24, (638.0, 520.0, 445.0)
@@ -50,4 +56,48 @@ def folders(place: Path, patterns: str = "dots:4", peak: float = 3e4) -> tuple[P
         shots.manifest = shots.manifest.model_copy(update=camera)
         shots.save(run / name)
         replace(factors, manifest=factors.manifest.model_copy(update=camera)).save(calibration / name)
+    return run, calibration
+
+
+WEIGHTS = ((0.10, 0.15, 0.50), (0.06, 0.45, 0.05), (0.06, 0.45, 0.05), (0.36, 0.05, 0.02))
+"""Electrons per photon of blue, green, green and red pixels at the lines."""
+
+
+def mosaic_folders(place: Path, patterns: str = "dots:4", peak: float = 3e4, truths: bool = True) -> tuple[Path, Path]:
+    """A run of the same chart behind filters BGGR, all lines at once, and its calibration, in ``place``.
+
+    Each line has a shadow of its own, a third of a pixel from the next.
+    """
+    sides = {
+        f"{wave:g}nm": ideal_sessions.shadow(shift, N) for wave, shift in zip(LINES, (-0.3, 0.0, 0.3), strict=True)
+    }
+    family, rng = parse_patterns(patterns, N), np.random.default_rng(7)
+    images = scenes()
+    lights = []
+    for shot in family.shots:
+        light = np.zeros((ideal_sessions.PIXELS,) * 2)
+        for number, (name, side) in enumerate(sides.items()):
+            seen = side @ (family.light(shot) * images[name]) @ side.T
+            for weights, (a, b) in zip(WEIGHTS, ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True):
+                light[a::2, b::2] += weights[number] * seen[a::2, b::2]
+        lights.append(light)
+    gain, memory = peak / max(light.max() for light in lights), RunMemory()
+    for index, light in enumerate(lights):
+        electrons = rng.poisson(gain * light) + ideal_sessions.READ * rng.standard_normal(light.shape)
+        dn = np.clip(np.rint(ideal_sessions.GAIN * electrons + ideal_sessions.BLACK), 0, 2**13 - 1).astype(np.uint32)
+        memory.write_frame(index, {"DN": dn}, {})
+    digital = Digital(
+        exposure_s=gain, gain_dn_per_e=ideal_sessions.GAIN, black_level_dn=ideal_sessions.BLACK,
+        dark_current_e_per_s=0.0, read_noise_e=ideal_sessions.READ, step_dn=1.0,
+    )  # fmt: skip
+    files = [frame_name(index) for index in range(len(lights))]
+    shots = Capture.recorded(memory, RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files)))
+    named = MosaicManifest.model_validate({**manifest("mosaic-run"), "mosaic": "BGGR", "weights": WEIGHTS})
+    known = {name: LineTruth(image, np.full(image.shape, 1e-4), 0.99) for name, image in images.items()}
+    run, calibration = place / "run", place / "cal"
+    MosaicCapture(shots, named, known if truths else {}).save(run)
+    calibration.mkdir()
+    (calibration / "colour.json").write_text(json.dumps(manifest("colour-calibration")))
+    for seed, (name, side) in enumerate(sides.items()):
+        ideal_sessions.Bench(side, side).calibrated(seed, 1e-5).save(calibration / name)
     return run, calibration

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 # What needs numpy, or the renderer, is imported where it is used: a misspelt name is refused without them.
-from mitsim.core.configuration import load_model, locate
+from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.files import SceneFiles
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mitsim.capture.render import Rendered
     from mitsim.core.job import Job
     from mitsim.core.manifests import Parallax
+    from mitsim.core.mosaics import MosaicCapture
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
     from mitsim.rig.board import BoardShape
@@ -217,6 +218,78 @@ class Bench:
             from mitsim.capture.colour import calibrate_lines
 
         return calibrate_lines(self, seed, accuracy, recipe, output, resume, job)
+
+    def capture_mosaic(
+        self,
+        patterns: str = "dots:7",
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+        **request: Any,
+    ) -> MosaicCapture:
+        """All lines of the projector at once, seen by a camera under a mosaic of colour filters: one frame a shot.
+
+        Needs a spectral variant, and a camera whose file has a ``mosaic``.
+
+        Parameters
+        ----------
+        patterns
+            name of the family.
+        output
+            RUN folder, with the lines' truths and colour.json beside; None keeps all in memory.
+        resume, job
+            as for :meth:`capture`.
+        **request
+            other fields of :class:`mitsim.capture.request.Request`, but for ``seconds``.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
+            odd number of pixels, and a projector with speckle, which is not simulated behind filters.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.capture.mosaic import capture_mosaic
+            from mitsim.capture.request import Request
+
+        return capture_mosaic(self, Request.of(patterns=patterns, **request), job, output, resume)
+
+    def calibrate_mosaic(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> dict[str, Factors]:
+        """The factors of a camera under a mosaic of colour filters at each spectral line of the projector, by its name.
+
+        One session a line, whose light the filters dim; each pixel's reading is divided by what its filter passes of
+        the line, as the camera's file states it. Factors are those of pixels without filters, one electron a photon.
+
+        Parameters
+        ----------
+        seed, accuracy, output, resume, job
+            as for :meth:`calibrate_lines`.
+        recipe
+            how each session is run; None: the shipped one, with four shots of each pattern.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate_lines` and :meth:`capture_mosaic`, and for a filter that passes nothing of a line.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.capture.mosaic import calibrate_mosaic
+
+        return calibrate_mosaic(self, seed, accuracy, recipe, output, resume, job)
 
     def calibrate(
         self,
@@ -576,7 +649,7 @@ def open_bench(
     path = locate(scene, "scenes", "scene.xml")
     defines = {name: _text(value) for name, value in parameters.items()}
     Outline(path, defines, SceneFiles(path, allow_outside_files))  # what it refuses needs no renderer
-    sensor_path = locate(camera if camera is not None else "imx249", "calibration", ".toml")
+    sensor_path = locate(DEFAULT_CAMERA if camera is None else camera, "calibration", ".toml")
     projector_path = locate(projector if projector is not None else "mp_cl1", "calibration", ".toml")
     from mitsim.rig.profile import load_mask
     from mitsim.rig.projector import ProjectorModel
@@ -585,7 +658,8 @@ def open_bench(
 
     sensor, mask = load_sensor(sensor_path), load_mask(sensor_path)
     light = load_model(projector_path, ProjectorModel)
-    if not for_render:
+    # All lines at once behind colour filters are for variants that tell them apart.
+    if not for_render and not (sensor.mosaic and variant.endswith("_spectral")):
         try:
             sensor.efficiency(light.effective_wavelength_nm)
         except MitsimError as error:

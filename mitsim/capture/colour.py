@@ -24,6 +24,7 @@ from mitsim.capture.run import capture, check_run, plan_request, sampling_of
 from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import trace_truths
+from mitsim.core.arrays import FloatArray
 from mitsim.core.colours import CALIBRATION, RUN, ColourManifest, Line, write_colours
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
@@ -132,24 +133,42 @@ def capture_lines(
     """
     job = job or Job()
     colours = ColourBench.of(bench, RUN)
-    _refuse(colours.whole, request)
+    refuse(colours.whole, request)
     with _claimed(output, colours.manifest, resume) as places:
         for each, place in zip(colours.benches, places, strict=True):
             check_run(each, request, place, resume)
-        with job.clock.stage("plan"):
-            plan = plan_request(colours.roughest(request.seed), request)
-        if plan.cost:
-            plan.cost.check(request.patterns, job.limits)
-        lighting = bench.family(request.patterns, request.seed).lighting
-        with job.clock.stage("transport"):
-            sampling = sampling_of(colours.whole, request)
-            lights = trace_lines(colours.whole, colours.benches, plan, lighting, request.seed, sampling, job.progress)
-        with job.clock.stage("truth"):
-            errors = np.stack([light.flux_error for light in lights])
-            truths = trace_truths(colours.whole, plan.settings, request.seed, errors)
-        lights = [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
+        lights = traced_lines(colours, request, job)
         runs = zip(colours.manifest.names, colours.benches, lights, places, strict=True)
         return {name: capture(each, request, job, place, resume, light=light) for name, each, light, place in runs}
+
+
+def traced_lines(colours: ColourBench, request: Request, job: Job) -> list[Light]:
+    """Light of each line with its truth, traced on the same paths.
+
+    Parameters
+    ----------
+    colours
+        bench and lines.
+    request, job
+        what is asked for; clock, progress and limits.
+
+    Raises
+    ------
+    MitsimError
+        for what is not simulated in colour, and work beyond the limits.
+    """
+    with job.clock.stage("plan"):
+        plan = plan_request(colours.roughest(request.seed), request)
+    if plan.cost:
+        plan.cost.check(request.patterns, job.limits)
+    lighting = colours.whole.family(request.patterns, request.seed).lighting
+    with job.clock.stage("transport"):
+        sampling = sampling_of(colours.whole, request)
+        lights = trace_lines(colours.whole, colours.benches, plan, lighting, request.seed, sampling, job.progress)
+    with job.clock.stage("truth"):
+        errors = np.stack([light.flux_error for light in lights])
+        truths = trace_truths(colours.whole, plan.settings, request.seed, errors)
+    return [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
 
 
 def calibrate_lines(
@@ -173,17 +192,51 @@ def calibrate_lines(
     MitsimError
         as there.
     """
-    colours, job = ColourBench.of(bench, CALIBRATION), job or Job()
-    recipe = of_one_depth(recipe or load_recipe())
+    colours = ColourBench.of(bench, CALIBRATION)
+    sessions = line_sessions(colours, of_one_depth(recipe or load_recipe()), seed)
+    return run_sessions(colours, sessions, accuracy, output, resume, job or Job())
+
+
+def line_sessions(
+    colours: ColourBench, recipe: SessionRecipe, seed: int, filters: Sequence[FloatArray] | None = None
+) -> list[Session]:
+    """The session of each line, whose light is traced with the others'.
+
+    Parameters
+    ----------
+    colours, recipe, seed
+        bench and lines, how they are run, and the root of their random streams.
+    filters
+        (pixels, pixels) part of each line's light that filters pass; None: all.
+    """
     shared = _SharedLight(colours, Session(colours.whole, recipe, seed))
+    passed: Sequence[FloatArray | None] = filters or [None] * len(colours.benches)
+    return [
+        _LineSession(each, recipe, seed, filters=own, shared=shared, line=number)
+        for number, (each, own) in enumerate(zip(colours.benches, passed, strict=True))
+    ]
+
+
+def run_sessions(
+    colours: ColourBench,
+    sessions: Sequence[Session],
+    accuracy: float,
+    output: Path | str | None,
+    resume: bool,
+    job: Job,
+) -> dict[str, Factors]:
+    """Factors at each line, by its name.
+
+    Parameters
+    ----------
+    colours, sessions
+        bench and lines, and the session of each.
+    accuracy, output, resume, job
+        as for :meth:`mitsim.capture.bench.Bench.calibrate_lines`.
+    """
     with _claimed(output, colours.manifest, resume) as places:
-        lines = zip(colours.manifest.names, colours.benches, places, strict=True)
-        return {
-            name: calibrate_session(
-                _LineSession(each, recipe, seed, shared=shared, line=number), accuracy, place, resume, job
-            )
-            for number, (name, each, place) in enumerate(lines)
-        }
+        lines = zip(colours.manifest.names, sessions, places, strict=True)
+        return {name: calibrate_session(each, accuracy, place, resume, job) for name, each, place in lines}
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +292,8 @@ class _LineSession(Session):
         return self.shared.light(self.line, plan, job)
 
 
-def _refuse(bench: Bench, request: Request) -> None:
-    """MitsimError for what is not simulated in colour."""
+def refuse(bench: Bench, request: Request) -> None:
+    """MitsimError where a ``request`` on a ``bench`` asks for what is not simulated in colour."""
     if bench.loaded.lamps and request.effects.get("ambient", True):
         raise MitsimError(
             f"{bench.loaded.path}: colour: ambient light is not simulated in colour; switch it off with "

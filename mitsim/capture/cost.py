@@ -75,12 +75,12 @@ def frames_cost(
     """
     shots, classes = lighting.weights.shape
     rows = bench.geometry.pixels
-    pixels = rows**2
+    pixels, lines = rows**2, 1 if bench.lines is None else len(bench.lines.shares)
     files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
     truth = float(_BYTES_PER_PIXEL * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES)
     return Cost(
         seconds=seconds,
-        memory_bytes=light_bytes(bench, classes, settings) + frames_bytes(classes, shots, rows),
+        memory_bytes=lines * (light_bytes(bench, classes, settings) + frames_bytes(classes, shots, rows)),
         disk_bytes=max(files + truth - on_disk, 0.0),
     )
 

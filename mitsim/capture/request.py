@@ -47,7 +47,13 @@ class Exposure:
             )
 
     def check(self, rig: Rig) -> None:
-        """MitsimError when the time is to follow from a full well that the camera of ``rig`` does not have."""
+        """MitsimError when the camera of ``rig`` sees through colour filters, whose frames are captured otherwise, or
+        the time is to follow from a full well that it does not have."""
+        if rig.sensor.mosaic is not None:
+            raise MitsimError(
+                f"camera {rig.camera_file}: has a mosaic {rig.sensor.mosaic}, whose frames show all lines at once; "
+                "capture and calibrate it with --colour mosaic, in Python capture_mosaic and calibrate_mosaic"
+            )
         if self.seconds is None and not math.isfinite(rig.sensor.full_well_e):
             raise MitsimError(
                 f"camera {rig.camera_file}: full_well_e is inf, so there is no full well to fill; "

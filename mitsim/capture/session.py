@@ -65,12 +65,15 @@ class Session:
         of its noise and light.
     depth
         of the board [mm]; None: on the aligned plane.
+    filters
+        (pixels, pixels) part of the light that colour filters over them pass, which readings are divided by; None: all.
     """
 
     bench: Bench
     recipe: SessionRecipe
     seed: int = 0
     depth: float | None = None
+    filters: FloatArray | None = None
 
     @property
     def distance(self) -> float:
@@ -144,6 +147,10 @@ class Session:
         """Whether a +-1 pattern is the difference of two shots, and not taken from one and a uniform shot."""
         return self.recipe.signed_capture == "pair"
 
+    def filtered(self, light: FloatArray) -> FloatArray:
+        """What passes the filters of ``light`` (pixels, pixels)."""
+        return light if self.filters is None else light * self.filters
+
     @property
     def shots(self) -> int:
         """Frames of the whole session."""
@@ -214,7 +221,7 @@ class Session:
         with job.clock.stage("optics"):
             white = next(iter(light.frames(Lighting.uniform(self.bench.n), self.seed)))
             exposure = Exposure(None, self.recipe.exposure_fraction)
-            exposure_s = exposure.choose(self.bench.rig, float(white.irradiance.max()))
+            exposure_s = exposure.choose(self.bench.rig, float(self.filtered(white.irradiance).max()))
         stripes = PatternFamily("stripes", self.signs[:, 1:2].astype(np.int8), np.ones((self.bench.n, 1), np.int8))
         return LitSession(self, light, white, exposure_s, light.speckle(stripes))
 
@@ -284,8 +291,10 @@ class LitSession:
         own, shared = (dict.fromkeys((SHOT, DARK, READ, ROUNDING), np.zeros(1)) for _ in range(2))
         for number, time in enumerate(self.exposures_s):
             weight: FloatArray | float = 1.0 if ladder.weights is None else np.square(ladder.weights[number])
+            if self.session.filters is not None:
+                weight = weight / np.square(self.session.filters)
             single: dict[str, FloatArray | float] = {
-                SHOT: self.uniform_rate / time,
+                SHOT: self.session.filtered(self.uniform_rate) / time,
                 DARK: sensor.superpixel_dark_current_e_per_s / time,
                 READ: sensor.superpixel_reading_noise_e**2 / time**2,
                 ROUNDING: rounding / time**2,
@@ -427,7 +436,7 @@ class LitSession:
             for index in range(number):
                 total += self._read(exposer, still, "dark", exposure, index)
             rates.append(exposer.rate(total / number))
-        return {side: ladder.merged(rates) for side, ladder in self.ladders.items()}
+        return {side: self._unfiltered(ladder.merged(rates)) for side, ladder in self.ladders.items()}
 
     @cached_property
     def uniform_rate(self) -> FloatArray:
@@ -459,7 +468,8 @@ class LitSession:
 
     def _lit(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
         """Expected electrons of a shot. Speckle of a board at rest is the same in all repeats and exposures."""
-        return self._exposers[exposure].lit(Frame(irradiance, 0.0, 0.0, 0.0), "calibration", *names)
+        passed = Frame(self.session.filtered(irradiance), 0.0, 0.0, 0.0)
+        return self._exposers[exposure].lit(passed, "calibration", *names)
 
     def _repeated(self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int) -> tuple[Digital, int]:
         """The mean of all repeats of a shot at one exposure, and how many have saturated pixels that are used.
@@ -507,7 +517,12 @@ class LitSession:
     def _rate(self, shot: _Shot, rows: slice) -> FloatArray:
         """Rates of some ``rows`` of a ``shot``."""
         each = zip(self._exposers, shot.digital, strict=True)
-        return shot.ladder.merged((exposer.rate(digital[rows]) for exposer, digital in each), rows)
+        merged = shot.ladder.merged((exposer.rate(digital[rows]) for exposer, digital in each), rows)
+        return self._unfiltered(merged, rows)
+
+    def _unfiltered(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:
+        """What pixels without filters would read, from the ``rate`` of some ``rows``."""
+        return rate if self.session.filters is None else rate / self.session.filters[rows]
 
     @staticmethod
     def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:

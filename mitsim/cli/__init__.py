@@ -16,7 +16,7 @@ import typer
 
 import mitsim
 from mitsim.cli import calibration, exchange, image, sensor, study
-from mitsim.cli.colour import Colour, of_capture, spectral
+from mitsim.cli.colour import LINES, MOSAIC, Colour, of_capture, of_mosaic, variant_for
 from mitsim.cli.options import (
     DAY,
     Accuracy,
@@ -213,13 +213,18 @@ def capture(
         ambient_frame=ambient_frame,
         ambient_shots=ambient_shots,
     )
-    by_line = colour == "lines"
+    traced_in = variant_for(colour, variant, camera)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
-            bench = bench_of(scene, spectral(variant) if by_line else variant, camera, projector, define, outside)
+            bench = bench_of(scene, traced_in, camera, projector, define, outside)
         held = memory_from_here()
-        if by_line:
+        if colour == MOSAIC:
+            seen = bench.capture_mosaic(request.pop("patterns"), output, resume, job, **request)
+            payload, lines = of_mosaic(seen)
+            payload["memory_bytes"] = max(peak_memory() - held, 0.0)
+            return finish(as_json, payload, lines, seen.warnings)
+        if colour == LINES:
             runs = bench.capture_lines(request.pop("patterns"), output, resume, job, **request)
             payload, lines = of_capture(runs, output)
             payload["memory_bytes"] = max(peak_memory() - held, 0.0)

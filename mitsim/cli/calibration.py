@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.cli.colour import Colour, of_calibration, spectral
+from mitsim.cli.colour import LINES, NO, Colour, of_calibration, variant_for
 from mitsim.cli.modelling import calibrate_model, modelling_of
 from mitsim.cli.options import (
     DAY,
@@ -119,29 +119,30 @@ def calibrate(
     session = load_recipe(recipe)
     if write_frames is not None and resume:
         raise MitsimError("--write-frames: a resumed session shows its finished patterns no more; leave out --resume")
-    by_line = colour == "lines"
-    if by_line and write_frames is not None:
+    if colour != NO and write_frames is not None:
         raise MitsimError(
             f"--write-frames {write_frames}: frames are kept of light that is not told apart; leave one out"
         )
     if planning:
         if write_frames is not None:
             raise MitsimError(f"--write-frames {write_frames}: --plan takes no frames; leave one of them out")
-        if by_line:
-            raise MitsimError("--colour lines: --plan is for light that is not told apart; leave one of them out")
+        if colour != NO:
+            raise MitsimError(f"--colour {colour}: --plan is for light that is not told apart; leave one of them out")
         wanted = Wanted.of(psnr, patterns, output, resume)
         with job_of(quiet or as_json, max_seconds, max_memory) as job:
             with job.clock.stage("open scene"):
                 bench = bench_of(scene, variant, camera, projector, define, outside)
             return wanted.planned(bench, session, request, job, as_json)
-    folder = check_no_plan(psnr, patterns, output)
+    folder, traced_in = check_no_plan(psnr, patterns, output), variant_for(colour, variant, camera)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
-            bench = bench_of(scene, spectral(variant) if by_line else variant, camera, projector, define, outside)
+            bench = bench_of(scene, traced_in, camera, projector, define, outside)
         held = memory_from_here()
-        if by_line:
-            colours = bench.calibrate_lines(**request, recipe=session, output=folder, resume=resume, job=job)
+        if colour != NO:
+            by_line = bench.calibrate_lines if colour == LINES else bench.calibrate_mosaic
+            shown = None if recipe is None else session
+            colours = by_line(**request, recipe=shown, output=folder, resume=resume, job=job)
             payload, lines = of_calibration(colours, folder)
             payload["memory_bytes"] = max(peak_memory() - held, 0.0)
             return finish(as_json, payload, lines, payload["warnings"])

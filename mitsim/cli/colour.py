@@ -10,35 +10,82 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsim.cli.screen import finish
-from mitsim.core.colours import CALIBRATION, RUN, read_colours
+from mitsim.core.colours import CALIBRATION, RUN, check_way, is_mosaic, read_colours, read_mosaic
 from mitsim.core.errors import MitsimError
 
 if TYPE_CHECKING:
+    from mitsim.core.mosaics import MosaicCapture
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
 
-_CHOICES = ("no", "lines")
+NO, LINES, MOSAIC = _CHOICES = ("no", "lines", "mosaic")
 
 
 def _choice(name: str) -> str:
     if name not in _CHOICES:
-        raise MitsimError(f"--colour {name!r}: use {' or '.join(_CHOICES)}")
+        raise MitsimError(f"--colour {name!r}: use {', '.join(_CHOICES[:-1])} or {_CHOICES[-1]}")
     return name
 
 
 Colour = Annotated[
     str,
     typer.Option(
-        help="lines: sequential colour, each line of the projector in a folder of its own; no: one, of all light",
-        metavar="no|lines",
+        help="lines: sequential colour, each line of the projector in a folder of its own; mosaic: all lines at once, "
+        "by a camera under colour filters; no: light that is not told apart",
+        metavar="no|lines|mosaic",
         callback=_choice,
     ),
 ]
 
 
-def spectral(variant: str) -> str:
-    """The ``variant`` of the same backend that knows wavelengths."""
+def variant_for(colour: str, variant: str, camera: str | None) -> str:
+    """The variant that light is traced in.
+
+    Parameters
+    ----------
+    colour, variant
+        as asked for; light is told apart by the same backend's variant that knows wavelengths.
+    camera
+        name or file; None: the default one.
+
+    Raises
+    ------
+    MitsimError
+        for colour that the camera cannot have.
+    """
+    if colour == NO:
+        return variant
+    from mitsim.core.configuration import DEFAULT_CAMERA, locate
+    from mitsim.rig.sensor import load_sensor
+
+    path = locate(camera or DEFAULT_CAMERA, "calibration", ".toml")
+    mosaic = load_sensor(path).mosaic
+    if colour == MOSAIC and mosaic is None:
+        raise MitsimError(
+            f"--colour mosaic: camera {path} has no mosaic of colour filters; give one that has, such as "
+            "--camera imx249_rggb, or use --colour lines"
+        )
+    if colour == LINES and mosaic is not None:
+        raise MitsimError(
+            f"--colour lines: camera {path} has a mosaic {mosaic}, whose frames show all lines at once; use "
+            "--colour mosaic"
+        )
     return f"{variant.rpartition('_')[0]}_spectral"
+
+
+def mosaic_options(options: Mapping[str, Any], way: str) -> dict[str, Any]:
+    """Those ``options`` of `mitsim reconstruct` that images behind colour filters have, and their ``way``.
+
+    MitsimError for a way that there is not, and for options that these images have not.
+    """
+    check_way(way)
+    for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0)):
+        if options[name] != neutral:
+            raise MitsimError(
+                f"--{name} {options[name]}: runs behind colour filters are solved by tikhonov at the calibrated depth; "
+                "leave it out"
+            )
+    return {"lam": options["lam"], "overwrite": options["overwrite"], "way": way}
 
 
 def of_capture(runs: Mapping[str, Capture], output: Path) -> tuple[dict[str, Any], list[str]]:
@@ -51,6 +98,19 @@ def of_capture(runs: Mapping[str, Capture], output: Path) -> tuple[dict[str, Any
         for part in payload["channels"]
     ]
     return payload, [*lines, _last(payload)]
+
+
+def of_mosaic(shots: MosaicCapture) -> tuple[dict[str, Any], list[str]]:
+    """JSON and lines of text of ``shots`` behind colour filters, in their folder."""
+    payload = shots.summary()
+    lines = [
+        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} behind {payload['mosaic']} "
+        f"filters, {len(payload['channels'])} lines at once, in {payload['seconds']['total']:.1f} s: "
+        f"{payload['output']}",
+        f"Monte Carlo error at most {payload['mc_error']:.1e}, total error up to {payload['total_error_bound']:.1e}, "
+        f"exposure {payload['exposure_s']:.3g} s a frame",
+    ]
+    return payload, lines
 
 
 def of_calibration(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, Any], list[str]]:
@@ -84,8 +144,12 @@ def reconstruct_lines(
     from mitsim.rig.chart import load_chart
 
     # Refused before the solver and colour-science are imported.
-    for name in read_colours(run, RUN).names:
-        read_manifest(run / name, RunManifest)
+    if is_mosaic(run):
+        read_mosaic(run)
+        read_manifest(run, RunManifest)
+    else:
+        for name in read_colours(run, RUN).names:
+            read_manifest(run / name, RunManifest)
     for name in read_colours(calibration, CALIBRATION).names:
         read_manifest(calibration / name, CalibrationManifest)
     place = None if chart is None else load_chart(chart)
@@ -95,13 +159,7 @@ def reconstruct_lines(
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)
     payload = {**found.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
-    lines = [
-        f"{name}: {judged.quality or 'no truth to compare with'}, lambda {judged.reconstruction.lam:.3g}, residual "
-        f"{judged.reconstruction.residual:.1e}"
-        for name, judged in found.images.items()
-    ]
-    lines.append(f"colours by a matrix fitted on {found.model.fitted_on}: {found.output}")
-    return finish(as_json, payload, lines, found.warnings)
+    return finish(as_json, payload, [*found.sentences, found.output], found.warnings)
 
 
 def _percent(part: float | None) -> str:

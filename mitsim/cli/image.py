@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mitsim.cli.colour import reconstruct_lines
+from mitsim.cli.colour import mosaic_options, reconstruct_lines
 from mitsim.cli.options import Json, Quiet, Variant, number_of
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
@@ -47,22 +47,35 @@ def reconstruct(
             metavar="NAME|FILE.json",
         ),
     ] = None,
+    mosaic: Annotated[
+        str | None,
+        typer.Option(
+            help="of a run behind colour filters: how its images are found",
+            metavar="joint|half|demosaic",
+            show_default="joint",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
-    from mitsim.core.colours import is_coloured
+    from mitsim.core.colours import JOINT, is_coloured, is_mosaic
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
     if is_coloured(run):
         options = {"lam": strength, "method": method, "overwrite": overwrite, "focus": depth, "margin": margin}
+        if is_mosaic(run):
+            options = mosaic_options(options, mosaic or JOINT)
+        elif mosaic is not None:
+            raise MitsimError(f"--mosaic {mosaic}: {run} has a run for each line; leave out --mosaic")
         return reconstruct_lines(run, calibration, output or run / "reconstruction", chart, options, as_json)
-    if chart is not None:
-        raise MitsimError(f"--chart {chart}: {run} is not coloured; leave out --chart")
+    for option, value in (("--chart", chart), ("--mosaic", mosaic)):
+        if value is not None:
+            raise MitsimError(f"{option} {value}: {run} is not coloured; leave out {option}")
     # Refused before the solver is imported, which takes half a second.
     read_manifest(run, RunManifest)
     read_manifest(calibration, CalibrationManifest)

@@ -1,23 +1,34 @@
 """Coloured folders: which spectral lines a run, calibration or image has; each line lies in a folder of its own.
 
-`colour.json` names the lines; `FOLDER/638nm/` is an ordinary RUN, CAL or image folder of that line alone.
+`colour.json` names the lines; `FOLDER/638nm/` is an ordinary RUN, CAL or image folder of that line alone. Of a camera
+under a mosaic of colour filters, whose frames show all lines at once, a run is one RUN folder for all, and the lines'
+folders hold what a perfect image of each would show.
 """
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mitsim.core.configuration import validated
-from mitsim.core.errors import MitsimError, cut
+from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.jsonfile import read_json, write_json
 
 COLOUR = "colour.json"
-RUN, CALIBRATION, IMAGE = KINDS = ("colour-run", "colour-calibration", "colour-image")
-_COMMANDS = {RUN: "capture", CALIBRATION: "calibrate", IMAGE: "reconstruct"}
-"""Verbs that make a folder of each kind."""
+RUN, CALIBRATION, IMAGE, MOSAIC = KINDS = ("colour-run", "colour-calibration", "colour-image", "mosaic-run")
+_COMMANDS = {
+    RUN: "capture --colour lines",
+    CALIBRATION: "calibrate --colour lines",
+    IMAGE: "reconstruct",
+    MOSAIC: "capture --colour mosaic",
+}
+"""What makes a folder of each kind."""
+JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
+"""Ways to images of lines from frames behind colour filters (:mod:`mitsim.study.filters`), that of most PSNR first."""
+Weight = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class Line(BaseModel):
@@ -46,7 +57,9 @@ class ColourManifest(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
-    kind: Literal["colour-run", "colour-calibration", "colour-image"] = Field(description="what the folder is")
+    kind: Literal["colour-run", "colour-calibration", "colour-image", "mosaic-run"] = Field(
+        description="what the folder is"
+    )
     channels: Annotated[tuple[Line, ...], Field(strict=False, min_length=1, max_length=256)] = Field(
         description="spectral lines, each in a folder of its name"
     )
@@ -71,9 +84,37 @@ class ColourManifest(BaseModel):
         return tuple(line.wavelength_nm for line in self.channels)
 
 
+class MosaicManifest(ColourManifest):
+    """What colour.json says of a run behind colour filters, beside its lines."""
+
+    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"] = Field(
+        description="filters of 2 x 2 pixels, row by row from the frame's first pixel"
+    )
+    weights: Annotated[
+        tuple[Annotated[tuple[Weight, ...], Field(strict=False)], ...], Field(strict=False, min_length=4, max_length=4)
+    ] = Field(description="of each of these four pixels, electrons per photon of each line")
+
+    @model_validator(mode="after")
+    def _a_weight_for_each_line(self) -> MosaicManifest:
+        if any(len(row) != len(self.channels) for row in self.weights):
+            raise ValueError(
+                f"weights have {', '.join(str(len(row)) for row in self.weights)} numbers; give each of the four "
+                f"pixels one for each of {len(self.channels)} lines"
+            )
+        return self
+
+
+Manifest = TypeVar("Manifest", bound=ColourManifest)
+
+
 def is_coloured(folder: Path | str) -> bool:
     """Whether ``folder`` has a colour.json."""
     return (Path(folder) / COLOUR).is_file()
+
+
+def is_mosaic(folder: Path | str) -> bool:
+    """Whether ``folder`` has the colour.json of a run behind colour filters. MitsimError when it is no JSON."""
+    return is_coloured(folder) and _kind(read_json(Path(folder) / COLOUR)) == MOSAIC
 
 
 def read_colours(folder: Path | str, kind: str) -> ColourManifest:
@@ -81,12 +122,36 @@ def read_colours(folder: Path | str, kind: str) -> ColourManifest:
 
     MitsimError when it has no colour.json, or one of another kind or that breaks a rule.
     """
-    folder = Path(folder)
-    if not is_coloured(folder):
+    return _read(Path(folder), kind, ColourManifest)
+
+
+def read_mosaic(folder: Path | str) -> MosaicManifest:
+    """What colour.json says of a run behind colour filters in ``folder``. MitsimError as :func:`read_colours`."""
+    return _read(Path(folder), MOSAIC, MosaicManifest)
+
+
+def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
+    """Whether a calibration is of a run's lines.
+
+    Parameters
+    ----------
+    lines, run
+        of the run, and what messages call it.
+    calibration
+        coloured folder.
+
+    Raises
+    ------
+    MitsimError
+        where its lines are others, or it is not coloured.
+    """
+    calibrated = read_colours(calibration, CALIBRATION)
+    ours, theirs = (dict(zip(each.names, each.wavelengths_nm, strict=True)) for each in (lines, calibrated))
+    if ours != theirs:
         raise MitsimError(
-            f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]} --colour lines`"
+            f"calibration {calibration}: its lines are {', '.join(theirs)}, but {run} has {', '.join(ours)}; "
+            "calibrate each line of this projector"
         )
-    return checked_colours(read_json(folder / COLOUR), kind, folder)
 
 
 def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
@@ -106,22 +171,49 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     MitsimError
         when it is of another kind or breaks a rule.
     """
-    found = data.get("kind") if isinstance(data, dict) else type(data).__name__
-    if found != kind:
-        raise MitsimError(f"{place}: holds a {cut(str(found))}, not a {kind}; give the right folder")
-    return validated(ColourManifest, data, f"{place}/{COLOUR}")
+    return _checked(data, kind, place, ColourManifest)
 
 
 def same_lines(run: Path, calibration: Path) -> ColourManifest:
     """The lines of a coloured ``run``; MitsimError where its ``calibration`` has others, or either is not coloured."""
-    lines, calibrated = read_colours(run, RUN), read_colours(calibration, CALIBRATION)
-    ours, theirs = (dict(zip(each.names, each.wavelengths_nm, strict=True)) for each in (lines, calibrated))
-    if ours != theirs:
-        raise MitsimError(
-            f"calibration {calibration}: its lines are {', '.join(theirs)}, but {run} has {', '.join(ours)}; "
-            "calibrate each line of this projector"
-        )
+    lines = read_colours(run, RUN)
+    check_lines(lines, str(run), calibration)
     return lines
+
+
+def _read(folder: Path, kind: str, model: type[Manifest]) -> Manifest:
+    if not is_coloured(folder):
+        raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
+    return _checked(read_json(folder / COLOUR), kind, folder, model)
+
+
+def _checked(data: Any, kind: str, place: Path, model: type[Manifest]) -> Manifest:
+    if _kind(data) != kind:
+        raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
+    return validated(model, data, f"{place}/{COLOUR}")
+
+
+def _kind(data: Any) -> str:
+    """What a colour.json of this ``data`` says that the folder is."""
+    return str(data.get("kind") if isinstance(data, dict) else type(data).__name__)
+
+
+def installed_ways() -> tuple[str, ...]:
+    """Those of :data:`WAYS` that are installed: demosaicing is an extra."""
+    return WAYS if find_spec("colour_demosaicing") else WAYS[:-1]
+
+
+def check_way(way: str) -> str:
+    """The ``way``, one of :data:`WAYS`; ArgumentError for another, and one that is not installed."""
+    if way not in WAYS:
+        raise ArgumentError("mosaic", f"{way!r}: use {', '.join(WAYS[:-1])} or {WAYS[-1]}")
+    if way not in installed_ways():
+        raise ArgumentError(
+            "mosaic",
+            f"{way}: colour-demosaicing is not installed; pip install 'mitsim[mosaic]' (Python 3.11 or newer), or use "
+            f"{' or '.join(installed_ways())}",
+        )
+    return way
 
 
 def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:

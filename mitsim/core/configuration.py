@@ -23,6 +23,8 @@ _MOST_DOTS = 200
 """The parser takes a tenth of a second for a name of that many parts."""
 _SHORT = reprlib.Repr()  # values as a message shows them
 _SHORT.maxstring = _SHORT.maxother = 100  # characters: a line of 120 with what stands around them
+DEFAULT_CAMERA = "imx249"
+"""Of a bench where none is named: the paper's."""
 Model = TypeVar("Model", bound=pydantic.BaseModel)
 LARGEST = 1e12
 """Largest number of a device, and one over the smallest: far from any device, and products of a few stay finite."""

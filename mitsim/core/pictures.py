@@ -42,13 +42,17 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
     smallest
         pixels a side that there are at least: each value then takes a square of them.
     """
+    return _png(np.asarray(values, dtype=np.float64), largest, smallest)
+
+
+def _png(shown: npt.NDArray[np.float64], largest: int | None, smallest: int) -> bytes:
+    """A PNG of values ``shown`` (rows, columns), or (rows, columns, 3) in colour, 0 black and 1 white."""
     # Imported here: most work shows nothing.
     from PIL import Image
 
-    shown = np.asarray(values, dtype=np.float64)
-    copies = -(-smallest // max(shown.shape))
-    grey = np.rint(255 * np.clip(np.kron(shown, np.ones((copies, copies))), 0, 1))
-    picture = Image.fromarray(grey.astype(np.uint8))
+    copies = -(-smallest // max(shown.shape[:2]))
+    levels = np.rint(255 * np.clip(shown.repeat(copies, axis=0).repeat(copies, axis=1), 0, 1))
+    picture = Image.fromarray(levels.astype(np.uint8))
     if largest:
         picture = picture.reduce(max(1, -(-max(picture.size) // largest)))
     buffer = io.BytesIO()
@@ -56,13 +60,17 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
     return buffer.getvalue()
 
 
-def colour_png(rgb: npt.ArrayLike) -> bytes:
-    """A PNG in colour of linear sRGB ``rgb`` (rows, columns, 3), cut to 0..1 and encoded for a screen."""
-    from PIL import Image
+def colour_png(rgb: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
+    """A PNG in colour of linear sRGB.
 
-    buffer = io.BytesIO()
-    Image.fromarray(np.rint(255 * lightness(rgb)).astype(np.uint8)).save(buffer, format="png", optimize=True)
-    return buffer.getvalue()
+    Parameters
+    ----------
+    rgb
+        (rows, columns, 3), cut to 0..1 and encoded for a screen.
+    largest, smallest
+        as for :func:`grey_png`.
+    """
+    return _png(lightness(rgb), largest, smallest)
 
 
 def data_uri(picture: bytes) -> str:
@@ -92,11 +100,14 @@ def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]
     title
         above all.
     pictures
-        reflectances, or numbers scaled to 0..1, by caption.
+        reflectances, or numbers scaled to 0..1, or linear sRGB (rows, columns, 3), by caption.
     facts
         lines below them.
     """
-    sources = {caption: data_uri(png(values, _LARGEST_INLINE)) for caption, values in pictures.items()}
+    sources = {
+        caption: data_uri((colour_png if np.ndim(values) == 3 else png)(values, _LARGEST_INLINE))
+        for caption, values in pictures.items()
+    }
     figures = "".join(
         '<figure style="display:inline-block;vertical-align:top;margin:4px 12px 4px 0">'
         f'<img style="height:{_SHOWN_HEIGHT}px;image-rendering:pixelated" src="{source}">'

@@ -236,7 +236,20 @@ class JointMosaic:
 
     def _filters(self, shape: Sequence[int]) -> FloatArray:
         """(lines, m, m') what each pixel sees of each line."""
-        return np.tile(self.weights.T.reshape(-1, 2, 2), (1, shape[0] // 2, shape[1] // 2))
+        return behind(self.weights, shape)
+
+
+def behind(weights: FloatArray, shape: Sequence[int]) -> FloatArray:
+    """(lines, m, m') what each pixel of a sensor counts of each line.
+
+    Parameters
+    ----------
+    weights
+        (4, lines) of each plane of :data:`PLANES`.
+    shape
+        (m, m'), both even.
+    """
+    return np.tile(weights.T.reshape(-1, 2, 2), (1, shape[0] // 2, shape[1] // 2))
 
 
 def _grams(sides: FloatArray, patterns: npt.NDArray[np.floating]) -> FloatArray:

@@ -1,6 +1,7 @@
 """The numbers that describe an image sensor: a TOML file in, a checked and frozen model out."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -200,7 +201,7 @@ class SensorModel(BaseModel):
         if (self.mosaic is None) != (plane is None):
             filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
             asked = f"plane {plane}" if plane else "monochrome frames"
-            remedy = "use a monochrome camera" if self.mosaic else "leave the plane out"
+            remedy = "use a monochrome camera, or colour mosaic" if self.mosaic else "leave the plane out"
             raise MitsimError(f"sensor {self.name!r}: has {filters}, and {asked} was asked for; {remedy}")
         curve = getattr(self.mosaic_curves, plane) if plane else self.quantum_efficiency_curve
         try:
@@ -213,6 +214,16 @@ class SensorModel(BaseModel):
                 "electrons; give one, with its source"
             )
         return float(found)
+
+    def planes(self, wavelengths_nm: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Electrons per photon of the mosaic's four pixels, row by row, each at these ``wavelengths_nm``.
+
+        MitsimError for a camera without a mosaic, and outside its curves.
+        """
+        if self.mosaic is None:
+            raise MitsimError(f"sensor {self.name!r}: has no mosaic of colour filters; use a camera that has one")
+        filters: dict[str, Plane] = {"R": "R", "G": "G", "B": "B"}
+        return tuple(tuple(self.efficiency(nm, filters[name]) for nm in wavelengths_nm) for name in self.mosaic)
 
     @property
     def states_efficiency(self) -> bool:

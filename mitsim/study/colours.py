@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colours import COLOUR, IMAGE, ColourManifest, read_colours, same_lines, write_colours
+from mitsim.core.colours import COLOUR, IMAGE, ColourManifest, is_mosaic, read_colours, same_lines, write_colours
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
-from mitsim.core.manifests import CalibrationManifest, read_manifest
-from mitsim.core.output import output_folder, whole_file
-from mitsim.core.pictures import colour_png
-from mitsim.reconstruct.colour import ColourModel, linear_srgb
-from mitsim.reconstruct.result import IMAGE_FILE
+from mitsim.core.output import output_folder
+from mitsim.core.runs import load_run
+from mitsim.reconstruct.colour import ColourModel
 from mitsim.rig.chart import ChartPlace
+from mitsim.study.colour_page import PAGE, write_page
+from mitsim.study.coloured import ColourImage, board_of
+from mitsim.study.metrics import truth_for
+from mitsim.study.mosaics import JudgedMosaic, reconstruct_mosaic
 from mitsim.study.quality import Judged, reconstruct
 
 
@@ -33,29 +33,31 @@ class JudgedColours:
         spectral lines and their folders' names.
     images
         of each line, by its name.
-    model
-        from reflectances at the lines to colours.
-    board
-        reflectance of the calibrations' board; 1 where they do not state it.
+    colours
+        the image in colour.
     output
         the folder that holds all.
     """
 
     lines: ColourManifest
     images: Mapping[str, Judged]
-    model: ColourModel
-    board: float
+    colours: ColourImage
     output: str
+
+    @property
+    def model(self) -> ColourModel:
+        """From reflectances at the lines to colours."""
+        return self.colours.model
 
     @property
     def reflectances(self) -> FloatArray:
         """(n, n', lines) reflectance at each line, 1 = a perfect reflector."""
-        return self.board * stacked(self.images)
+        return self.colours.reflectances
 
     @property
     def xyz(self) -> FloatArray:
         """(n, n', 3) CIE XYZ under D65; a perfect reflector has Y = 1."""
-        return self.model.xyz(self.reflectances)
+        return self.colours.xyz
 
     @property
     def ok(self) -> bool:
@@ -74,8 +76,7 @@ class JudgedColours:
     @property
     def psnr_db(self) -> float | None:
         """Of all lines' images together: of the mean of their squared errors; None without a truth."""
-        known = [judged.quality.psnr_db for judged in self.images.values() if judged.quality]
-        return -10 * math.log10(np.mean([10 ** (-each / 10) for each in known])) if known else None
+        return self.colours.psnr_db
 
     def summary(self) -> dict[str, Any]:
         """All but the pictures, by the keys of the command line's JSON."""
@@ -83,13 +84,36 @@ class JudgedColours:
         each = {name: judged.summary() for name, judged in self.images.items()}
         return {
             "channels": [{**line.model_dump(), **each[line.name]} for line in self.lines.channels],
-            "psnr": self.psnr_db,
             "ssim": float(np.mean(known)) if known else None,
-            **self.model.summary(),
+            **self.colours.summary(),
             "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
             "seconds": {"total": sum(part["seconds"]["total"] for part in each.values())},
             "output": self.output,
         }
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the command line says of it."""
+        each = [
+            f"{name}: {judged.quality or 'no truth to compare with'}, lambda {judged.reconstruction.lam:.3g}, residual "
+            f"{judged.reconstruction.residual:.1e}"
+            for name, judged in self.images.items()
+        ]
+        return [*each, *self.colours.sentences]
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """How the images were made, by name."""
+        solved = {name: judged.reconstruction for name, judged in self.images.items()}
+        return {
+            "frames": "one line at a time, a run for each",
+            "solved": "each line by itself",
+            "lambda": ", ".join(f"{name} {found.lam:.3g}" for name, found in solved.items()),
+            "residual of the frames": ", ".join(f"{name} {found.residual:.1e}" for name, found in solved.items()),
+        }
+
+    def _repr_html_(self) -> str:
+        return self.colours._repr_html_()
 
 
 def reconstruct_colours(
@@ -99,10 +123,10 @@ def reconstruct_colours(
     chart: ChartPlace | None = None,
     overwrite: bool = False,
     **options: Any,
-) -> JudgedColours:
+) -> JudgedColours | JudgedMosaic:
     """Recover the image of every line of a coloured run, and bring them together.
 
-    Writes the folder of each line's image, image.exr (linear sRGB and XYZ), image.png and colour.json.
+    Writes the folder of each line's image, image.exr (linear sRGB and XYZ), image.png, report.html and colour.json.
 
     Parameters
     ----------
@@ -116,7 +140,8 @@ def reconstruct_colours(
     overwrite
         whether an earlier image of other inputs may be replaced.
     **options
-        of :func:`mitsim.study.quality.reconstruct`, for every line.
+        of :func:`mitsim.study.quality.reconstruct`, for every line; of a run behind colour filters, ``way`` and ``lam``
+        as for :func:`mitsim.study.mosaics.reconstruct_mosaic`.
 
     Raises
     ------
@@ -124,6 +149,8 @@ def reconstruct_colours(
         for folders of different lines, and as :func:`mitsim.study.quality.reconstruct`.
     """
     run, calibration = Path(run), Path(calibration)
+    if is_mosaic(run):
+        return reconstruct_mosaic(run, calibration, output, chart, overwrite, **options)
     lines = same_lines(run, calibration)
     earlier = (Path(output) / COLOUR).is_file() and read_colours(output, IMAGE).names == lines.names
     with output_folder(output, overwrite=earlier or (overwrite and (Path(output) / COLOUR).is_file())) as folder:
@@ -131,26 +158,17 @@ def reconstruct_colours(
             name: reconstruct(run / name, calibration / name, folder / name, overwrite=overwrite, **options)
             for name in lines.names
         }
-        model, board = ColourModel.of_lines(lines.wavelengths_nm), _board(calibration, lines)
-        if chart is not None:
-            model = ColourModel.fitted(
-                lines.wavelengths_nm, board * chart.means(stacked(images)), "the chart in this image"
-            )
-        found = JudgedColours(lines, images, model, board, str(folder))
-        write_colour_image(folder, found.xyz)
+        board = board_of(calibration, lines)
+        truths = [truth_for(load_run(run / name), board) for name in lines.names]
+        known = [truth for truth in truths if truth is not None]
+        truth = np.stack(known, axis=-1) if len(known) == len(truths) else None
+        found = JudgedColours(lines, images, ColourImage.of(lines, stacked(images), board, truth, chart), str(folder))
+        found.colours.write(folder)
+        qualities = {name: judged.quality for name, judged in images.items()}
+        write_page(folder / PAGE, found.colours, qualities, found.facts, found.warnings)
         parts = {key: value for key, value in found.summary().items() if key != "channels"}
         write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **parts)
     return found
-
-
-def _board(calibration: Path, lines: ColourManifest) -> float:
-    """Reflectance of the board that a calibration's images are relative to; 1 where it is not stated."""
-    boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
-    if len(boards) > 1:
-        raise MitsimError(
-            f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
-        )
-    return boards.pop() or 1.0
 
 
 def stacked(images: Mapping[str, Judged]) -> FloatArray:
@@ -159,15 +177,3 @@ def stacked(images: Mapping[str, Judged]) -> FloatArray:
     if len(shapes) > 1:
         raise MitsimError(f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid")
     return np.stack([judged.reconstruction.image for judged in images.values()], axis=-1)
-
-
-def write_colour_image(folder: Path, xyz: FloatArray) -> None:
-    """Write image.exr and image.png of ``xyz`` (n, n', 3) under D65 to a ``folder``; MitsimError when it cannot be."""
-    rgb = linear_srgb(xyz)
-    named = dict(zip("RGBXYZ", np.moveaxis(np.concatenate([rgb, xyz], axis=-1), -1, 0), strict=True))
-    channels = {name: values.astype(np.float32) for name, values in named.items()}
-    write_frame(
-        folder / IMAGE_FILE, channels, {"rgb": "linear sRGB", "xyz": "CIE 1931 under D65, perfect reflector Y = 1"}
-    )
-    with whole_file(folder / "image.png") as part:
-        part.write_bytes(colour_png(rgb))

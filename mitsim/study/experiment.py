@@ -178,6 +178,25 @@ class Results:
 
 
 @dataclass(frozen=True)
+class PageTable:
+    """A table on a study's page.
+
+    Attributes
+    ----------
+    title
+        above it: what the numbers are, with their unit.
+    headings
+        of its columns, the first of which has names and the others numbers.
+    rows
+        as they are shown.
+    """
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
 class Experiment:
     """A study of many points.
 
@@ -197,6 +216,8 @@ class Experiment:
         what its figures are, for who knows nothing of it; empty for claims of the paper, which the page explains.
     heads
         of a claim's three figures; one without a head has no column.
+    tables
+        from all results, for the page; all numbers are in the study's CSV and JSON as well.
     """
 
     name: str
@@ -206,6 +227,7 @@ class Experiment:
     measure: Callable[[Studio, Point], Found]
     claims: Callable[[Results], Sequence[Claim]]
     figures: Callable[[Results], Mapping[str, Figure]]
+    tables: Callable[[Results], Sequence[PageTable]] = lambda results: ()
     about: str = ""
     heads: tuple[str, str, str] = HEADS
 

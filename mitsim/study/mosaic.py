@@ -1,49 +1,44 @@
 """Light of each line in, and filters over the sensor's pixels; frames that show all lines at once, and images, out.
 
-Three ways to images of the lines, all with factors that were calibrated line by line. *Demosaiced*: every frame becomes
-three whole ones (colour-demosaicing), a solve for each channel, and channels are taken apart into lines. *Half
-resolution*: a solve for each plane of filters with its own rows of the factors, no pixel interpolated. *Joint*: all
-planes for all lines (:mod:`mitsim.reconstruct.mosaic`). A channel or plane that sees several lines has the one factor
-that is nearest to them; only the joint solve knows that each line has its own.
+Three ways to images of the lines are compared (:mod:`mitsim.study.filters`), all with factors that were calibrated line
+by line, each with its best lambda.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.util import find_spec
 
 import numpy as np
 
 from mitsim.capture.exposer import Exposer
+from mitsim.core import colours
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import load_model, locate
-from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.optics.separable import BestTerm, best_term
-from mitsim.reconstruct.mosaic import PLANES, JointMosaic
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.mosaic import behind
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.sensor import SensorModel
 from mitsim.study.exposures import LAMBDAS
+from mitsim.study.filters import MosaicCamera, Solver, solver_of
 from mitsim.study.lines import LitLine
 from mitsim.study.metrics import psnr
 
-DEMOSAICED, HALF, JOINT = WAYS = ("demosaiced", "half resolution", "joint")
+DEMOSAICED, HALF, JOINT = "demosaiced", "half resolution", "joint"
+WAYS = {DEMOSAICED: colours.DEMOSAIC, HALF: colours.HALF, JOINT: colours.JOINT}
+"""Names in tables, and those of the ways."""
 FILTERS, ARRAY = "ov5647", "RGGB"
 """Camera file whose measured curves the filters have, and their array."""
 _COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
 """Lambdas of the joint solve, of its largest eigenvalue; the best of them is refined by half a decade."""
 Lines = Sequence[LitLine]
-Parts = Sequence[FloatArray] | FloatArray
-"""Of one frame, for each plane or channel."""
 
 
-def ways() -> tuple[str, ...]:
-    """Those of :data:`WAYS` that are installed: demosaicing is an extra."""
-    return WAYS if find_spec("colour_demosaicing") else WAYS[1:]
+def installed() -> tuple[str, ...]:
+    """Those of :data:`WAYS` that are: demosaicing is an extra."""
+    return tuple(name for name, way in WAYS.items() if way in colours.installed_ways())
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,94 +69,35 @@ class MosaicShots:
 
         MitsimError for demosaicing without colour-demosaicing.
         """
+        solver = solver_of(WAYS[way], self.camera, patterns_of(self.family))
         with single_threaded_blas():
-            if way == JOINT:
-                return self._joint()
-            return self._demosaiced() if way == DEMOSAICED else self._half()
+            return self._best(solver, way)
 
-    @cached_property
-    def weights(self) -> FloatArray:
-        """(4, lines) of each plane."""
-        return filter_weights(self.lines)
-
-    def _joint(self) -> FloatArray:
-        lefts, rights = (np.stack([getattr(line.factors, name) for line in self.lines]) for name in ("left", "right"))
-        patterns = self.family.left.astype(np.float64), self.family.right.astype(np.float64)
-        model = JointMosaic(lefts, rights, self.weights, *patterns)
-        gathered = np.zeros(model.shape)
+    def _best(self, solver: Solver, way: str) -> FloatArray:
         for each in self.frames:
-            gathered += model.gathered(*each)
-        solved: dict[float, FloatArray] = {}
+            solver.add(*each)
+        flat, solved = self.truth.reshape(len(self.lines), -1), dict[float, FloatArray]()
 
         def quality(lam: float) -> float:
             if lam not in solved:
-                solved[lam] = model.solve(gathered, lam * model.scale).images
-            return psnr(solved[lam].reshape(len(self.lines), -1), self.truth.reshape(len(self.lines), -1))
+                solved[lam] = solver.images(lam, relative=True).images
+            return psnr(solved[lam].reshape(flat.shape), flat)
 
-        best = max(_COARSE, key=quality)
-        best = max((best, best * 10**0.5, best / 10**0.5), key=quality)
+        best = max(_COARSE if way == JOINT else LAMBDAS, key=quality)
+        if way == JOINT:
+            best = max((best, best * 10**0.5, best / 10**0.5), key=quality)
         return solved[best]
 
-    def _demosaiced(self) -> FloatArray:
-        terms = [self._term(weights) for weights in self._channels]
-        whole = ((np.moveaxis(demosaiced(frame), -1, 0), row, column) for frame, row, column in self.frames)
-        return self._apart(self._channels, terms, self._solved(terms, whole))
+    @cached_property
+    def camera(self) -> MosaicCamera:
+        """Factors of all lines, and filters."""
+        factors = [(line.factors.left, line.factors.right) for line in self.lines]
+        return MosaicCamera.of(factors, filter_weights(self.lines), ARRAY)
 
-    def _half(self) -> FloatArray:
-        terms = [self._term(weights) for weights in self.weights]
-        rows = [
-            BestTerm(term.left[a::2], term.right[b::2], term.residual)
-            for term, (a, b) in zip(terms, PLANES, strict=True)
-        ]
-        planes = (([frame[a::2, b::2] for a, b in PLANES], row, column) for frame, row, column in self.frames)
-        return self._apart(self.weights, terms, self._solved(rows, planes))
 
-    @property
-    def _channels(self) -> FloatArray:
-        """(3, lines) of red, green and blue filters."""
-        return self.weights[[ARRAY.index(name) for name in "RGB"]]
-
-    def _term(self, weights: FloatArray) -> BestTerm:
-        """The one separable camera that is nearest to that of a plane's ``weights`` of all lines."""
-        pairs = zip(weights, self.lines, strict=True)
-        return best_term([(weight * line.factors.left, line.factors.right) for weight, line in pairs])
-
-    def _solved(
-        self, terms: Sequence[BestTerm], frames: Iterator[tuple[Parts, int, int]]
-    ) -> Callable[[float], FloatArray]:
-        """(terms, n, n') image of each plane or channel, by lambda of the largest sigma^2; ``frames`` have one
-        part of each."""
-        models = [prepare(term.left, term.right, self.family.left, self.family.right) for term in terms]
-        sums = [model.accumulator() for model in models]
-        for parts, row, column in frames:
-            for total, part in zip(sums, parts, strict=True):
-                total.add(part, row, column)
-        scales = [model.problem(total).scale for model, total in zip(models, sums, strict=True)]
-
-        def image(lam: float) -> FloatArray:
-            pairs = zip(models, sums, scales, strict=True)
-            return np.stack([model.solve(total, lam * scale).image for model, total, scale in pairs])
-
-        return image
-
-    def _apart(
-        self, weights: FloatArray, terms: Sequence[BestTerm], image: Callable[[float], FloatArray]
-    ) -> FloatArray:
-        """(lines, n, n') from images of planes, which are mixtures of the lines' by what their factor has of each."""
-        mixing = np.array(
-            [
-                [
-                    weight * np.vdot(line.factors.left, term.left) * np.vdot(line.factors.right, term.right)
-                    for weight, line in zip(row, self.lines, strict=True)
-                ]
-                / (np.square(np.linalg.norm(term.left)) * np.square(np.linalg.norm(term.right)))
-                for row, term in zip(weights, terms, strict=True)
-            ]
-        )
-        undo = np.linalg.pinv(mixing)
-        flat = self.truth.reshape(len(self.lines), -1)
-        images = (np.tensordot(undo, image(lam), axes=1) for lam in LAMBDAS)
-        return max(images, key=lambda each: psnr(each.reshape(flat.shape), flat))
+def patterns_of(family: PatternFamily) -> tuple[FloatArray, FloatArray]:
+    """P_L (n, K) and P_R (n', K') of a ``family``."""
+    return family.left.astype(np.float64), family.right.astype(np.float64)
 
 
 def mosaic_shots(lines: Lines, patterns: str, seed: int) -> MosaicShots:
@@ -239,23 +175,6 @@ def filter_weights(lines: Lines) -> FloatArray:
     )
 
 
-def demosaiced(frame: FloatArray) -> FloatArray:
-    """(m, m', 3) red, green and blue of a ``frame`` (m, m') behind :data:`ARRAY` (Menon and others 2007).
-
-    MitsimError without colour-demosaicing.
-    """
-    try:
-        from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007
-    except ImportError as error:
-        raise MitsimError(
-            "demosaicing: colour-demosaicing is not installed; pip install 'mitsim[mosaic]' (Python 3.11 or newer)"
-        ) from error
-    return np.asarray(demosaicing_CFA_Bayer_Menon2007(frame, ARRAY), dtype=np.float64)
-
-
 def _behind_filters(rates: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """(m, m') electrons a second of all lines together, each pixel behind its filter."""
-    frame = np.zeros_like(rates[0])
-    for plane, (a, b) in enumerate(PLANES):
-        frame[a::2, b::2] = sum(weight * rate[a::2, b::2] for weight, rate in zip(weights[plane], rates, strict=True))
-    return frame
+    return np.asarray(np.einsum("lij,lij->ij", behind(weights, rates[0].shape), np.stack(rates)))

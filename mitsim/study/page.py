@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri
 from mitsim.core.versions import versions
-from mitsim.study.experiment import HEADS, Claim, Experiment, Results, Scope
+from mitsim.study.experiment import HEADS, Claim, Experiment, PageTable, Results, Scope
 from mitsim.study.pictures import TEST_IMAGES
 
 _DPI, _SHOWN_DPI = 220, 110
@@ -34,6 +34,7 @@ class Section:
     command: str
     about: str = ""
     heads: tuple[str, str, str] = HEADS
+    tables: tuple[PageTable, ...] = ()
 
     @classmethod
     def of(
@@ -68,6 +69,7 @@ class Section:
             command=" ".join(command),
             about=experiment.about,
             heads=experiment.heads,
+            tables=tuple(experiment.tables(results)),
         )
 
 

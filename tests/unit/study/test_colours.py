@@ -21,6 +21,8 @@ from mitsim.study.lines import LitLine, serving
 from mitsim.study.quality import reconstruct
 from tests.coloured import LINES, PLACE, folders
 
+pytestmark = pytest.mark.usefixtures("draft_figures")
+
 
 def main(command: list[str]) -> int:
     """Exit status of mitsim, run in this process."""

@@ -16,9 +16,10 @@ from mitsim.reconstruct.colour import chart
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.mosaic import PLANES, JointMosaic
 from mitsim.rig.patterns import parse_patterns
+from mitsim.study.filters import demosaiced
 from mitsim.study.lines import respectred, serving
 from mitsim.study.metrics import psnr
-from mitsim.study.mosaic import ARRAY, HALF, JOINT, MosaicShots, demosaiced, filter_weights
+from mitsim.study.mosaic import ARRAY, HALF, JOINT, MosaicShots, filter_weights
 from tests.ideal_sessions import picture, shadow
 from tests.invented import sensor
 
@@ -75,13 +76,13 @@ def test_a_demosaiced_frame_of_one_colour_is_that_colour() -> None:
     colour, frame = np.array([3.0, 5.0, 2.0]), np.zeros((12, 16))
     for name, (a, b) in zip(ARRAY, PLANES, strict=True):
         frame[a::2, b::2] = colour["RGB".index(name)]
-    assert np.allclose(demosaiced(frame), colour, atol=1e-9)
+    assert np.allclose(demosaiced(frame, ARRAY), colour, atol=1e-9)
 
 
 def test_demosaicing_names_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "colour_demosaicing", None)
     with pytest.raises(MitsimError, match=r"pip install 'mitsim\[mosaic\]'"):
-        demosaiced(np.zeros((4, 4)))
+        demosaiced(np.zeros((4, 4)), ARRAY)
 
 
 def test_spectra_become_numbers(tmp_path: Path) -> None:

@@ -1,0 +1,340 @@
+"""A camera under a mosaic of colour filters: a bench of several lines in; a run of all, and factors of each, out.
+
+Lines are traced as for sequential colour (:mod:`mitsim.capture.colour`). With w_pl the electrons that a pixel of plane
+p of the 2 x 2 filters makes of a photon of line l, its expected electrons are
+
+    e_p = t A sum_l w_pl E_l lambda_l / (h c),
+
+those of a pixel without a filter, one electron a photon, in an irradiance sum_l w_pl E_l lambda_l / lambda of the
+projector's effective wavelength lambda. Frames of that irradiance go through the sensor as any other's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.calibrate import of_one_depth
+from mitsim.capture.colour import ColourBench, line_sessions, refuse, run_sessions, traced_lines
+from mitsim.capture.light import Light
+from mitsim.capture.run import capture, check_run
+from mitsim.capture.simulation import Simulation
+from mitsim.capture.truth import Truth
+from mitsim.core.arrays import FloatArray
+from mitsim.core.colours import CALIBRATION, MOSAIC, MosaicManifest
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.job import Job
+from mitsim.core.manifests import MANIFEST
+from mitsim.core.mosaics import LineTruth, MosaicCapture
+from mitsim.core.output import prepare_output
+from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.reconstruct.mosaic import behind
+from mitsim.rig.patterns import Lighting, PatternFamily
+from mitsim.rig.recipe import SessionRecipe, load_recipe
+from mitsim.rig.sensor import SensorModel
+
+if TYPE_CHECKING:
+    from mitsim.capture.request import Request
+    from mitsim.reconstruct.factors import Factors
+
+
+_REPEATS = 4
+"""Of every shot of a session behind filters, unless a recipe says otherwise: most pixels see a tenth of a line that
+fills others, and of single shots some directions of the OV5647's filters over the IMX249 are not above the noise."""
+
+
+@dataclass(frozen=True)
+class MosaicBench(Bench):
+    """A bench whose camera is thought without its filters, one electron a photon; they are put over its frames.
+
+    Attributes
+    ----------
+    camera
+        as its file states it, filters and all.
+    """
+
+    camera: SensorModel | None = None
+
+    @classmethod
+    def of(cls, bench: Bench) -> MosaicBench:
+        """Of a ``bench`` whose camera has a mosaic. MitsimError for another camera, or an odd number of pixels."""
+        sensor = bench.sensor
+        if sensor.mosaic is None:
+            raise MitsimError(
+                f"camera {bench.rig.camera_file}: has no mosaic of colour filters, and colour mosaic was asked for; "
+                "use a camera that has one, such as imx249_rggb, or colour lines"
+            )
+        if bench.geometry.pixels % 2:
+            raise MitsimError(
+                f"camera {bench.rig.camera_file}: {bench.geometry.pixels} pixels a side do not hold whole filters of "
+                "2 x 2; give the scene an even number"
+            )
+        bare = {"mosaic": None, "mosaic_curves": None, "quantum_efficiency": 1.0}
+        rig = replace(bench.rig, sensor=sensor.model_copy(update=bare))
+        return cls(**{each.name: getattr(bench, each.name) for each in fields(Bench)} | {"rig": rig}, camera=sensor)
+
+    @property
+    def mosaic(self) -> SensorModel:
+        """:attr:`camera`, which every bench that is made by :meth:`of` has."""
+        assert self.camera is not None, "made by of()"
+        return self.camera
+
+    def identity(self) -> dict[str, Any]:
+        """As of any bench, of the camera with its filters; lines are named by colour.json, not by a run of all."""
+        found = super().identity()
+        projector = found["projector"]
+        if self.lines is not None and self.lines.several:
+            projector = {key: value for key, value in projector.items() if key not in ("lines_nm", "radiant_shares")}
+        return {**found, "sensor": self.mosaic.identity, "projector": projector}
+
+
+@dataclass(frozen=True, eq=False)
+class MosaicLight(Light):
+    """Light of all lines together behind the filters.
+
+    Attributes
+    ----------
+    by_line
+        light of each, traced on the same paths.
+    passed
+        (lines, m, m') part of each line's irradiance that counts, as that of the effective wavelength.
+    """
+
+    by_line: tuple[Light, ...] = ()
+    passed: FloatArray | None = None
+
+    @classmethod
+    def of(cls, bench: MosaicBench, lights: Sequence[Light], wavelengths_nm: Sequence[float]) -> MosaicLight:
+        """Of all lines together.
+
+        Parameters
+        ----------
+        bench
+            with all lines.
+        lights, wavelengths_nm
+            of each line.
+        """
+        weights = np.array(bench.mosaic.planes(wavelengths_nm))
+        counted = weights * np.asarray(wavelengths_nm) / bench.projector.effective_wavelength_nm
+        first = lights[0]
+        own = {
+            "simulation": Simulation(bench, first.plan.settings),
+            "flux": np.tensordot(counted.mean(axis=0), [light.flux for light in lights], axes=1),
+            "flux_error": np.tensordot(counted.mean(axis=0), [light.flux_error for light in lights], axes=1),
+            "sampling_error": max(light.sampling_error for light in lights),
+            "reached": all(light.reached for light in lights),
+            "looked": None,
+            "known_truth": _truth_of_all(lights, counted.mean(axis=0)),
+            "by_line": tuple(lights),
+            "passed": behind(counted, (bench.geometry.pixels,) * 2),
+        }
+        return cls(**{each.name: getattr(first, each.name) for each in fields(Light)} | own)
+
+    @property
+    def lost(self) -> float:
+        """The largest of any line."""
+        return max(light.lost for light in self.by_line)
+
+    def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
+        """Expected frames of all lines together; see :meth:`Light.frames`.
+
+        Parameters
+        ----------
+        lighting, seed, leaking
+            as there.
+        """
+        assert self.passed is not None, "made by of()"
+        return MosaicFrames([light.frames(lighting, seed, leaking) for light in self.by_line], self.passed)
+
+    def speckle(self, family: PatternFamily | None = None) -> float:
+        """None, of any ``family``: a projector with speckle is refused."""
+        return 0.0
+
+
+class MosaicFrames(ExpectedFrames):
+    """Frames of every shot behind the filters; iterate as often as needed.
+
+    Lines are traced on the same paths, so their errors go together: that of the sum is at most the sum of theirs.
+
+    Parameters
+    ----------
+    lines
+        frames of each line.
+    passed
+        (lines, m, m') part of its irradiance that counts.
+    """
+
+    def __init__(self, lines: Sequence[ExpectedFrames], passed: FloatArray) -> None:
+        self._lines, self._passed = tuple(lines), passed
+        self._spread = np.sqrt(np.square(passed).mean(axis=(1, 2)))
+
+    def __len__(self) -> int:
+        return len(self._lines[0])
+
+    @property
+    def has_ambient(self) -> bool:
+        """No: lamps are refused."""
+        return False
+
+    @property
+    def projector_off(self) -> Frame:
+        """A dark frame."""
+        return self._lines[0].projector_off
+
+    def __iter__(self) -> Iterator[Frame]:
+        for shot in zip(*self._lines, strict=True):
+            light = np.einsum("lij,lij->ij", self._passed, np.stack([frame.irradiance for frame in shot]))
+            groups = zip(*(frame.by_group or (frame.variance,) for frame in shot), strict=True)
+            parts = [float(self._spread @ np.sqrt(each)) ** 2 for each in groups]
+            variance = sum(parts)
+            yield Frame(
+                light,
+                variance,
+                max(frame.removed for frame in shot),
+                max(parts) / variance if variance else 0.0,
+                tuple(parts) if shot[0].by_group else (),
+            )
+
+
+def capture_mosaic(
+    bench: Bench, request: Request, job: Job | None = None, output: Path | str | None = None, resume: bool = False
+) -> MosaicCapture:
+    """A run of all lines at once; see :meth:`mitsim.capture.bench.Bench.capture_mosaic`.
+
+    Parameters
+    ----------
+    bench, request, job, output, resume
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    job, whole = job or Job(), MosaicBench.of(bench)
+    colours = ColourBench.of(whole, MOSAIC)
+    manifest = _manifest(whole, colours)
+    refuse(whole, request)
+    _refuse_speckle(whole, request)
+    place = None if output is None else Path(output)
+    all_lines = colours.whole
+    assert isinstance(all_lines, MosaicBench)
+    check_run(all_lines, request, place, resume)
+    with _usable(place, resume):
+        lights = traced_lines(colours, request, job)
+        light = MosaicLight.of(all_lines, lights, manifest.wavelengths_nm)
+        shots = capture(all_lines, request, job, place, resume, light=light)
+    board = load_recipe().board_reflectance
+    truths = {
+        name: LineTruth(own.apparent.reflectance, own.apparent.standard_error, board)
+        for name, own in zip(manifest.names, lights, strict=True)
+    }
+    found = MosaicCapture(shots, manifest, truths)
+    if shots.folder is not None:
+        found.write_lines(shots.folder)
+    return found
+
+
+def calibrate_mosaic(
+    bench: Bench,
+    seed: int = 0,
+    accuracy: float = 1e-3,
+    recipe: SessionRecipe | None = None,
+    output: Path | str | None = None,
+    resume: bool = False,
+    job: Job | None = None,
+) -> dict[str, Factors]:
+    """Factors at each line; see :meth:`mitsim.capture.bench.Bench.calibrate_mosaic`.
+
+    Parameters
+    ----------
+    bench, seed, accuracy, recipe, output, resume, job
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    whole = MosaicBench.of(bench)
+    colours = ColourBench.of(whole, CALIBRATION)
+    weights = np.array(_manifest(whole, colours).weights)
+    if (dark := np.argwhere(weights == 0)).size:
+        plane, line = dark[0]
+        raise MitsimError(
+            f"camera {bench.rig.camera_file}: its {whole.mosaic.mosaic[plane] if whole.mosaic.mosaic else ''} filters "
+            f"pass nothing of {colours.manifest.names[line]}, so a calibration in this line alone does not see all "
+            "pixels; use a projector whose lines all filters pass"
+        )
+    passed = behind(weights, (bench.geometry.pixels,) * 2)
+    recipe = recipe or load_recipe().model_copy(update={"repeats": _REPEATS})
+    sessions = line_sessions(colours, of_one_depth(recipe), seed, list(passed))
+    return run_sessions(colours, sessions, accuracy, output, resume, job or Job())
+
+
+@contextmanager
+def _usable(place: Path | None, resume: bool) -> Iterator[None]:
+    """Before light is traced: MitsimError where a run cannot be written to ``place``. A new folder in which nothing was
+    written is removed."""
+    new = place is not None and not place.exists()
+    if place is not None:
+        prepare_output(place, overwrite=resume and (place / MANIFEST).is_file())
+    try:
+        yield
+    except BaseException:
+        if new and place is not None:
+            with suppress(OSError):  # not empty: what was written stays
+                place.rmdir()
+        raise
+
+
+def _manifest(whole: MosaicBench, colours: ColourBench) -> MosaicManifest:
+    """What colour.json says of a run. MitsimError for a line that the filters' curves do not hold."""
+    weights = whole.mosaic.planes(colours.manifest.wavelengths_nm)
+    assert whole.mosaic.mosaic is not None, "checked before"
+    lines = colours.manifest.channels
+    return MosaicManifest(kind="mosaic-run", channels=lines, mosaic=whole.mosaic.mosaic, weights=weights)
+
+
+def _refuse_speckle(bench: Bench, request: Request) -> None:
+    """MitsimError for speckle: each line has its own, and each filter another mixture of them."""
+    if request.effects.get("speckle", True) and (bench.projector.speckle_contrast or bench.projector.speckle):
+        raise ArgumentError(
+            "effects",
+            f"projector {bench.projector.name} has speckle, which is not simulated behind colour filters; switch it "
+            "off with -speckle",
+        )
+
+
+def _truth_of_all(lights: Sequence[Light], counted: FloatArray) -> Truth:
+    """What a perfect image of all pixels together would show: the lines' truths by the light that is counted of each
+    on the board.
+
+    Parameters
+    ----------
+    lights
+        of the lines.
+    counted
+        (lines,) part of each line's light.
+    """
+    truths = [light.apparent for light in lights]
+    shape = truths[0].reflectance.shape
+    board = counted[:, None] * np.stack([truth.board_flux for truth in truths])
+    whole = board.sum(axis=0)
+    shares = np.divide(board, whole, out=np.zeros_like(board), where=whole > 0).reshape(-1, *shape)
+    return Truth(
+        reflectance=sum(
+            (share * truth.reflectance for share, truth in zip(shares, truths, strict=True)), np.zeros(shape)
+        ),
+        standard_error=sum(
+            (share * truth.standard_error for share, truth in zip(shares, truths, strict=True)), np.zeros(shape)
+        ),
+        board_flux=whole,
+        rays=truths[0].rays,
+    )

@@ -1,0 +1,118 @@
+"""`--colour mosaic` through the installed program: frames are the lines' own behind filters, and come apart again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.framefile import read_frame
+from tests.system.conftest import CAMERA, tree
+from tests.system.test_colour import LINES, SHEET, electrons, projector, spectrum
+
+CURVES = {
+    "R": {638: 0.4, 520: 0.1, 445: 0.05},
+    "G": {638: 0.1, 520: 0.5, 445: 0.1},
+    "B": {638: 0.05, 520: 0.2, 445: 0.4},
+}
+"""Electrons per photon of pixels under each filter at the lines."""
+COMMON = "--patterns", "dots:2", "--accuracy", "1e-2", "--json"
+
+
+@pytest.fixture(scope="module")
+def scene(shared_scene: Callable[..., Path]) -> Path:
+    path = shared_scene("sheet behind filters")
+    known = f'<default name="albedo" value="{spectrum(SHEET)}"/>'
+    path.write_text(path.read_text().replace('<default name="albedo" value="0.5"/>', known))
+    return path
+
+
+@pytest.fixture(scope="module")
+def devices(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """Options of a camera behind filters, of superpixels as the scene has them, and of a projector of three lines."""
+    folder = tmp_path_factory.mktemp("devices")
+    single = CAMERA.replace("5.86", "11.72").replace("binning = 2\n", "").replace("quantum_efficiency = 0.75\n", "")
+    tables = "".join(
+        f"[mosaic_curves.{name}]\nwavelengths_nm = {sorted(map(float, parts))}\n"
+        f"efficiency = {[parts[nm] for nm in sorted(parts)]}\n"
+        for name, parts in CURVES.items()
+    )
+    (folder / "filters.toml").write_text(f'{single}mosaic = "GBRG"\n{tables}')
+    return "--camera", str(folder / "filters.toml"), "--projector", str(projector(folder / "lines.toml", LINES))
+
+
+def test_a_pixel_sees_each_line_through_its_own_filter(
+    shell: Callable[..., Any], scene: Path, devices: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Against runs of each line by a monochrome camera, of the same paths: electrons by efficiencies' ratio."""
+    run, lines = tmp_path / "run", tmp_path / "lines"
+    common = *COMMON, "--exposure", "0.1"
+    told = shell("capture", scene, "-o", run, "--colour", "mosaic", *devices, *common).payload
+    assert told["kind"] == "mosaic-run" and told["mosaic"] == "GBRG" and told["warnings"] == []
+    shell("capture", scene, "-o", lines, "--colour", "lines", *devices[2:], *common)
+    seen, expected = electrons(run), np.zeros_like(electrons(run))
+    for nm in LINES:
+        alone = electrons(lines / f"{nm}nm") / 0.75
+        for plane, (a, b) in zip("GBRG", ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True):
+            expected[:, a::2, b::2] += CURVES[plane][nm] * alone[:, a::2, b::2]
+        truths = [read_frame(each / f"{nm}nm" / "truth.exr")[0]["reflectance"] for each in (run, lines)]
+        assert np.array_equal(*truths)
+    assert np.allclose(seen, expected, rtol=1e-5, atol=1e-5 * seen.max())
+    assert told["mc_error"] < 2e-2 and (run / "truth.exr").is_file()
+
+
+@pytest.mark.slow
+def test_a_run_behind_filters_goes_on_and_comes_apart(
+    shell: Callable[..., Any], scene: Path, devices: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Lost frames come back bit for bit; images of the lines are their truths, though all share every frame."""
+    run, cal = tmp_path / "run", tmp_path / "cal"
+    command = "capture", scene, "-o", run, "--colour", "mosaic", *devices, *COMMON
+    shell(*command)
+    before = tree(run)
+    for lost in ("frame_00002.exr", "445nm/truth.exr", "colour.json"):
+        (run / lost).unlink()
+    assert "holds files already" in shell(*command).refusal
+    assert shell(*command, "--resume").code == 0
+    after = tree(run)
+    changed = {Path(name).name for name in before if before[name] != after[name]}
+    assert changed <= {"manifest.json"}, "whose seconds differ"
+    told = shell("calibrate", scene, "-o", cal, "--colour", "mosaic", *devices, *COMMON[2:]).payload
+    assert told["kind"] == "colour-calibration" and len(told["channels"]) == 3
+    found = shell("reconstruct", run, "--calibration", cal, "-o", tmp_path / "image", "--json").payload
+    assert all(line["psnr"] > 25 for line in found["channels"]) and found["delta_e"] < 5
+    kept = json.loads((tmp_path / "image" / "colour.json").read_text())
+    assert kept["mosaic"] == "joint" and kept["psnr"] == pytest.approx(found["psnr"])
+    mono = shell("calibrate", scene, "-o", tmp_path / "mono", "--colour", "lines", *devices[2:], *COMMON[2:])
+    assert mono.code in (0, 1)
+    refused = shell("reconstruct", run, "--calibration", tmp_path / "mono", "-o", tmp_path / "other").refusal
+    assert "calibrate this camera" in refused and "sensor" in refused
+
+
+@pytest.mark.parametrize(
+    ("verb", "options", "words"),
+    [
+        (
+            "capture",
+            ("--colour", "mosaic", "--patterns", "dots:2"),
+            "imx249.toml has no mosaic of colour filters; give one",
+        ),
+        (
+            "calibrate",
+            ("--colour", "mosaic", "--camera", "imx249"),
+            "imx249.toml has no mosaic of colour filters; give one",
+        ),
+        ("capture", ("--colour", "lines", "--camera", "ov5647", "--patterns", "dots:2"), "use --colour mosaic"),
+        ("capture", ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"), "or colour mosaic"),
+        ("capture", ("--colour", "red", "--patterns", "dots:2"), "--colour 'red': use no, lines or mosaic"),
+    ],
+)
+def test_a_camera_without_filters_has_no_mosaic(
+    call: Callable[..., Any], scene: Path, tmp_path: Path, verb: str, options: tuple[str, ...], words: str
+) -> None:
+    assert words in call(verb, scene, "-o", tmp_path / "new", *options).refusal
+    assert not (tmp_path / "new").exists()

@@ -1,0 +1,112 @@
+"""Frames behind colour filters are sums of the lines' own; calibrations behind them are those of bare pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimates
+from mitsim.capture.mosaic import MosaicBench, MosaicFrames
+from mitsim.capture.session import Session
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.optics.frames import Frame
+from mitsim.reconstruct.mosaic import behind
+from mitsim.rig.efficiency import EfficiencyCurve, MosaicCurves
+from mitsim.rig.recipe import load_recipe
+
+WEIGHTS = np.array([[0.4, 0.1], [0.2, 0.3], [0.2, 0.3], [0.1, 0.5]])
+
+
+class Frames:
+    """Expected frames as they are given; iterate as often as needed."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self.frames = frames
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)
+
+
+def test_a_pixel_counts_each_line_by_its_filter() -> None:
+    rng = np.random.default_rng(1)
+    lines = [[Frame(rng.random((4, 4)), 0.0, 0.0, 0.0) for _ in range(2)] for _ in range(2)]
+    seen = list(MosaicFrames([Frames(line) for line in lines], behind(WEIGHTS, (4, 4))))  # type: ignore[arg-type, misc]
+    for shot in range(2):
+        first, second = (line[shot].irradiance for line in lines)
+        assert seen[shot].irradiance[0, 0] == pytest.approx(0.4 * first[0, 0] + 0.1 * second[0, 0])
+        assert seen[shot].irradiance[2, 1] == pytest.approx(0.2 * first[2, 1] + 0.3 * second[2, 1])
+        assert seen[shot].irradiance[3, 3] == pytest.approx(0.1 * first[3, 3] + 0.5 * second[3, 3])
+
+
+def test_errors_of_lines_on_one_path_add_up() -> None:
+    """Both lines off by the same part in every group: the sum is off by the sum; and as many parts are told."""
+    rng, spread = np.random.default_rng(2), np.sqrt(np.square(WEIGHTS).mean(axis=0))
+    parts = rng.random(8)
+    lines = [Frame(rng.random((4, 4)), scale**2 * parts.sum(), 0.0, 0.0, tuple(scale**2 * parts)) for scale in (1, 3)]
+    (seen,) = MosaicFrames([Frames([line]) for line in lines], behind(WEIGHTS, (4, 4)))  # type: ignore[list-item]
+    assert seen.variance == pytest.approx((spread[0] + 3 * spread[1]) ** 2 * parts.sum())
+    assert seen.by_group == pytest.approx((spread[0] + 3 * spread[1]) ** 2 * parts)
+    assert seen.heaviest == pytest.approx(parts.max() / parts.sum())
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    return open_bench(shared_scene("mosaic", n=16), variant)
+
+
+def coloured(bench: Bench) -> Bench:
+    """The bench's camera under a mosaic that passes a tenth to half of the light."""
+    flat = {
+        name: EfficiencyCurve(wavelengths_nm=(400.0, 700.0), efficiency=(part, part))
+        for name, part in {"R": 0.5, "G": 0.2, "B": 0.1}.items()
+    }
+    change = {"mosaic": "RGGB", "mosaic_curves": MosaicCurves(**flat), "quantum_efficiency": None, "binning": 1}
+    sensor = bench.sensor.model_copy(update=change)
+    return replace(bench, rig=replace(bench.rig, sensor=sensor))
+
+
+def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans: None) -> None:
+    """Its factors are those without filters, within what their noise predicts; its noise is what it says it is."""
+    passed = behind(np.array([[0.5], [0.2], [0.2], [0.1]]), (bench.geometry.pixels,) * 2)[0]
+    job, recipe = Job(), load_recipe()
+    session = Session(bench, recipe, 0, filters=passed)
+    plan = session.plan(1e-2, job)
+    lit = session.lit(session.trace(plan, job), job)
+    (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE))
+    assert saturated == 0
+    for name, predicted in zip(("left", "right"), noisy.predicted_error, strict=True):
+        found, exact = getattr(noisy, name), getattr(clean, name)
+        error = np.linalg.norm(found - exact) / np.linalg.norm(exact)
+        # 64 x 16 numbers: their rms is known to a few percent; what is common to them is left out of the prediction.
+        assert 0.6 < error / predicted < 1.5
+    # Of 2 x 32 responses of 64 x 64 pixels the noise's variance is known to 0.3 %.
+    assert noisy.noise == pytest.approx(lit.response_noise, rel=0.02)
+    # The brightest pixel behind its filter fills the well, so light is gathered longer than without.
+    bare = Session(bench, recipe, 0)
+    assert lit.exposure_s == pytest.approx(2 * bare.lit(lit.light, job).exposure_s, rel=0.1)
+
+
+def test_only_a_camera_with_filters_has_a_mosaic(bench: Bench) -> None:
+    with pytest.raises(MitsimError, match=r"imx249.toml: has no mosaic of colour filters, and colour mosaic was asked"):
+        bench.capture_mosaic("dots:2")
+    with pytest.raises(MitsimError, match="knows no wavelengths; open the bench with llvm_ad_spectral"):
+        coloured(bench).calibrate_mosaic()
+    for mono in (lambda: coloured(bench).capture("dots:2"), lambda: coloured(bench).calibrate()):
+        with pytest.raises(MitsimError, match="has a mosaic RGGB, whose frames show all lines at once; capture and"):
+            mono()
+
+
+def test_a_bench_behind_filters_says_which_camera_it_has(bench: Bench) -> None:
+    """The sensor's own identity, filters and all, though frames are formed of bare pixels."""
+    seen = MosaicBench.of(coloured(bench))
+    assert seen.identity()["sensor"]["mosaic"] == "RGGB" and seen.sensor.quantum_efficiency == 1.0
+    assert seen.identity()["geometry"] == bench.identity()["geometry"]
