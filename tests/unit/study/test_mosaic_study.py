@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import CalibrationManifest
 from mitsim.reconstruct.colour import chart
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.mosaic import PLANES, JointMosaic
@@ -96,7 +97,8 @@ def test_spectra_become_numbers(tmp_path: Path) -> None:
 
 def test_a_lent_camera_has_the_gain_of_the_line() -> None:
     """Its own factors twice and three times as large lend themselves exactly."""
-    own, lent = (Factors(left, left, None, None) for left in (shadow(0.0, N), 2 * shadow(0.0, N)))  # type: ignore[arg-type]
+    manifest = CalibrationManifest(camera={})
+    own, lent = (Factors(left, left, manifest, None) for left in (shadow(0.0, N), 2 * shadow(0.0, N)))  # type: ignore[arg-type]
     line, other = (SimpleNamespace(factors=each) for each in (own, lent))
     found = serving(line, other)  # type: ignore[arg-type]
     assert np.allclose(found.left, own.left) and np.allclose(found.right, own.right)
