@@ -281,7 +281,7 @@ EXPERIMENT = Experiment(
     "Colours of a ColorChecker",
     "How near are recovered colours to those of the patches' spectra, and what does each way to see colour cost?",
     _points, _measure, _claims, _figures, _tables,
-    about="A chart of known spectra on rendered frames: light of each line traced with diffraction at the mask, falloff "
-    "and the sensor's noise, solved with factors that were calibrated from rendered frames.",
+    about="A chart of known spectra on rendered frames: light of each line traced with diffraction at the mask and "
+    "falloff, and the sensor's noise, solved with factors that were calibrated from rendered frames.",
     heads=("", "", "Found"),
 )  # fmt: skip
