@@ -133,7 +133,7 @@ def test_each_line_is_calibrated_for_itself(
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("sheet", ("--colour", "bands"), "--colour 'bands': use no or lines"),
+        ("sheet", ("--colour", "bands"), "--colour 'bands': use no, lines or mosaic"),
         ("sheet", ("--colour", "lines", "--seconds", "5"), "not planned by time"),
         ("lamp", ("--colour", "lines"), "ambient light is not simulated in colour; switch it off"),
     ],
