@@ -103,7 +103,7 @@ def cameras(bench: ms.Bench) -> dict[str, Any]:
             return mi.ScalarBoundingBox3f()
 
     mi.register_sensor("benchmark_rays", lambda props: Rays(props))
-    numbers = geometry.model_dump(exclude={"pixels"})
+    numbers = geometry.model_dump(exclude={"pixels"}, exclude_none=True)
     place = {"to_world": mi.ScalarTransform4f(np.array(bench.loaded.camera.world_transform().matrix)[..., 0])}
 
     def made(kind: str) -> object:

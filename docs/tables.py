@@ -76,6 +76,8 @@ def _allowed(rules: dict[str, Any]) -> str:
         return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
     if "$ref" in rules or rules.get("type") == "object":
         return "object"
+    if "prefixItems" in rules:
+        return f"list of {len(rules['prefixItems'])}: {_allowed(rules['prefixItems'][0])}"
     if rules.get("type") == "array":
         if "prefixItems" in rules:
             return f"list of {len(rules['prefixItems'])}: {_allowed(rules['prefixItems'][0])}"

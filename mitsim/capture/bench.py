@@ -67,8 +67,8 @@ class Bench:
     lines: Lines | None = None
 
     def __repr__(self) -> str:
-        path, pixels = self.loaded.path, self.geometry.pixels
-        rig = f"{self.sensor.name} with {pixels} x {pixels} pixels, {self.projector.name}"
+        path, (rows, columns) = self.loaded.path, self.geometry.frame_shape
+        rig = f"{self.sensor.name} with {rows} x {columns} pixels, {self.projector.name}"
         return f"Bench({path.parent.name}/{path.name}: {rig})"
 
     def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
@@ -503,25 +503,40 @@ class Bench:
         window = self.windows_at(depth)
         farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
         shift = 1 / (2 * depth) - 1 / depth
+        # Seen from the frames' middle, c off the axis: tangents are c / z less.
+        centres = [self._centre(axis) for axis in (0, 1)]
         rows, columns = (
-            ((far[0] - near[0]) / shift, (far[1] - near[1]) / shift) for near, far in zip(window, farther, strict=True)
+            ((far[0] - near[0]) / shift - centre, (far[1] - near[1]) / shift - centre)
+            for near, far, centre in zip(window, farther, centres, strict=True)
+        )
+        row_tan, column_tan = (
+            (first - centre / depth, last - centre / depth)
+            for (first, last), centre in zip(window, centres, strict=True)
         )
         return Parallax(
             depth_mm=depth,
-            row_tan=window[0],
-            column_tan=window[1],
+            row_tan=row_tan,
+            column_tan=column_tan,
             row_mm=rows,
             column_mm=columns,
             pixel_pitch_mm=self.geometry.pixel_pitch,
+            row_pitch_mm=self.geometry.row_pitch,
             mask_distance_mm=self.geometry.mask_distance,
         )
+
+    def _centre(self, axis: int) -> float:
+        """Middle of a frame's rows (``axis`` 0) or columns (1) [mm], of a region of interest."""
+        centres = self.geometry.centres(axis)
+        return 0.0 if self.geometry.roi is None else float(centres[0] + centres[-1]) / 2
 
     @property
     def field_stop_cuts(self) -> bool:
         """Whether some sensor point does not see all of the projector's window through the field stop."""
-        reach = max(abs(edge) for window in self.windows for edge in window)
-        shift = self.geometry.half_width / self.geometry.scene_distance
-        return bool(reach + shift > self.geometry.tan_half_fov)
+        geometry = self.geometry
+        return any(
+            max(map(abs, window)) + half / geometry.scene_distance > geometry.tan_half_fov
+            for window, half in zip(self.windows, geometry.half_sides, strict=True)
+        )
 
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
         """The family ``patterns`` on this projector, ``seed`` for random ones; MitsimError when it does not fit."""
@@ -672,12 +687,14 @@ def open_bench(
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     plugins.register()
     loaded = load_scene(path, defines, needs_projector=not for_render, outside=allow_outside_files)
-    pitch, stated = sensor.superpixel_pitch_um * 1e-3, loaded.camera.geometry.pixel_pitch
-    if not for_render and abs(pitch - stated) > _PITCH_TOLERANCE * stated:
-        raise MitsimError(
-            f"camera {sensor_path}: its binned pixel pitch is {pitch * 1e3:g} um, but {scene} has {stated * 1e3:g} um; "
-            "use the camera of that scene, or change pixel_pitch, or binning"
-        )
+    row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning
+    of_rows, of_columns = zip((row_um, sensor.superpixel_pitch_um), loaded.camera.geometry.pitches, strict=True)
+    for name, (um, stated) in (("pixel_pitch", of_columns), ("row_pitch", of_rows)):
+        if not for_render and abs(um * 1e-3 - stated) > _PITCH_TOLERANCE * stated:
+            raise MitsimError(
+                f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {um:g} um, but {scene} has "
+                f"{stated * 1e3:g} um; use the camera of that scene, or change {name}, or binning"
+            )
     if mask is not None:
         if "mask" in defines:
             raise MitsimError(

@@ -151,7 +151,7 @@ def write_session(
     session = Session(bench, of_one_depth(recipe or load_recipe()), seed)
     with whole_folder(frames) as folder:
         number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
-        size = Cost(disk_bytes=float(session.shots * bench.geometry.pixels**2 * number_bytes))
+        size = Cost(disk_bytes=float(session.shots * math.prod(bench.geometry.frame_shape) * number_bytes))
         size.check("frames", Limits(), folder)
         return calibrate_session(session, accuracy, output, False, job or Job(), folder)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import names
 from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
@@ -39,11 +41,11 @@ _BYTES_PER_ROW, _HEADER_BYTES = 16, 2000
 
 def frame_seconds(bench: Bench, shots: int) -> dict[str, float]:
     """Seconds of exposing and of writing so many ``shots`` of a ``bench``."""
-    pixels = shots * bench.geometry.pixels**2
+    pixels = shots * math.prod(bench.geometry.frame_shape)
     return {"sensor": pixels * _EXPOSING_S, "write": pixels * _WRITING_S}
 
 
-def frames_bytes(classes: int, shots: int, pixels: int) -> float:
+def frames_bytes(classes: int, shots: int, pixels: float) -> float:
     """Memory of frames that are formed, with the probes that tell their error, exposed and written at a time.
 
     Parameters
@@ -52,7 +54,7 @@ def frames_bytes(classes: int, shots: int, pixels: int) -> float:
         of the family, and a side of the sensor.
     """
     formed = frames_in_memory(classes, shots, pixels) * (pixels + GROUPS * (PROBES + 1))
-    return 8.0 * pixels * (formed + _EXPOSED * frames_at_once(pixels**2) * pixels)
+    return 8.0 * pixels * (formed + _EXPOSED * frames_at_once(round(pixels**2)) * pixels)
 
 
 def frames_cost(
@@ -74,13 +76,14 @@ def frames_cost(
         bytes of frames that are there already.
     """
     shots, classes = lighting.weights.shape
-    rows = bench.geometry.pixels
-    pixels, lines = rows**2, 1 if bench.lines is None else len(bench.lines.shares)
+    rows, pixels = bench.geometry.frame_shape[0], math.prod(bench.geometry.frame_shape)
+    lines = 1 if bench.lines is None else len(bench.lines.shares)
     files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
     truth = float(_BYTES_PER_PIXEL * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES)
     return Cost(
         seconds=seconds,
-        memory_bytes=lines * (light_bytes(bench, classes, settings) + frames_bytes(classes, shots, rows)),
+        memory_bytes=lines
+        * (light_bytes(bench, classes, settings) + frames_bytes(classes, shots, bench.geometry.frame_side)),
         disk_bytes=max(files + truth - on_disk, 0.0),
     )
 
@@ -100,7 +103,7 @@ def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
     followed = bool(settings.effects & names(lambda effect: effect.followed))
     geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
     terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
-    factors = _TERM_BYTES * terms * geometry.pixels * cells * len(settings.depths)
+    factors = _TERM_BYTES * terms * max(geometry.frame_shape) * cells * len(settings.depths)
     if settings.raster or geometry.drawn(geometry.diffracts):
         factors = max(0.0 if settings.raster else factors, raster_bytes(geometry))
     return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES

@@ -108,7 +108,7 @@ class DriftedExposer(Exposer):
     family
         patterns whose frames are exposed, in the order of its shots.
     ambient
-        (pixels, pixels) light of lamps [W m^-2], as it was when their frame was taken.
+        (m, m') light of lamps [W m^-2], as it was when their frame was taken.
     """
 
     drift: Drift = field(default_factory=Drift)
@@ -116,7 +116,7 @@ class DriftedExposer(Exposer):
     ambient: FloatArray | float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
-        """Expected photoelectrons (pixels, pixels) of ``frame`` in the time that the shutter is open."""
+        """Expected photoelectrons (m, m') of ``frame`` in the time that the shutter is open."""
         return self._open.electrons(frame)
 
     def lit(self, frame: Frame, *names: str | int) -> FloatArray:

@@ -274,7 +274,7 @@ class Forming:
         seconds of drawing a shadow, without diffraction and with it, for each layer.
     """
 
-    pixels: int
+    pixels: float
     cells: int
     lit: float
     terms: float

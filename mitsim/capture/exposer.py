@@ -47,7 +47,7 @@ class Exposer:
     speckle: float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
-        """Expected photoelectrons (pixels, pixels) of ``frame``, without dark current."""
+        """Expected photoelectrons (m, m') of ``frame``, without dark current."""
         return electrons_from_irradiance(
             frame.irradiance, self.exposure_s, self.rig.sensor, self.rig.projector.effective_wavelength_nm
         )

@@ -20,6 +20,7 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.frames import Filed
+from mitsim.optics.shadow import Places
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
 from mitsim.transport.cells import CellGrid, aligned_grid
@@ -91,7 +92,7 @@ class Tray:
     spectrum
         light whose diffraction is simulated; None: the mask's shadow is geometric.
     places
-        pixels along both axes of the sensor whose frames are formed; None: all.
+        rows and columns whose frames are formed; None: all.
     """
 
     def __init__(
@@ -99,12 +100,12 @@ class Tray:
         bundle: Bundle,
         geometry: CameraGeometry,
         spectrum: Spectrum | None,
-        places: tuple[int, ...] | None = None,
+        places: Places | None = None,
     ) -> None:
         self.bundle, self._geometry, self._spectrum, self._places = bundle, geometry, spectrum, places
 
     @property
-    def key(self) -> tuple[Bundle, CameraGeometry, Spectrum | None, tuple[int, ...] | None]:
+    def key(self) -> tuple[Bundle, CameraGeometry, Spectrum | None, Places | None]:
         """Equal for trays that form the same light alike."""
         return self.bundle, self._geometry, self._spectrum, self._places
 
@@ -148,7 +149,7 @@ class Trays:
         whether diffraction is that of the light's mean wavelength alone: for what hardly hangs on it, in a third of the
         time.
     places
-        pixels along both axes of the sensor whose frames are formed; None: all.
+        rows and columns whose frames are formed; None: all.
 
     Attributes
     ----------
@@ -165,7 +166,7 @@ class Trays:
         settings: Settings,
         pixels: int | None = None,
         one_line: bool = False,
-        places: tuple[int, ...] | None = None,
+        places: Places | None = None,
     ) -> None:
         self.bench, self.settings, self.places = bench, settings, places
         self.physics = Physics.simulated(bench, settings.effects)

@@ -55,7 +55,7 @@ class Shown:
     rows, columns
         (n,) weights: the pattern is their product.
     rate
-        (pixels, pixels) response [electrons / s], centred where the camera's factors are.
+        (m, m') response [electrons / s], centred where the camera's factors are.
     noise
         standard deviation of a number of it.
     """

@@ -124,7 +124,7 @@ def _seen(lit: LitSession, sums: StripeSums, shown: tuple[int, Frame]) -> Seen:
 
 
 def _variances(lit: LitSession) -> tuple[FloatArray, FloatArray | None]:
-    """(pixels, pixels) noise variance of a +-1 response [(electrons/s)^2]: its own, and what all of a side share.
+    """(m, m') noise variance of a +-1 response [(electrons/s)^2]: its own, and what all of a side share.
 
     Shots of a pattern are taken for half as bright as uniform light: over all patterns, and over a pair, that is exact.
     """

@@ -265,7 +265,7 @@ class Light:
 
         return {
             "n": self.bench.n,
-            "shape": [self.bench.geometry.pixels] * 2,
+            "shape": list(self.bench.geometry.frame_shape),
             "entries": sum(getattr(group, tray).nnz for group in self.groups for tray in TRAYS),
             "accuracy": self.plan.accuracy,
             "mc_error": self.sampling_error,
@@ -446,7 +446,7 @@ def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, fl
         whether it is light over several surfaces.
     """
     shots, classes = lighting.weights.shape
-    whole = tells_all(classes, shots, light.bench.geometry.pixels)
+    whole = tells_all(classes, shots, light.bench.geometry.frame_side)
     seen = lighting if whole else _some(lighting, MOST_CHECKED if followed else CHECKED_SHOTS)
     # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
     expected = light.frames(seen, light.seed, leaking=False)

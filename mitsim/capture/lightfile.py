@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
     from mitsim.capture.light import Light
 
-LAYOUT = 1
-"""Number of the layout that is written here: attribute `mitsim_transport` of the file."""
+LAYOUT, LAYOUT_OF_TWO_SIDES = 1, 2
+"""Numbers of the layouts that are written here: attribute `mitsim_transport` of the file. The second has anchors'
+weights for columns too, where these do not lie as rows do."""
 _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
 """Filters that every HDF5 library has, and a checksum for each chunk."""
 _GLINT_BYTES = 2**31
@@ -84,12 +85,15 @@ def error_bound(light: Light) -> float:
 def _facts(light: Light) -> dict[str, Any]:
     """Attributes of the file."""
     bench, plan, rig = light.bench, light.plan, light.bench.rig
+    rows, columns = bench.geometry.frame_shape
     joule = electrons_from_irradiance(1.0, 1.0, rig.sensor, rig.projector.effective_wavelength_nm)
     return {
-        "mitsim_transport": LAYOUT,
+        "mitsim_transport": LAYOUT if bench.geometry.axes_alike else LAYOUT_OF_TWO_SIDES,
         "mitsim_version": __version__,
         "n": bench.n,
-        "pixels": bench.geometry.pixels,
+        **({"pixels": rows} if rows == columns else {}),
+        "rows": rows,
+        "columns": columns,
         "groups": len(light.groups),
         "black_level": light.simulation.physics.black_level,
         "electrons_per_j_m2": float(joule),
@@ -119,9 +123,10 @@ def _write_shadow(group: h5py.Group, tray: Tray) -> None:
     for side, name in enumerate(("left", "right")):
         factors = np.stack([[term[side] for term in terms] for terms in layers])
         group.create_dataset(name, data=factors.astype(np.float32), **_PACKED)
-    weights = anchor_weights(anchor_positions(bundle.anchors, geometry.half_width), geometry.pixel_centres)
+    positions = anchor_positions(bundle.anchors, geometry.half_width)
     arrays = {
-        "anchors": weights,
+        "anchors": anchor_weights(positions, geometry.centres(0)),
+        **({"column_anchors": anchor_weights(positions, geometry.centres(1))} if not geometry.axes_alike else {}),
         "rows": bundle.rows.centres,
         "columns": bundle.columns.centres,
         "depths_mm": np.array(bundle.depths),
@@ -131,9 +136,8 @@ def _write_shadow(group: h5py.Group, tray: Tray) -> None:
 
 
 def _ambient(light: Light) -> FloatArray:
-    """(groups, pixels, pixels) irradiance of lamps by each group of a ``light``."""
-    pixels = light.bench.geometry.pixels
-    frames = np.zeros((len(light.groups), pixels, pixels))
+    """(groups, m, m') irradiance of lamps by each group of a ``light``."""
+    frames = np.zeros((len(light.groups), *light.bench.geometry.frame_shape))
     for filed in light.simulation.filed(light.groups, light.bench.n**2)[1]:
         for frame, group in zip(frames, filed.groups, strict=True):
             frame += filed.optics.frame(group.indices, group.data)
@@ -141,14 +145,14 @@ def _ambient(light: Light) -> FloatArray:
 
 
 def _glint(path: Path, light: Light) -> sparse.csr_array | None:
-    """(n^2, pixels^2) irradiance of each projector pixel over mirrors alone; None without such light."""
+    """(n^2, m m') irradiance of each projector pixel over mirrors alone; None without such light."""
     if not light.simulation.physics.mirrors:
         return None
-    pixels, count = light.bench.geometry.pixels, light.bench.n**2
+    (rows, columns), count = light.bench.geometry.frame_shape, light.bench.n**2
     shining = len(np.unique(light.bench.glint.beams.pixel))
-    if shining * pixels**2 * 8 > _GLINT_BYTES:
+    if shining * rows * columns * 8 > _GLINT_BYTES:
         raise MitsimError(
-            f"file {path}: {shining} projector pixels shine over mirrors, and their frames of {pixels}x{pixels} take "
+            f"file {path}: {shining} projector pixels shine over mirrors, and their frames of {rows}x{columns} take "
             f"more than {_GLINT_BYTES >> 30} GiB at once; leave the mirror out, or take a sensor of fewer pixels"
         )
     found = light.simulation.glint_frames(light.labels)

@@ -179,10 +179,11 @@ def _real(bench: Bench, session: SessionFrames, modelling: Modelling) -> tuple[l
     chosen = modelling.chosen(_changes(signs), pairs, listed.repeats)
     shown = []
     for (side, index), (rate, noise) in zip(chosen, chosen_responses(session, chosen), strict=True):
-        if rate.shape != (bench.geometry.pixels,) * 2:
+        rows, columns = bench.geometry.frame_shape
+        if rate.shape != (rows, columns):
             raise MitsimError(
                 f"frames {session.folder}: are {rate.shape[0]} x {rate.shape[1]} pixels, but the scene's camera has "
-                f"{bench.geometry.pixels} x {bench.geometry.pixels}; give the scene of this rig"
+                f"{rows} x {columns}; give the scene of this rig"
             )
         shown.append(_shown(signs[:, index], side, rate, noise, listed.centre))
     return shown, listed.digital, frames_of(chosen, pairs, listed.repeats) * len(listed.exposure_ladder)

@@ -70,10 +70,11 @@ class MosaicBench(Bench):
                 f"camera {bench.rig.camera_file}: has no mosaic of colour filters, and colour mosaic was asked for; "
                 "use a camera that has one, such as imx249_rggb, or colour lines"
             )
-        if bench.geometry.pixels % 2:
+        (rows, columns), first = bench.geometry.frame_shape, (bench.geometry.roi or (0, 0))[:2]
+        if rows % 2 or columns % 2 or any(at % 2 for at in first):
             raise MitsimError(
-                f"camera {bench.rig.camera_file}: {bench.geometry.pixels} pixels a side do not hold whole filters of "
-                "2 x 2; give the scene an even number"
+                f"camera {bench.rig.camera_file}: frames of {rows} x {columns} pixels from row {first[0]} and column "
+                f"{first[1]} do not hold whole filters of 2 x 2; give the scene's film even numbers"
             )
         bare = {"mosaic": None, "mosaic_curves": None, "quantum_efficiency": 1.0}
         rig = replace(bench.rig, sensor=sensor.model_copy(update=bare))
@@ -132,7 +133,7 @@ class MosaicLight(Light):
             "looked": None,
             "known_truth": _truth_of_all(lights, counted.mean(axis=0)),
             "by_line": tuple(lights),
-            "passed": behind(counted, (bench.geometry.pixels,) * 2),
+            "passed": behind(counted, bench.geometry.frame_shape),
         }
         return cls(**{each.name: getattr(first, each.name) for each in fields(Light)} | own)
 
@@ -272,7 +273,7 @@ def calibrate_mosaic(
             f"pass nothing of {colours.manifest.names[line]}, so a calibration in this line alone does not see all "
             "pixels; use a projector whose lines all filters pass"
         )
-    passed = behind(weights, (bench.geometry.pixels,) * 2)
+    passed = behind(weights, bench.geometry.frame_shape)
     recipe = recipe or load_recipe().model_copy(update={"repeats": _REPEATS})
     sessions = line_sessions(colours, of_one_depth(recipe), seed, list(passed))
     return run_sessions(colours, sessions, accuracy, output, resume, job or Job())

@@ -327,7 +327,7 @@ def checking_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number
     return forming_seconds(forming, numbers, _LOOK * rounds * (few + numbers.indirect * (many - few)), paces)
 
 
-def tells_all(classes: int, shots: int, pixels: int) -> bool:
+def tells_all(classes: int, shots: int, pixels: float) -> bool:
     """Whether looks see all shots, by the frames of their classes.
 
     Parameters

@@ -47,7 +47,7 @@ class Rendered:
     Attributes
     ----------
     mean, error
-        (pixels, pixels, channels) irradiance, and its standard error.
+        (m, m', channels) irradiance, and its standard error.
     facts
         estimator, spp (None: factored), seconds, variant and seed.
     warnings
@@ -114,7 +114,7 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
 
     Returns
     -------
-    (pixels, pixels, channels) irradiance [W m^-2] and its standard error.
+    (m, m', channels) irradiance [W m^-2] and its standard error.
 
     Raises
     ------

@@ -96,7 +96,7 @@ class Session:
         return (
             *self.board_warnings,
             *self.mask_warnings,
-            *camera_warnings(self.bench.sensor, (self.bench.geometry.pixels,) * 2),
+            *camera_warnings(self.bench.sensor, self.bench.geometry.frame_shape),
         )
 
     @cached_property
@@ -228,7 +228,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Response:
-    """Response (pixels, pixels) to a +-1 pattern [electrons / s], and how many of its shots had saturated pixels."""
+    """Response (m, m') to a +-1 pattern [electrons / s], and how many of its shots had saturated pixels."""
 
     rate: FloatArray
     saturated: int = 0
@@ -267,7 +267,7 @@ class LitSession:
         return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
 
     def response_variance(self, side: str) -> FloatArray:
-        """(pixels, pixels) mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
+        """(m, m') mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
         variance: FloatArray = np.zeros(self.uniform_rate.shape)
         for parts in self.response_variances(side):
             for part in parts.values():
@@ -275,7 +275,7 @@ class LitSession:
         return variance
 
     def response_variances(self, side: str) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-        """The same by source, (pixels, pixels) or one number each: what each response has of its own, and what all of
+        """The same by source, (m, m') or one number each: what each response has of its own, and what all of
         the ``side`` share.
 
         Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
@@ -345,8 +345,8 @@ class LitSession:
         n = self.session.bench.n
         row, column = np.divmod(np.arange(n * n), n)
         stripes = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
-        pixels = self.session.bench.geometry.pixels
-        yield from stripe_frames(self.light, stripes, self.session.seed, pixels, max(first, 1))
+        shape = self.session.bench.geometry.frame_shape
+        yield from stripe_frames(self.light, stripes, self.session.seed, shape, max(first, 1))
 
     def _leaking(self, frame: Frame) -> Frame:
         """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""
@@ -359,7 +359,7 @@ class LitSession:
 
     @cached_property
     def _leaked(self) -> FloatArray:
-        """(pixels, pixels) light of all pixels when they are black [W m^-2]."""
+        """(m, m') light of all pixels when they are black [W m^-2]."""
         return np.asarray(self.light.simulation.physics.black_level * self.white.irradiance)
 
     def noisy(self, side: str, number: int, frame: Frame) -> Response:
@@ -388,7 +388,7 @@ class LitSession:
         return Response(rate, sum(shot.saturated for shot in shots))
 
     def noise_free(self, frame: Frame) -> FloatArray:
-        """(pixels, pixels) the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
+        """(m, m') the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
         rate = self._second.electrons(frame)
         rate *= 2
         rate -= self.uniform_rate
@@ -425,7 +425,7 @@ class LitSession:
 
     @cached_property
     def _dark(self) -> Mapping[str, FloatArray] | None:
-        """(pixels, pixels) rate of the mean dark frame, as each side's frames are merged; None where none is taken."""
+        """(m, m') rate of the mean dark frame, as each side's frames are merged; None where none is taken."""
         number = self.session.recipe.dark_frames
         if not number:
             return None
@@ -440,12 +440,12 @@ class LitSession:
 
     @cached_property
     def uniform_rate(self) -> FloatArray:
-        """(pixels, pixels) expected photoelectrons a second of the uniform frame."""
+        """(m, m') expected photoelectrons a second of the uniform frame."""
         return self._second.electrons(self.white)
 
     @cached_property
     def _both(self) -> FloatArray:
-        """(pixels, pixels) light of a pair's two shots together [W m^-2]: all of it, and what black pixels leak."""
+        """(m, m') light of a pair's two shots together [W m^-2]: all of it, and what black pixels leak."""
         n = self.session.bench.n
         off = Lighting(np.zeros(n * n, dtype=np.int64), np.zeros((1, 1)))
         (dark,) = self.light.frames(off, self.session.seed)
@@ -458,7 +458,7 @@ class LitSession:
         return {side: Response(self._rate(shot, slice(None)), shot.saturated) for side, shot in shots.items()}
 
     def _exposed(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
-        """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (pixels, pixels)."""
+        """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (m, m')."""
         ladder = self.ladders[side]
         found = [
             self._repeated(self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index)
@@ -526,7 +526,7 @@ class LitSession:
 
     @staticmethod
     def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
-        """(pixels, pixels) rates of all rows by those ``of`` some, a few at a time: their arrays stay in the cache."""
+        """(m, m') rates of all rows by those ``of`` some, a few at a time: their arrays stay in the cache."""
         rates: FloatArray = np.empty(shot.digital[0].shape)
         step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
         for start in range(0, len(rates), step):
@@ -537,7 +537,7 @@ class LitSession:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """Noisy frames (pixels, pixels), of each exposure the mean of its repeats, which a ``ladder`` merges; how many of
+    """Noisy frames (m, m'), of each exposure the mean of its repeats, which a ``ladder`` merges; how many of
     all have ``saturated`` pixels."""
 
     ladder: Ladder

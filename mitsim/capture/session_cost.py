@@ -45,7 +45,7 @@ def session_seconds(board: Bench, count: int, shots: int, settings: Settings) ->
     settings
         what is simulated.
     """
-    n, pixels = board.n, board.geometry.pixels
+    n, pixels = board.n, board.geometry.frame_side
     cells = max(Simulation(board, settings).fine.bundle.cells)
     mixed = lines_held(n, count, pixels)
     forming = Forming(
@@ -77,10 +77,10 @@ def session_cost(board: Bench, count: int, settings: Settings, seconds: float, e
     exposures
         of every frame.
     """
-    n, pixels = board.n, board.geometry.pixels
+    n, pixels = board.n, board.geometry.frame_side
     lines = n if lines_held(n, count, pixels) else 0
     at_work = _AT_WORK + _OF_AN_EXPOSURE * (exposures - 1)
     held = _HELD + (exposures if exposures > 1 else 0)  # and a pixel's weights
-    frames = lines + 3 * at_once(pixels) + held + at_work * frames_at_once(pixels**2)
+    frames = lines + 3 * at_once(pixels) + held + at_work * frames_at_once(round(pixels**2))
     memory_bytes = 8.0 * (frames * pixels**2 + _SUMS * count * pixels)
     return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + memory_bytes)

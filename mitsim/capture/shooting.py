@@ -102,7 +102,7 @@ class Shooting:
         ambient
             what is taken off the frames.
         always
-            (pixels, pixels) expected electrons of ambient light, which is in every frame.
+            (m, m') expected electrons of ambient light, which is in every frame.
         """
         self.family, self.recorder, self.exposer = family, recorder, exposer
         self.ambient, self.always = ambient, always

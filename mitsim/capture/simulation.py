@@ -206,7 +206,7 @@ class Simulation(Trays):
         found = self.bench.glint.frames(labels, self.physics.geometry, self.physics.spectrum)
         if found is None or self.places is None:
             return found
-        return replace(found, irradiance=found.irradiance[:, self.places][:, :, self.places])
+        return replace(found, irradiance=found.irradiance[:, self.places[0]][:, :, self.places[1]])
 
     def expected(
         self,

@@ -332,15 +332,16 @@ Edges = Annotated[tuple[Coordinate, ...], Field(strict=False, min_length=2, max_
 
 
 class Parallax(_Part):
-    """How a calibration's factors move with depth: the projector's window, seen from the sensor's centre on a plane at
-    distance z, has its edges at tan-angles window + parallax (1/z - 1/depth), in index coordinates."""
+    """How a calibration's factors move with depth: the projector's window, seen from the middle of the frames on a
+    plane at distance z, has its edges at tan-angles window + parallax (1/z - 1/depth), in index coordinates."""
 
     depth_mm: Distance = Field(description="sensor to the board [mm]")
     row_tan: Edges = Field(description="first and last edge of the window's rows on the board")
     column_tan: Edges = Field(description="the same of its columns")
     row_mm: Edges = Field(description="parallax of these edges; the baseline, where the projector faces as the camera")
     column_mm: Edges = Field(description="the same of columns")
-    pixel_pitch_mm: Distance = Field(description="between centres of (binned) sensor pixels")
+    pixel_pitch_mm: Distance = Field(description="between columns of (binned) sensor pixels, and between rows")
+    row_pitch_mm: Distance | None = Field(default=None, description="between rows, where pixels are not square")
     mask_distance_mm: Distance = Field(description="sensor to the mask")
 
     @model_validator(mode="after")
@@ -351,6 +352,10 @@ class Parallax(_Part):
         if not self.mask_distance_mm < self.depth_mm:
             raise ValueError(f"mask_distance_mm {self.mask_distance_mm:g} must be below depth_mm {self.depth_mm:g}")
         return self
+
+    def pitch_mm(self, axis: int) -> float:
+        """Distance between rows (``axis`` 0) or columns (1) of sensor pixels."""
+        return self.pixel_pitch_mm if axis or self.row_pitch_mm is None else self.row_pitch_mm
 
 
 class FittedNumber(_Part):

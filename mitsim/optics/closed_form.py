@@ -21,7 +21,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.correlation import Correlation
 from mitsim.optics.raster import raster
-from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.plate import FEW
@@ -50,7 +50,7 @@ class _Block:
     Attributes
     ----------
     factors
-        by term, (r, pixels) and (c, pixels): the shadow's factors of the lit rows and columns.
+        by term, (r, m) and (c, m') on frames (m, m'): the shadow's factors of the lit rows and columns.
     lights
         (estimates, r, c) light of each.
     """
@@ -59,7 +59,7 @@ class _Block:
     lights: FloatArray
 
     def frame(self, out: FloatArray | None = None) -> FloatArray:
-        """(pixels, pixels) irradiance of the estimates' mean, in ``out`` where that is given.
+        """(m, m') irradiance of the estimates' mean, in ``out`` where that is given.
 
         One product over the rows, or columns, of all terms: those of single terms would go over the frame once each.
         """
@@ -71,8 +71,8 @@ class _Block:
         return np.matmul(np.concatenate([mean.T @ left for left in lefts]).T, np.concatenate(rights), out=out)
 
     def probe(self, vectors: FloatArray | None) -> FloatArray:
-        """(pixels, estimates * probes) products of each estimate's frame with ``vectors`` (pixels, probes); without
-        them the frames themselves, side by side."""
+        """(m, estimates * probes) products of each estimate's frame with ``vectors`` (m', probes); without them the
+        frames themselves, side by side."""
         count, rows, columns = self.lights.shape
         flat, total = self.lights.reshape(count * rows, columns), np.zeros(())
         for left, right in self.factors:
@@ -116,12 +116,12 @@ class _RasterBlock:
 
 @dataclass(frozen=True, eq=False)
 class _RasterLayer:
-    """One layer behind a mask on a raster: its correlation, the anchors' weights (m, anchors), and (m,) pixels along
-    both axes, None for all."""
+    """One layer behind a mask on a raster: its correlation, the anchors' weights (m, anchors) and (m', anchors), and
+    rows and columns of a frame, None for all."""
 
     correlation: Correlation
-    weights: FloatArray
-    places: IntArray | None
+    weights: tuple[FloatArray, FloatArray]
+    places: Places | None
     cells: tuple[int, int]
 
     def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _RasterBlock:
@@ -129,11 +129,12 @@ class _RasterLayer:
         return _RasterBlock(self, rows, columns, lights)
 
     def image(self, light: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
-        """(m, m) irradiance of a ``light`` (r, c) in these ``rows`` and ``columns``."""
+        """(m, m') irradiance of a ``light`` (r, c) in these ``rows`` and ``columns``."""
         (row_anchor, row), (column_anchor, column) = (
             np.divmod(places, cells) for places, cells in zip((rows, columns), self.cells, strict=True)
         )
-        total = np.zeros((len(self.weights),) * 2)
+        by_row, by_column = self.weights
+        total = np.zeros((len(by_row), len(by_column)))
         for first in np.unique(row_anchor):
             for second in np.unique(column_anchor):
                 inside = row_anchor == first, column_anchor == second
@@ -142,8 +143,8 @@ class _RasterLayer:
                     continue
                 seen = self.correlation.image(part, row[inside[0]], column[inside[1]])
                 if self.places is not None:
-                    seen = seen[np.ix_(self.places, self.places)]
-                total += self.weights[:, first, None] * seen * self.weights[:, second]
+                    seen = seen[np.ix_(*self.places)]
+                total += by_row[:, first, None] * seen * by_column[:, second]
         return total
 
 
@@ -174,7 +175,7 @@ class FrameOptics:
     spectrum
         lines of a wave-optical shadow; None: geometric.
     places
-        (m,) pixels along both axes, increasing, of which the sensor then consists; None: all.
+        rows and columns of a frame, increasing, of which it then consists; None: all.
     """
 
     def __init__(
@@ -185,19 +186,21 @@ class FrameOptics:
         depths: Sequence[float],
         anchors: int,
         spectrum: Spectrum | None = None,
-        places: tuple[int, ...] | None = None,
+        places: Places | None = None,
     ) -> None:
-        centres = geometry.pixel_centres if places is None else geometry.pixel_centres[np.asarray(places)]
-        weights = anchor_weights(anchor_positions(anchors, geometry.half_width), centres)
+        positions = anchor_positions(anchors, geometry.half_width)
+        centres = [geometry.centres(axis) for axis in (0, 1)]
+        if places is not None:
+            centres = [own[np.asarray(chosen)] for own, chosen in zip(centres, places, strict=True)]
+        by_row, by_column = (anchor_weights(positions, own) for own in centres)
         self.anchors = anchors
-        self.pixels = len(centres)
+        self.frame_shape = len(centres[0]), len(centres[1])
         self.cells = (len(rows.centres), len(columns.centres))
         self.shape = (anchors * self.cells[0], anchors * self.cells[1])
         if geometry.correlated(spectrum is not None):
-            chosen = None if places is None else np.asarray(places)
             seen = [_correlation(geometry, rows, columns, depth, spectrum) for depth in depths]
             self._layers: Sequence[_RasterLayer | _TermsLayer] = [
-                _RasterLayer(correlation, weights, chosen, self.cells) for correlation in seen
+                _RasterLayer(correlation, (by_row, by_column), places, self.cells) for correlation in seen
             ]
             return
         # Stored with the light's index first, so that picking lit rows copies contiguous memory.
@@ -205,7 +208,7 @@ class FrameOptics:
         self._layers = [
             _TermsLayer(
                 [
-                    (stack(left, weights), stack(right, weights))
+                    (stack(left, by_row), stack(right, by_column))
                     for left, right in _shadow(geometry, rows, columns, depth, spectrum, places)
                 ]
             )
@@ -213,15 +216,16 @@ class FrameOptics:
         ]
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
-        """(pixels, pixels) irradiance of ``light`` [W m^-2] at distinct indices ``flat`` into (layers, *shape)."""
+        """(m, m') irradiance of ``light`` [W m^-2] at distinct indices ``flat`` into (layers, *shape)."""
         return self.seen([(flat, light)], None)[0]
 
     def probe(self, estimates: Sequence[Entries], vectors: FloatArray | None = None) -> FloatArray:
-        """Frames of several ``estimates`` times ``vectors`` (pixels, probes): (pixels, estimates * probes).
+        """Frames of several ``estimates`` times ``vectors`` (m', probes): (m, estimates * probes).
 
         The frames, which would cost far more, are never formed; but without ``vectors`` they are, side by side.
         """
-        total = np.zeros((self.pixels, len(estimates) * (self.pixels if vectors is None else vectors.shape[1])))
+        rows, columns = self.frame_shape
+        total = np.zeros((rows, len(estimates) * (columns if vectors is None else vectors.shape[1])))
         for block in self._blocks(estimates):
             total += block.probe(vectors)
         return total
@@ -236,22 +240,22 @@ class FrameOptics:
         estimates
             of one light.
         vectors
-            (pixels, probes), or None for no products.
+            (m', probes), or None for no products.
         out
-            (pixels, pixels) zeros, in which the frame is returned; a new array where not given.
+            (m, m') zeros, in which the frame is returned; a new array where not given.
 
         Returns
         -------
-        (pixels, pixels) and (pixels, estimates * probes).
+        (m, m') and (m, estimates * probes).
         """
         probes = 0 if vectors is None else vectors.shape[1]
-        frame, probed = None, np.zeros((self.pixels, len(estimates) * probes))
+        frame, probed = None, np.zeros((self.frame_shape[0], len(estimates) * probes))
         for block in self._blocks(estimates):
             frame = block.frame(out) if frame is None else np.add(frame, block.frame(), out=frame)
             if vectors is not None:
                 probed += block.probe(vectors)
         if frame is None:
-            frame = np.zeros((self.pixels, self.pixels)) if out is None else out
+            frame = np.zeros(self.frame_shape) if out is None else out
         return frame, probed
 
     def _blocks(self, estimates: Sequence[Entries]) -> Iterator[_Block | _RasterBlock]:
@@ -306,7 +310,8 @@ def raster_error(
     light
         (r, c).
     """
-    few = geometry.model_copy(update={"pixels": min(geometry.pixels, _JUDGED)})
+    side = min(*geometry.shape, _JUDGED)
+    few = geometry.model_copy(update={"pixels": side, "rows": None, "columns": None, "roi": None})
     row, column = (np.arange(len(each.centres)) for each in (rows, columns))
 
     def frame(finer: int) -> FloatArray:

@@ -40,26 +40,18 @@ class Correlation:
     """
 
     def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
-        self.pixels = len(shadow.pixel_centres_mm)
-        pitch = shadow.pixel_centres_mm[-1] - shadow.pixel_centres_mm[0]
-        step = pitch * shadow.shrink / max(self.pixels - 1, 1) / shadow.mask.feature_mm
-        phases = self._phases = max(round(step), 1)
-        if self.pixels > 1 and abs(step - phases) > _WHOLE:
-            raise MitsimError(f"a pixel is {step:g} cells of the mask's raster; draw one of a whole number")
-        sides = [
-            _Side.of(*shadow.from_mask(directions, axis), phases) for axis, directions in enumerate((rows, columns))
-        ]
+        sides = [_Side.of(*shadow.from_mask(directions, axis)) for axis, directions in enumerate((rows, columns))]
+        self.shape = sides[0].pixels, sides[1].pixels
+        self._phases = sides[0].phases, sides[1].phases
         self._spread = [side.weights for side in sides]
-        self._size = fft.next_fast_len(
-            self.pixels + max(side.weights.shape[0] for side in sides) // phases - 1, real=True
-        )
-        values = _mask_values(shadow)
-        seen = _part(_part(values, sides[0].first, self._size * phases).T, sides[1].first, self._size * phases).T
-        by_phase = seen.reshape(self._size, phases, self._size, phases).transpose(1, 3, 0, 2)
-        self._spectra = fft.rfft2(fill_factor * by_phase)
+        reach = max(len(side.weights) // side.phases for side in sides)
+        self._size = [fft.next_fast_len(side.pixels + reach - 1, real=True) for side in sides]
+        along = [size * phases for size, phases in zip(self._size, self._phases, strict=True)]
+        seen = _part(_part(_mask_values(shadow), sides[0].first, along[0]).T, sides[1].first, along[1]).T
+        self._spectra = fft.rfft2(fill_factor * self._by_phase(seen))
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
-        """(pixels, pixels) irradiance.
+        """(m, m') irradiance.
 
         Parameters
         ----------
@@ -69,21 +61,32 @@ class Correlation:
             (r,) and (c,) which cells of the directions these are.
         """
         left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
-        spread, phases = left @ light @ right.T, self._phases
-        by_phase = spread.reshape(len(spread) // phases, phases, -1, phases).transpose(1, 3, 0, 2)
-        seen = fft.fft(fft.rfft(by_phase, self._size), self._size, axis=-2)
+        by_phase = self._by_phase(left @ light @ right.T)
+        seen = fft.fft(fft.rfft(by_phase, self._size[1]), self._size[0], axis=-2)
         total = np.einsum("ijkl,ijkl->kl", self._spectra, np.conjugate(seen, out=seen))
-        return np.asarray(fft.irfft2(total, (self._size, self._size))[: self.pixels, : self.pixels])
+        return np.asarray(fft.irfft2(total, self._size)[: self.shape[0], : self.shape[1]])
+
+    def _by_phase(self, cells: FloatArray) -> FloatArray:
+        """(q, q', m, m') every q-th and q'-th of raster ``cells`` (q m, q' m')."""
+        rows, columns = self._phases
+        return cells.reshape(len(cells) // rows, rows, -1, columns).transpose(1, 3, 0, 2)
 
 
 class _Side:
-    """One axis: the first raster cell that pixel 0 sees, and how it weighs them (cells, c) for each direction."""
+    """One axis: its pixels, raster cells in each of them, the first cell that pixel 0 sees, and how it weighs them
+    (cells, c) for each direction."""
 
-    def __init__(self, first: int, weights: FloatArray) -> None:
-        self.first, self.weights = first, weights
+    def __init__(self, pixels: int, phases: int, first: int, weights: FloatArray) -> None:
+        self.pixels, self.phases, self.first, self.weights = pixels, phases, first, weights
 
     @classmethod
-    def of(cls, shadow: ShadowGeometry, directions: Directions, phases: int) -> _Side:
+    def of(cls, shadow: ShadowGeometry, directions: Directions) -> _Side:
+        pixels = len(shadow.pixel_centres_mm)
+        length = shadow.pixel_centres_mm[-1] - shadow.pixel_centres_mm[0]
+        step = length * shadow.shrink / max(pixels - 1, 1) / shadow.mask.feature_mm
+        phases = max(round(step), 1)
+        if pixels > 1 and abs(step - phases) > _WHOLE:
+            raise MitsimError(f"a pixel is {step:g} cells of the mask's raster; draw one of a whole number")
         cell, blur = shadow.mask.feature_mm, shadow.mask.blur_mm
         halves = shadow.half_pixel / cell, shadow.half_cell(directions) / cell
         crossings = (shadow.shrink * shadow.pixel_centres_mm[0] + shadow.distance_mm * directions.centres) / cell
@@ -93,7 +96,7 @@ class _Side:
         count = -(-(int(np.ceil(crossings.max() + reach)) - first) // phases) * phases
         edges = first + np.arange(count + 1)
         below = blurred_step(edges[:, None] - crossings, halves[0], halves[1], blur / cell)
-        return cls(first, np.diff(below, axis=0))
+        return cls(pixels, phases, first, np.diff(below, axis=0))
 
 
 def _mask_values(shadow: ShadowGeometry) -> FloatArray:

@@ -17,6 +17,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.optics.closed_form import Entries, FrameOptics, IntArray
+from mitsim.rig.camera import side_of
 from mitsim.rig.patterns import Lighting
 
 _AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
@@ -50,7 +51,7 @@ class Frame:
     Attributes
     ----------
     irradiance
-        (pixels, pixels) expected [W m^-2].
+        (m, m') expected [W m^-2].
     variance
         its Monte Carlo variance, mean over pixels.
     removed
@@ -79,7 +80,7 @@ class ClassFrames:
     classes
         (c,) increasing class numbers; every other class's frame is zero.
     irradiance
-        (c, pixels, pixels) [W m^-2].
+        (c, m, m') [W m^-2].
     """
 
     classes: IntArray
@@ -102,40 +103,40 @@ class Filed:
     groups: tuple[sparse.csr_array, ...]
 
 
-def at_once(pixels: int) -> int:
-    """Frames (``pixels``, ``pixels``) that are formed at a time."""
-    return max(1, min(_AT_ONCE, _BYTES_AT_ONCE // (_FLOAT * pixels**2)))
+def at_once(pixels: float) -> int:
+    """Frames of ``pixels`` a side, or as many in all, that are formed at a time."""
+    return max(1, min(_AT_ONCE, int(_BYTES_AT_ONCE // (_FLOAT * pixels**2))))
 
 
-def frames_in_memory(classes: int, shots: int, pixels: int) -> int:
+def frames_in_memory(classes: int, shots: int, pixels: float) -> int:
     """Frames that :class:`ExpectedFrames` holds at once: two lots that are in use, and one that is formed.
 
     Parameters
     ----------
     classes, shots, pixels
-        of the family, and a side of the sensor.
+        of the family, and a side of the sensor (:func:`mitsim.rig.camera.side_of`).
     """
     return (classes if mixes(classes, shots, pixels) else 0) + 3 * at_once(pixels)
 
 
-def formed_frames(classes: int, shots: int, pixels: int) -> int:
+def formed_frames(classes: int, shots: int, pixels: float) -> int:
     """Frames that are formed for a run, whose frames are asked for twice.
 
     Parameters
     ----------
     classes, shots, pixels
-        of the family, and a side of the sensor.
+        of the family, and a side of the sensor (:func:`mitsim.rig.camera.side_of`).
     """
     return classes if mixes(classes, shots, pixels) else 2 * shots
 
 
-def mixes(classes: int, shots: int, pixels: int) -> bool:
+def mixes(classes: int, shots: int, pixels: float) -> bool:
     """Whether shots are mixed from frames of classes, which are held, and not formed one by one.
 
     Parameters
     ----------
     classes, shots, pixels
-        of the family, and a side of the sensor.
+        of the family, and a side of the sensor (:func:`mitsim.rig.camera.side_of`).
     """
     return classes <= min(_LARGEST_BASIS, shots, _BASIS_BYTES // (_FLOAT * pixels**2))
 
@@ -181,7 +182,7 @@ class ExpectedFrames:
         self._seed, self._weights = seed, lighting.weights
         (shots, classes), rows = lighting.weights.shape, lighting.labels.size
         indicator = sparse.csr_array((np.ones(rows), (lighting.labels, np.arange(rows))), shape=(classes, rows))
-        self._mixed = mixes(classes, shots, self._pixels)
+        self._mixed = mixes(classes, shots, side_of(self._shape))
         self._shares = np.eye(classes) if self._mixed else self._weights
         least = self._least = self._weights.min(axis=0)
         self._own = sparse.csr_array(self._weights - least)
@@ -209,8 +210,7 @@ class ExpectedFrames:
     @property
     def projector_off(self) -> Frame:
         """The frame of ambient light alone, dark where there is none; its Monte Carlo error is that of all frames."""
-        pixels = self._lights[0].optics.pixels
-        light = np.zeros((pixels, pixels)) if self._ambient_formed is None else self._ambient_formed[0][0]
+        light = np.zeros(self._shape) if self._ambient_formed is None else self._ambient_formed[0][0]
         return Frame(np.maximum(light, 0.0), 0.0, 0.0, 0.0)
 
     @property
@@ -226,7 +226,7 @@ class ExpectedFrames:
         return self._leaked
 
     def __iter__(self) -> Iterator[Frame]:
-        step = at_once(self._pixels)
+        step = at_once(side_of(self._shape))
         if not self._mixed:
             for start in range(0, len(self), step):
                 irradiance, probed = self._form(start, min(start + step, len(self)))
@@ -255,7 +255,7 @@ class ExpectedFrames:
             return 0.0, 0.0
         for start in range(0, len(self), _AT_ONCE):
             for probed in self._shots_probed(start, min(start + _AT_ONCE, len(self))):
-                by_group = probed.reshape(self._pixels, count, -1)
+                by_group = probed.reshape(self._shape[0], count, -1)
                 mean = by_group.mean(axis=1)
                 energy += float(np.square(mean).sum())
                 parts += _squares(by_group - mean[:, None])
@@ -266,7 +266,7 @@ class ExpectedFrames:
 
     @property
     def probed(self) -> FloatArray | None:
-        """(classes, pixels * groups * probes) frames of classes by single groups, as random signs see them.
+        """(classes, m * groups * probes) frames of classes by single groups, as random signs see them.
 
         None where shots are formed one by one.
         """
@@ -275,7 +275,7 @@ class ExpectedFrames:
         return self._probed
 
     def _shots_probed(self, start: int, stop: int) -> FloatArray:
-        """(shots, pixels * groups * probes) frames of single groups as random signs see them."""
+        """(shots, m * groups * probes) frames of single groups as random signs see them."""
         classes, weights = self.probed, self._weights[start:stop]
         if classes is not None:
             probed = np.stack(self._of_classes.shots(classes, start, stop))
@@ -291,7 +291,7 @@ class ExpectedFrames:
         return probed
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        """(b, pixels, pixels) frames of basis lights, (b, pixels * groups * probes) those of groups as signs see them.
+        """(b, m, m') frames of basis lights, (b, m * groups * probes) those of groups as signs see them.
 
         Glint is exact: it is in the frames alone, as no difference between groups has any. Classes that were probed
         before are not probed again.
@@ -317,18 +317,18 @@ class ExpectedFrames:
 
     @cached_property
     def _probes(self) -> FloatArray:
-        return _probes(self._pixels, self._seed)
+        return _probes(self._shape[1], self._seed)
 
     @property
     def _groups(self) -> int:
         return len(self._lights[0].groups)
 
     @property
-    def _pixels(self) -> int:
-        return self._lights[0].optics.pixels
+    def _shape(self) -> tuple[int, int]:
+        return self._lights[0].optics.frame_shape
 
     def _frames(self, irradiance: Sequence[FloatArray], probes: Sequence[FloatArray]) -> list[Frame]:
-        """Frames (pixels, pixels) of light with what is in all of them, and their variance by ``probes``."""
+        """Frames (m, m') of light with what is in all of them, and their variance by ``probes``."""
         ambient = self._ambient_formed
         count = self._groups
         pairs = count * (count - 1)
@@ -337,7 +337,7 @@ class ExpectedFrames:
             frame, probed = irradiance[row], probes[row]
             if ambient is not None:
                 frame, probed = frame + ambient[0][0], probed + ambient[1][0]
-            by_group = probed.reshape(self._pixels, count, -1)
+            by_group = probed.reshape(self._shape[0], count, -1)
             squared = _squares(by_group - by_group.mean(axis=1, keepdims=True)) if pairs else np.zeros(1)
             spread = float(squared.sum())
             variance = spread / pairs / frame.size if pairs else 0.0
@@ -354,7 +354,7 @@ class ExpectedFrames:
 
 
 def _squares(deviations: FloatArray) -> FloatArray:
-    """(groups,) squared norms of ``deviations`` (pixels, groups, probes).
+    """(groups,) squared norms of ``deviations`` (m, groups, probes).
 
     Not products of vectors: BLAS adds up in an order that hangs on its threads.
     """
@@ -364,15 +364,15 @@ def _squares(deviations: FloatArray) -> FloatArray:
 def _formed(
     lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray | None, with_frames: bool = True
 ) -> tuple[FloatArray, FloatArray]:
-    """Frames (b, pixels, pixels) of mixtures ``basis`` (b, rows), and the groups' own as ``probes`` see them.
+    """Frames (b, m, m') of mixtures ``basis`` (b, rows), and the groups' own as ``probes`` see them.
 
-    The latter are (b, pixels * groups * probes); none without probes. No frames unless ``with_frames``.
+    The latter are (b, m * groups * probes); none without probes. No frames unless ``with_frames``.
     """
-    pixels, groups = lights[0].optics.pixels, len(lights[0].groups)
+    shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     count = basis.shape[0]
-    frames = np.zeros((count if with_frames else 0, pixels, pixels))
-    probed = np.zeros((count, pixels * groups * (0 if probes is None else probes.shape[1])))
+    frames = np.zeros((count if with_frames else 0, *shape))
+    probed = np.zeros((count, shape[0] * groups * (0 if probes is None else probes.shape[1])))
 
     def form(row: int) -> None:
         for number, (optics, parts) in enumerate(mixed):

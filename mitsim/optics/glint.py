@@ -123,18 +123,18 @@ def glint_frames(
     """
     labels = np.asarray(labels)
     _check(beams, labels, boxes_per_pixel)
-    active_side = math.sqrt(geometry.pixel_fill_factor)
+    active_part = math.sqrt(geometry.pixel_fill_factor)
     reached = _on_sensor(beams, geometry)
     classes = np.unique(labels[beams.pixel[reached]])
-    frames = np.zeros((len(classes), geometry.pixels, geometry.pixels))
+    frames = np.zeros((len(classes), *geometry.frame_shape))
     total, lit = 0.0, np.zeros(len(labels), dtype=bool)
-    for cut in _cuts(beams, reached, geometry.pixel_pitch / boxes_per_pixel):
+    for cut in _cuts(beams, reached, min(geometry.pitches) / boxes_per_pixel):
         boxes = _boxes(beams, cut, geometry)
         pixels = beams.pixel[boxes.beam]
-        total += _deposit(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms, active_side)
+        total += _deposit(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms, active_part)
         lit[pixels] = True
     used = np.isin(classes, labels[lit])
-    area = (geometry.pixel_pitch * active_side) ** 2
+    area = math.prod(geometry.active_sides)
     return GlintFrames(
         classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved
     )
@@ -210,7 +210,7 @@ def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
     place, tangent = _bilinear(corners, cut.a, cut.b), _bilinear(beams.tangent[cut.beams], cut.a, cut.b)
     along, across = _gradients(corners, cut.a, cut.b)
     extent = np.hypot(along * cut.size[0], across * cut.size[1])
-    extent = np.maximum(extent, _POINT * geometry.pixel_pitch)
+    extent = np.maximum(extent, _POINT * min(geometry.pitches))
     seen = (np.abs(place) < geometry.half_width + extent / 2).all(axis=-1)
     seen &= (np.abs(tangent) <= geometry.tan_half_fov).all(axis=-1)
     throughput = _bilinear(beams.throughput[cut.beams][..., None], cut.a, cut.b)[..., 0]
@@ -230,14 +230,14 @@ def _deposit(
     boxes: _Boxes,
     geometry: CameraGeometry,
     terms: Sequence[SeparableTerm],
-    active_side: float,
+    active_part: float,
 ) -> float:
     """Add the boxes' flux behind the mask to ``frames`` [.. mm^2]; the sum of their flux on the sensor without it.
 
     A box is at most one pixel wide, so it meets two pixels of each axis at most.
     """
-    count, total = geometry.pixels, 0.0
-    rows, columns = ([_pieces(boxes, axis, step, geometry, active_side) for step in (0, 1)] for axis in (0, 1))
+    count, total = geometry.frame_shape, 0.0
+    rows, columns = ([_pieces(boxes, axis, step, geometry, active_part) for step in (0, 1)] for axis in (0, 1))
     shadows = [
         ([row(*piece[2:]) for piece in rows], [column(*piece[2:]) for piece in columns]) for _, row, column in terms
     ]
@@ -253,27 +253,28 @@ def _deposit(
                 ),
                 np.zeros(len(met)),
             )
-            flat = (slot[met] * count + row[met]) * count + column[met]
+            flat = (slot[met] * count[0] + row[met]) * count[1] + column[met]
             np.add.at(frames.reshape(-1), flat, flux[met] * passed)
     return total
 
 
 def _pieces(
-    boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry, active_side: float
+    boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry, active_part: float
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """The part of each box in its first (step 0) or second pixel along an axis.
 
     Pixel index, share of the box (0 outside the sensor), then what a sampler takes: centre and width of the part's
     shadow in the mask plane [mm], tan-angle.
     """
-    pitch = geometry.pixel_pitch
-    place, extent = boxes.place[:, axis] / pitch + geometry.pixels / 2, boxes.extent[:, axis] / pitch
+    pitch, first = geometry.pitches[axis], 0 if geometry.roi is None else geometry.roi[axis]
+    place = boxes.place[:, axis] / pitch + geometry.shape[axis] / 2 - first
+    extent = boxes.extent[:, axis] / pitch
     low, high = place - extent / 2, place + extent / 2
     pixel = np.floor(low).astype(np.int64) + step
-    low = np.maximum(low, pixel + (1 - active_side) / 2)
-    high = np.minimum(high, pixel + (1 + active_side) / 2)
+    low = np.maximum(low, pixel + (1 - active_part) / 2)
+    high = np.minimum(high, pixel + (1 + active_part) / 2)
     share = np.maximum(high - low, 0) / extent
-    share[(pixel < 0) | (pixel >= geometry.pixels)] = 0
+    share[(pixel < 0) | (pixel >= geometry.frame_shape[axis])] = 0
     magnification, tangent = boxes.magnification[:, axis], boxes.tangent[:, axis]
     offset = ((low + high) / 2 - place) * pitch
     shadow = boxes.place[:, axis] + geometry.mask_distance * tangent + magnification * offset

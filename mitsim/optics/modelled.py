@@ -95,7 +95,7 @@ class ModelledCamera:
         return Placement(self.geometry.mask_distance)
 
     def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
-        """(pixels, n) left and right factor [sqrt(electrons / s)] of the mask at a ``placement``, but not turned."""
+        """(m, n) left and (m', n) right factor [sqrt(electrons / s)] of the mask at a ``placement``, but not turned."""
         left, right = self._kept(
             placement.moved({"gain": 1 - placement.gain, "mask_rotation": -placement.mask_rotation})
         )
@@ -127,9 +127,10 @@ class ModelledCamera:
     def _axis(self, distance: float, offset: float, directions: Directions) -> SeparableTerms:
         """The shadow of one axis, as its left and as its right factors."""
         update = {"mask_distance": distance, "mask_offset_row": offset, "mask_offset_column": offset}
-        camera, fall = self.geometry.model_copy(update=update), self._falloff(directions)
+        camera = self.geometry.model_copy(update=update)
+        of_rows, of_columns = (self._falloff(directions, axis) for axis in (0, 1))
         terms = shadow_terms(camera, directions, directions, camera.scene_distance, self.spectrum)
-        return [(left * fall, right * fall) for left, right in terms]
+        return [(left * of_rows, right * of_columns) for left, right in terms]
 
     def turned(self, placement: Placement) -> SeparableTerms:
         """What a rotation of the mask at a ``placement`` adds to the product of its factors, for each radian."""
@@ -151,17 +152,19 @@ class ModelledCamera:
             edges.append(np.linspace(middle - half, middle + half, self.n + 1))
         return Directions.cells(edges[0]), Directions.cells(edges[1])
 
-    def _falloff(self, directions: Directions) -> FloatArray:
-        """(pixels, n) part of the light that is left of a direction's at a pixel."""
-        depth, pixels = self.geometry.scene_distance, self.geometry.pixel_centres
+    def _falloff(self, directions: Directions, axis: int) -> FloatArray:
+        """(m, n) part of the light that is left of ``directions`` at a pixel, along an ``axis``."""
+        depth, pixels = self.geometry.scene_distance, self.geometry.centres(axis)
         squared = np.square(directions.centres - pixels[:, None] / depth)
         return np.asarray((1 + squared) ** -_ANGLE * self.geometry.angular_response(squared))
 
     def _crossings(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
-        """(pixels, n) mask coordinates, from its centre, of rays from pixels to directions, along rows and columns."""
+        """(m, n) and (m', n) mask coordinates, from its centre, of rays from pixels to directions, along both axes."""
         depth, distance = self.geometry.scene_distance, placement.mask_distance
         shifts = placement.mask_shift_row, placement.mask_shift_column
         return tuple(  # type: ignore[return-value]
-            (1 - distance / depth) * self.geometry.pixel_centres[:, None] + distance * each.centres - own - shift
-            for each, own, shift in zip(self._directions(placement), self.geometry.mask_offset, shifts, strict=True)
+            (1 - distance / depth) * self.geometry.centres(axis)[:, None] + distance * each.centres - own - shift
+            for axis, (each, own, shift) in enumerate(
+                zip(self._directions(placement), self.geometry.mask_offset, shifts, strict=True)
+            )
         )

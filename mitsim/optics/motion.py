@@ -65,8 +65,8 @@ def moving_terms(
     if not angle:
         return shaking(0.0)
     row, column = (
-        shadow.crossings(directions) - offset
-        for directions, offset in zip((rows, columns), geometry.mask_offset, strict=True)
+        shadow.along(axis).crossings(directions) - geometry.mask_offset[axis]
+        for axis, directions in enumerate((rows, columns))
     )
     reach = abs(angle) * max(float(np.abs(row).max()), float(np.abs(column).max()))
     nodes = np.linspace(-reach, reach, max(2, 1 + int(np.ceil(2 * reach / (NODE_UM / 1e3)))))

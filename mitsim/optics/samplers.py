@@ -81,7 +81,7 @@ def wave_samplers(
     if geometry.drawn(spectrum is not None):
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
-    reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + geometry.pixel_pitch
+    reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + max(geometry.pitches)
     terms: list[SeparableTerm] = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
 

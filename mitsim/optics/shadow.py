@@ -42,6 +42,8 @@ from mitsim.rig.plate import Plate
 SeparableTerms = list[tuple[FloatArray, FloatArray]]
 EVEN = ((0.0, 0.0), (0.0, 0.0))
 """The tilt of a mask that has none."""
+Places = tuple[tuple[int, ...], tuple[int, ...]]
+"""Rows and columns of a frame, increasing."""
 _WIDE = 32
 """Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel to 1e-11."""
 
@@ -91,7 +93,7 @@ class ShadowGeometry:
     pixel_centres_mm
         (m,) sensor coordinates.
     active_mm
-        side of a pixel's active square [mm]; the shadow is averaged over it.
+        length of a pixel's active part [mm]; the shadow is averaged over it.
     distance_mm, thickness_mm
         sensor to the mask's exit face, d, and the mask's thickness [mm].
     depth_mm
@@ -101,6 +103,8 @@ class ShadowGeometry:
     tilt
         along rows, and along columns, how its distance grows with the coordinate, and by how much it is greater at the
         mask's centre [mm].
+    columns_mm
+        the first two of columns, where they are not those of rows.
     """
 
     mask: Mask | Plate
@@ -111,12 +115,26 @@ class ShadowGeometry:
     depth_mm: float
     offset_mm: tuple[float, float] = (0.0, 0.0)
     tilt: tuple[tuple[float, float], tuple[float, float]] = EVEN
+    columns_mm: tuple[FloatArray, float] | None = None
 
     @classmethod
-    def of(cls, camera: CameraGeometry, depth_mm: float) -> ShadowGeometry:
-        """That of a ``camera`` toward points at ``depth_mm``."""
-        centres, side, mask = camera.pixel_centres, camera.active_side, camera.build_mask()
-        return cls(mask, centres, side, camera.mask_distance, camera.mask_thickness, depth_mm, camera.mask_offset)
+    def of(cls, camera: CameraGeometry, depth_mm: float, places: Places | None = None) -> ShadowGeometry:
+        """That of a camera toward points at one depth.
+
+        Parameters
+        ----------
+        camera, depth_mm
+            whose mask and frames, and how far off.
+        places
+            rows and columns that frames then consist of; None: all.
+        """
+        rows, columns = (camera.centres(axis) for axis in (0, 1))
+        if places is not None:
+            rows, columns = rows[np.asarray(places[0])], columns[np.asarray(places[1])]
+        row_side, column_side = camera.active_sides
+        beside = None if row_side == column_side and np.array_equal(rows, columns) else (columns, column_side)
+        distances = camera.mask_distance, camera.mask_thickness, depth_mm
+        return cls(camera.build_mask(), rows, row_side, *distances, camera.mask_offset, columns_mm=beside)
 
     def __post_init__(self) -> None:
         _require_beyond(self.depth_mm, self.distance_mm + self.thickness_mm)
@@ -135,15 +153,23 @@ class ShadowGeometry:
         """Half a cell of ``directions`` seen on the mask [mm]."""
         return self.distance_mm * directions.width / 2
 
+    def along(self, axis: int) -> ShadowGeometry:
+        """The same with the pixels of one ``axis``, 0 rows or 1 columns, for both."""
+        if self.columns_mm is None:
+            return self
+        if not axis:
+            return replace(self, columns_mm=None)
+        return replace(self, pixel_centres_mm=self.columns_mm[0], active_mm=self.columns_mm[1], columns_mm=None)
+
     def from_mask(self, directions: Directions, axis: int) -> tuple[ShadowGeometry, Directions]:
         """The same along one ``axis`` (0 rows, 1 columns), and its ``directions``, in coordinates of the mask's centre.
 
         In them the sensor is off the axis by as much the other way.
         """
-        offset, tilt = self.offset_mm[axis], (self.tilt[axis],) * 2
+        offset, tilt, own = self.offset_mm[axis], (self.tilt[axis],) * 2, self.along(axis)
         if not offset:
-            return (self if tilt == self.tilt else replace(self, tilt=tilt)), directions
-        moved = replace(self, pixel_centres_mm=self.pixel_centres_mm - offset, offset_mm=(0.0, 0.0), tilt=tilt)
+            return (own if tilt == own.tilt else replace(own, tilt=tilt)), directions
+        moved = replace(own, pixel_centres_mm=own.pixel_centres_mm - offset, offset_mm=(0.0, 0.0), tilt=tilt)
         return moved, Directions(directions.centres - offset / self.depth_mm, directions.width)
 
     def crossings(self, directions: Directions) -> FloatArray:
@@ -193,6 +219,7 @@ def both_axes(
     by_row, seen_rows = shadow.from_mask(rows, 0)
     left = axis(by_row, row_profiles, seen_rows)
     alike = rows == columns and all(first == second for first, second in (shadow.offset_mm, shadow.tilt))
+    alike = alike and shadow.columns_mm is None
     if alike and np.array_equal(row_profiles, column_profiles):
         return left, left
     by_column, seen_columns = shadow.from_mask(columns, 1)

@@ -23,7 +23,8 @@ some together. With <> the mean over pairs of points u, u', each weighed by B, a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 
@@ -125,9 +126,8 @@ def _space(rig: Rig, pixels_mm: tuple[float, float], lit: FloatArray, wavelength
     more light and of less.
     """
     camera, radius = rig.camera, (rig.projector.speckle or Coherence()).beam_radius_mm
-    width = camera.pixel_pitch * np.sqrt(camera.pixel_fill_factor)
 
-    def grains(distance: FloatArray) -> FloatArray:
+    def grains(distance: FloatArray, width: float) -> FloatArray:
         kernel = np.square(np.sinc(width * distance / (wavelength_mm * camera.scene_distance)))
         return np.asarray(kernel if radius is None else kernel * np.exp(-np.square(distance / radius)))
 
@@ -135,16 +135,17 @@ def _space(rig: Rig, pixels_mm: tuple[float, float], lit: FloatArray, wavelength
     spectrum = np.square(np.abs(np.fft.rfft2(lit, sizes)))
     apart = np.fft.irfft2(spectrum, sizes)  # light of pairs of pixels, by how many rows and columns they are apart
 
-    def mean(kernel: Kernel) -> float:
+    def mean(kernels: Iterable[Kernel]) -> float:
         total = 0.0
         for weight, seen in _pairs_seen(camera):
             rows, columns = (
-                _between_pixels((kernel, seen), size, side) for size, side in zip(pixels_mm, lit.shape, strict=True)
+                _between_pixels((kernel, seen), size, side)
+                for kernel, size, side in zip(kernels, pixels_mm, lit.shape, strict=True)
             )
             total += weight * float(rows @ apart @ columns)
         return total
 
-    return mean(grains) / mean(np.ones_like)
+    return mean([partial(grains, width=width) for width in camera.active_sides]) / mean([np.ones_like] * 2)
 
 
 def _between_pixels(kernels: tuple[Kernel, Kernel], size: float, count: int) -> FloatArray:

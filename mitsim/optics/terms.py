@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from mitsim.optics.diffraction import wave_terms
 from mitsim.optics.motion import moving_terms
 from mitsim.optics.raster import raster
-from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.optics.tilt import tilted_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
@@ -22,9 +19,9 @@ def shadow_terms(
     columns: Directions,
     depth: float,
     spectrum: Spectrum | None = None,
-    places: Sequence[int] | None = None,
+    places: Places | None = None,
 ) -> SeparableTerms:
-    """Shadow on each pixel of directions at one depth, as separable terms: [(left (m, r), right (m, c)), ...].
+    """Shadow on each pixel of directions at one depth, as separable terms: [(left (m, r), right (m', c)), ...].
 
     The mean over a pixel's active area times the fill factor: irradiance is per pixel area. All weights are folded
     into left. The angular response is not in here; it belongs to the light.
@@ -40,13 +37,11 @@ def shadow_terms(
     spectrum
         wave-optical with one: each wavelength has terms of its own, weighted by its share. None: geometric.
     places
-        (m,) pixels along an axis, increasing; None: all.
+        rows and columns of a frame, increasing; None: all.
     """
-    shadow, waves = ShadowGeometry.of(geometry, depth), spectrum is not None
+    shadow, waves = ShadowGeometry.of(geometry, depth, places), spectrum is not None
     if geometry.drawn(waves):
         shadow, spectrum = replace(shadow, mask=raster(geometry, depth, spectrum)), None
-    if places is not None:
-        shadow = replace(shadow, pixel_centres_mm=shadow.pixel_centres_mm[np.asarray(places)])
     if geometry.mask_motion is not None:
         others = rows, columns, depth, spectrum, places
         return moving_terms(geometry, shadow, rows, columns, lambda still: shadow_terms(still, *others))

@@ -52,8 +52,8 @@ def tilted_terms(
     """
     along, across = tilt
     by_row, by_column = (
-        shadow.crossings(directions) - offset
-        for directions, offset in zip((rows, columns), shadow.offset_mm, strict=True)
+        shadow.along(axis).crossings(directions) - shadow.offset_mm[axis]
+        for axis, directions in enumerate((rows, columns))
     )
     first, second = nodes_between(by_column, nodes[0]), nodes_between(by_row, nodes[1])
     # One look at both axes serves a node of each; the last of fewer nodes is looked at again.

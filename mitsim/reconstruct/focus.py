@@ -132,7 +132,7 @@ class FactorOfDepths:
             1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
         """
         rows, count = self.factor.shape
-        place = (np.arange(rows) - (rows - 1) / 2) * self.parallax.pixel_pitch_mm
+        place = (np.arange(rows) - (rows - 1) / 2) * self._pitch
         column = np.arange(count) + (self.edges - self._parallax_pixels[2] * place[:, None]) * shift
         shadows, known = self._seen(column, np.arange(count))
         return shadows, _whole(known)
@@ -171,7 +171,7 @@ class FactorOfDepths:
     def reach(self) -> float:
         """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees."""
         first, last, by_place = self._parallax_pixels
-        return float(max(abs(first), abs(last), by_place * len(self.factor) * self.parallax.pixel_pitch_mm / 2))
+        return float(max(abs(first), abs(last), by_place * len(self.factor) * self._pitch / 2))
 
     def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
         """How bright places at each ``column`` and between are, the mask's shadow apart; 1 in the window's middle."""
@@ -209,7 +209,11 @@ class FactorOfDepths:
         """Columns that one pixel's step along the sensor sees the mask's shadow move."""
         parallax = self.parallax
         inverse = 1 / parallax.mask_distance_mm - 1 / parallax.depth_mm
-        return parallax.pixel_pitch_mm * inverse * self._parallax_pixels[2]
+        return self._pitch * inverse * self._parallax_pixels[2]
+
+    @property
+    def _pitch(self) -> float:
+        return self.parallax.pitch_mm(self.axis)
 
 
 def _whole(known: npt.NDArray[np.bool_]) -> slice:

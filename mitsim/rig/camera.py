@@ -25,6 +25,8 @@ _NODES_PER_PIXEL = 14
 mrad at the paper's geometry (benchmarks/masks.py)."""
 _MOST_TILTED_TERMS = 64
 """Separable terms that a tilted mask is formed of: 0.8 GB at 512 pixels and as many cells a side."""
+_NOT_KNOWN_BEFORE = ("mask_offset", "mask_plate", "mask_motion", "mask_fft", "rows", "columns", "row_pitch", "roi")
+"""Beginnings of the names of fields that calibrations of 0.4 do not know."""
 
 
 class CameraGeometry(BaseModel):
@@ -34,10 +36,23 @@ class CameraGeometry(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
     )
 
-    pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side (square sensor)")
+    pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side, of a square sensor")
     """More than the largest square sensors, 10 560; a frame of it has 2 GiB."""
-    pixel_pitch: float = Field(0.01172, ge=1e-6, le=1e3, description="sensor pixel pitch [mm]")
+    rows: int | None = Field(None, ge=1, le=16384, description="rows of sensor pixels; none: `pixels`")
+    columns: int | None = Field(None, ge=1, le=16384, description="columns of sensor pixels; none: `pixels`")
+    pixel_pitch: float = Field(
+        0.01172, ge=1e-6, le=1e3, description="distance between columns of sensor pixels, and between rows [mm]"
+    )
     """A nanometre to a metre: shadows keep at least eight digits there (tests/hard/test_hard_shadows.py)."""
+    row_pitch: float | None = Field(
+        None,
+        ge=1e-6,
+        le=1e3,
+        description="distance between rows of pixels that are not square [mm]; none: `pixel_pitch`",
+    )
+    roi: tuple[int, int, int, int] | None = Field(
+        None, strict=False, description="region of interest: its first row and column, rows and columns; none: all"
+    )
     mask: CameraMask = Field("separable", description="mask construction; plate: what a camera file's [mask] gives")
     mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
     """The orders of :func:`mitsim.rig.mask.mls_code`: 3 to 65 535 features a side."""
@@ -57,7 +72,10 @@ class CameraGeometry(BaseModel):
     fov: float = Field(20.0, ge=1e-3, lt=180, description="full angle of the square field stop [degrees]")
     """3.6 seconds of arc, the width of a star's blur, to all that a plane can see."""
     pixel_fill_factor: float = Field(
-        1.0, ge=1e-4, le=1, description="part of a pixel that is active, a centred square; 1 is the whole pixel"
+        1.0,
+        ge=1e-4,
+        le=1,
+        description="part of a pixel that is active, in its middle and as high to wide as it; 1 is the whole pixel",
     )
     """Pixels with a counter each fill some 1e-2."""
     angular_exponent: float = Field(
@@ -81,6 +99,17 @@ class CameraGeometry(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _the_region_lies_on_the_sensor(self) -> CameraGeometry:
+        if self.roi is not None:
+            ends = [first + size for first, size in zip(self.roi[:2], self.roi[2:], strict=True)]
+            if min(self.roi[:2]) < 0 or min(self.roi[2:]) < 1 or ends[0] > self.shape[0] or ends[1] > self.shape[1]:
+                raise ValueError(
+                    f"roi {list(self.roi)}: {self.roi[2]} rows from {self.roi[0]} and {self.roi[3]} columns from "
+                    f"{self.roi[1]} are not on a sensor of {self.shape[0]} x {self.shape[1]} pixels"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _a_plate_is_there(self) -> CameraGeometry:
         if (self.mask == "plate") != (self.mask_plate is not None):
             raise ValueError("mask: got 'plate' without one; a camera file's table [mask] gives it, with --camera")
@@ -88,6 +117,12 @@ class CameraGeometry(BaseModel):
             raise ValueError(
                 f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms, or one "
                 f"that is blurred, dusty, turned or tilted ({self.mask_plate.words}), is thin, so set 0"
+            )
+        if self.pitches[0] != self.pitches[1] and self.drawn(waves=True):
+            raise ValueError(
+                f"row_pitch: got {self.pitches[0]:g} beside pixel_pitch {self.pitches[1]:g}; the shadow of "
+                f"{self.mask_words} is drawn on a raster of square cells, so give square pixels, or a mask of one or "
+                "two separable terms that is not turned"
             )
         return self
 
@@ -98,21 +133,48 @@ class CameraGeometry(BaseModel):
 
     @property
     def identity(self) -> dict[str, object]:
-        """What manifests say of it: all fields, but for an offset of 0 and no plate, which calibrations of 0.4 do not
-        know."""
-        known = {
-            name: value
-            for name, value in self
-            if value or not name.startswith(("mask_offset", "mask_plate", "mask_motion", "mask_fft"))
-        }
+        """What manifests say of it: all fields, but for those that calibrations of 0.4 do not know, where they are 0 or
+        none."""
+        known = {name: value for name, value in self if value or not name.startswith(_NOT_KNOWN_BEFORE)}
         if self.mask_motion is not None:
             known["mask_motion"] = self.mask_motion.model_dump()
         return known if self.mask_plate is None else {**known, "mask_plate": self.mask_plate.identity}
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the whole sensor."""
+        return self.rows or self.pixels, self.columns or self.pixels
+
+    @property
+    def pitches(self) -> tuple[float, float]:
+        """Distances between rows, and between columns [mm]."""
+        return self.row_pitch or self.pixel_pitch, self.pixel_pitch
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame: of the region of interest."""
+        return self.shape if self.roi is None else self.roi[2:]
+
+    @property
+    def axes_alike(self) -> bool:
+        """Whether a frame's columns lie as its rows do: of square pixels, as many and as far off the axis."""
+        return self.pitches[0] == self.pitches[1] and np.array_equal(self.centres(0), self.centres(1))
+
+    @property
+    def frame_side(self) -> float:
+        """Pixels a side of a square with as many as a frame; a whole number for square frames."""
+        return side_of(self.frame_shape)
+
+    @property
     def half_width(self) -> float:
-        """Half the sensor's side [mm]."""
-        return self.pixels * self.pixel_pitch / 2
+        """Half the sensor's longer side [mm]: light is followed to the square of that side."""
+        return max(self.half_sides)
+
+    @property
+    def half_sides(self) -> tuple[float, float]:
+        """Half the sensor's height, along rows' numbers, and half its width [mm]."""
+        (rows, columns), (row, column) = self.shape, self.pitches
+        return rows * row / 2, columns * column / 2
 
     @property
     def tan_half_fov(self) -> float:
@@ -125,14 +187,20 @@ class CameraGeometry(BaseModel):
 
     @property
     def pixel_edges(self) -> FloatArray:
-        """(pixels + 1,) pixel edges [mm]."""
-        return centred_edges(self.pixels, self.pixel_pitch)
+        """(pixels + 1,) edges of pixels along the sensor's longer side [mm]."""
+        return centred_edges(*max(zip(self.shape, self.pitches, strict=True), key=math.prod))
 
     @property
     def pixel_centres(self) -> FloatArray:
-        """(pixels,) centres [mm]."""
+        """(pixels,) centres along the sensor's longer side [mm]."""
         edges = self.pixel_edges
         return np.asarray((edges[:-1] + edges[1:]) / 2)
+
+    def centres(self, axis: int) -> FloatArray:
+        """(m,) centres of a frame's rows (``axis`` 0) or columns (1) [mm]."""
+        edges = centred_edges(self.shape[axis], self.pitches[axis])
+        centres = np.asarray((edges[:-1] + edges[1:]) / 2)
+        return centres if self.roi is None else centres[self.roi[axis] : self.roi[axis] + self.roi[axis + 2]]
 
     @property
     def mask_offset(self) -> tuple[float, float]:
@@ -152,7 +220,7 @@ class CameraGeometry(BaseModel):
         """How far from its centre a mask is seen [mm]."""
         seen = self.half_width + (self.mask_distance + self.mask_thickness) * self.tan_half_fov
         leaning = 1 + self.tan_half_fov * sum(map(abs, self.mask_tilt))
-        return (seen + self.pixel_pitch + max(map(abs, self.mask_offset))) * leaning
+        return (seen + max(self.pitches) + max(map(abs, self.mask_offset))) * leaning
 
     @property
     def centred(self) -> bool:
@@ -184,7 +252,7 @@ class CameraGeometry(BaseModel):
         would take too many terms."""
         if not any(self.mask_tilt) or self.drawn(waves):
             return None
-        farthest = self.tan_half_fov * self.mask_reach / self.pixel_pitch
+        farthest = self.tan_half_fov * self.mask_reach / min(self.pitches)
         by_column, by_row = (
             1 if not growth else 2 + math.ceil(_NODES_PER_PIXEL * farthest * abs(growth))
             for growth in self.mask_tilt[::-1]
@@ -219,9 +287,10 @@ class CameraGeometry(BaseModel):
 
     def may_be_drawn(self, waves: bool) -> bool:
         """Whether frames behind the mask, with ``waves`` or without, may as well be sums of terms as correlations with
-        a shadow on a raster: of a plate of more than two terms that is mounted straight, and at rest."""
+        a shadow on a raster: of a plate of more than two terms that is mounted straight, and at rest, over square
+        pixels."""
         mask = self.build_mask()
-        still = self.mask_motion is None and not any(self.mask_tilt)
+        still = self.mask_motion is None and not any(self.mask_tilt) and self.pitches[0] == self.pitches[1]
         return isinstance(mask, Plate) and still and not (waves or self.drawn(waves)) and mask.crosses is None
 
     def drawn(self, waves: bool) -> bool:
@@ -245,13 +314,19 @@ class CameraGeometry(BaseModel):
         return self.mask_thickness * self.tan_half_fov / self.mask_feature
 
     @property
-    def active_side(self) -> float:
-        """Side of a pixel's active square [mm]."""
-        return self.pixel_pitch * math.sqrt(self.pixel_fill_factor)
+    def active_sides(self) -> tuple[float, float]:
+        """A pixel's active part, along rows' and columns' numbers [mm]: a square in a square pixel."""
+        row, column = self.pitches
+        return row * math.sqrt(self.pixel_fill_factor), column * math.sqrt(self.pixel_fill_factor)
 
     def angular_response(self, squared_tan: FloatArray) -> FloatArray:
         """A pixel's response, relative to normal incidence, to rays of ``squared_tan``, tan^2(theta): cos^n(theta)."""
         return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
+
+
+def side_of(shape: tuple[int, int]) -> float:
+    """Pixels a side of a square with as many as a frame of ``shape``; a whole number for square frames."""
+    return shape[0] if shape[0] == shape[1] else math.sqrt(shape[0] * shape[1])
 
 
 def centred_edges(count: int, pitch: float) -> FloatArray:

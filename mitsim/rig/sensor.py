@@ -44,8 +44,14 @@ class SensorModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
     name: str = Field(description="what the sensor is called in reports")
-    pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="distance between centres of the square pixels, um")
+    pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="distance between centres of pixels in a row, um")
     """Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
+    row_pitch_um: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e4,
+        description="distance between rows of pixels that are not square, um; none: as above",
+    )
     binning: int = Field(default=1, ge=1, le=64, description="pixels summed along each side of a superpixel")
     """Cameras bin up to 16 x 16."""
     full_well_e: float = Field(ge=0.1, allow_inf_nan=True, description="electrons a pixel holds; inf = no limit")
@@ -308,13 +314,15 @@ class SensorModel(BaseModel):
 
     @property
     def superpixel_pitch_um(self) -> float:
-        """Distance between superpixel centres, um."""
+        """Distance between superpixel centres in a row, um."""
         return self.pixel_pitch_um * self.binning
 
     @property
     def superpixel_area_m2(self) -> float:
         """Light-collecting area, m^2 (the fill factor is part of the quantum efficiency)."""
-        return (self.superpixel_pitch_um * 1e-6) ** 2
+        if self.row_pitch_um is None:
+            return (self.superpixel_pitch_um * 1e-6) ** 2
+        return self.superpixel_pitch_um * self.row_pitch_um * self.binning * 1e-12
 
     @property
     def superpixel_full_well_e(self) -> float:

@@ -245,12 +245,14 @@ def _frames(shots: Capture, folder: Path, name: str) -> dict[str, Channel]:
 def _configuration(evidence: _Evidence) -> dict[str, object]:
     bench = evidence.light.bench
     geometry = bench.geometry
+    rows, columns = geometry.frame_shape
+    size = " x ".join(f"{pitch * 1e3:g}" for pitch in geometry.pitches[geometry.row_pitch is None :])
     return {
         "variant": bench.variant,
         "camera": bench.sensor.name,
         "projector": bench.projector.name,
         "parameters": ", ".join(f"{name} = {value}" for name, value in bench.defines.items()) or "the scene's own",
-        "sensor": f"{geometry.pixels} x {geometry.pixels} pixels of {geometry.pixel_pitch * 1e3:g} um",
+        "sensor": f"{rows} x {columns} pixels of {size} um",
         "mask": f"{geometry.mask_words}, {geometry.mask_feature * 1e3:g} um, "
         f"{geometry.mask_distance:g} mm from the sensor",
         "scene plane": f"{geometry.scene_distance:g} mm, {bench.n} x {bench.n} projector pixels",

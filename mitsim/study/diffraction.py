@@ -143,7 +143,7 @@ class DiffractionFindings:
         del profiles[LINE]
         off = next(row for row in self.shadows if (row.mask, row.light) == (MASKS[0], PROJECTOR))
         message = f"A point's shadow in the projector's light is {off.point_source:.0%} off the geometric one"
-        position = self.bench.geometry.pixel_centres
+        position = self.bench.geometry.centres(0)
         return {
             "quality.png": plots.quality_by_factors(quality, self.verdict),
             "shadow.png": plots.shadow_profiles(position, profiles, _PROFILE_MM, message),

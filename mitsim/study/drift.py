@@ -287,7 +287,7 @@ class DriftStand:
             return replace(
                 changed, added=lamps, added_gain=drift.lamp, added_flicker=drift.lamp_flicker, added_common=common
             )
-        return replace(changed, added=np.full((self.lit.bench.geometry.pixels,) * 2, self._offset(drift)))
+        return replace(changed, added=np.full(self.lit.bench.geometry.frame_shape, self._offset(drift)))
 
     @property
     def _leak(self) -> float:

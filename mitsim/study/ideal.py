@@ -176,7 +176,7 @@ def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
 
 
 def point_profiles(bench: Bench) -> dict[str, FloatArray]:
-    """(pixels,) shadow of a point on the axis of ``bench`` along one side of the sensor, through the separable mask, by
+    """(pixels,) shadow of a point on the axis of ``bench`` down the rows of the sensor, through the separable mask, by
     light."""
     camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
     return {

@@ -128,7 +128,7 @@ def _refine(
     """Beams of one chain inside squares of the lattice (first row and column, ``size``), and the flux not resolved."""
     parts: list[Beams] = []
     unresolved = 0.0
-    pitch = geometry.pixel_pitch
+    pitch = min(geometry.pitches)
     while len(row):
         half = size // 2
         nodes = _trace_squares(tracer, chain, row, column, half)
@@ -189,7 +189,7 @@ def _near(nodes: _Nodes, parent: _Nodes, geometry: CameraGeometry) -> Mask:
     sine = geometry.tan_half_fov / np.hypot(1, geometry.tan_half_fov)
     whole = nodes.valid.all(axis=(1, 2))
     near = nodes.valid.any(axis=(1, 2))
-    of_places = nodes.sensor, parent.sensor, geometry.half_width + geometry.pixel_pitch
+    of_places = nodes.sensor, parent.sensor, geometry.half_width + max(geometry.pitches)
     for values, above_values, reach in (of_places, (_sines(nodes), _sines(parent), sine + _MARGIN)):
         low, high = _box(nodes.valid, values)
         above = _size(*_box(parent.valid, above_values))

@@ -24,7 +24,9 @@ along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as
 ======================  ========  ==========  =================================================================
 parameter               unit      default     meaning
 ======================  ========  ==========  =================================================================
-``pixel_pitch``         mm        0.01172     pixel pitch; the film's size gives the number of pixels (square)
+``pixel_pitch``         mm        0.01172     pixel pitch; the film's size gives the number of pixels,
+                                              and its crop window a region of interest
+``row_pitch``           mm        -           distance between rows, where pixels are not square
 ``mask``                -         separable   ``separable``, ``flatcam`` or ``open``; a camera file may give others
 ``mask_order``          -         9           order of the maximum length sequence (2^order - 1 features a side)
 ``mask_feature``        mm        0.06        feature size
@@ -79,11 +81,15 @@ def register() -> None:
     register_once("sensor", PLUGIN, _sensor_class)
 
 
-def _geometry(props: mi.Properties, size: mi.ScalarVector2u) -> CameraGeometry:
-    values = {name: props[name] for name in CameraGeometry.model_fields if name != "pixels" and name in props}
-    if size[0] != size[1]:
-        raise MitsimError(f"{PLUGIN}: film is {size[0]}x{size[1]} pixels; the sensor must be square")
-    return CameraGeometry.checked(PLUGIN, pixels=int(size[0]), **values)
+def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
+    of_film = ("pixels", "rows", "columns", "roi")
+    values = {name: props[name] for name in CameraGeometry.model_fields if name not in of_film and name in props}
+    (columns, rows), first, shown = ([*map(int, part)] for part in (film.size(), film.crop_offset(), film.crop_size()))
+    if rows != columns:
+        values |= {"rows": rows, "columns": columns}
+    if shown != [columns, rows]:
+        values["roi"] = first[1], first[0], shown[1], shown[0]
+    return CameraGeometry.checked(PLUGIN, pixels=max(rows, columns), **values)
 
 
 def _check_rigid(transform: mi.AffineTransform4f) -> None:
@@ -107,11 +113,9 @@ def _sensor_class() -> type:
                 raise MitsimError(
                     f"{PLUGIN}: the film's filter spreads light between pixels; use <rfilter type='box'/>"
                 )
-            if list(self.film().crop_size()) != list(self.film().size()):
-                raise MitsimError(f"{PLUGIN}: the film is cropped; the whole sensor is simulated, remove the crop")
             _check_rigid(self.world_transform())
             self._points: tuple[int, int] | None = None
-            self.wear(_geometry(props, self.film().size()))
+            self.wear(_geometry(props, self.film()))
 
         def wear(self, geometry: CameraGeometry) -> None:
             """Take the camera of a ``geometry``, which has the mask of a camera file."""
@@ -147,7 +151,8 @@ def _sensor_class() -> type:
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             if self._points:
                 sample2, sample3 = self._stratified(sample2, *self._points)
-            u = (1 - 2 * self._active(sample2)) * geometry.half_width
+            height, width = geometry.half_sides
+            u = (1 - 2 * self._active(self._on_sensor(sample2))) * mi.Point2f(width, height)
             t, weight = self._direction(u, sample3)
             squared = 1 + dr.squared_norm(t)
             if self._whole:
@@ -174,20 +179,31 @@ def _sensor_class() -> type:
 
         def _stratified(self, film: mi.Point2f, seed: int, paths: int) -> tuple[mi.Point2f, mi.Point2f]:
             """Even points in the pixels of ``film`` points (0..1), and of the unit square; in the order of lanes."""
-            place = dr.minimum(dr.floor(film * self.geometry.pixels), self.geometry.pixels - 1)
-            pixel = mi.UInt32(place.y) * self.geometry.pixels + mi.UInt32(place.x)
+            rows, columns = self.geometry.frame_shape
+            count = mi.Point2f(columns, rows)
+            place = dr.minimum(dr.floor(film * count), count - 1)
+            pixel = mi.UInt32(place.y) * columns + mi.UInt32(place.x)
             rng = generator(dr.opaque(mi.UInt32, seed), pixel)
             index = dr.arange(mi.UInt32, dr.width(film)) % dr.opaque(mi.UInt32, paths)
-            film = (place + stratified(index, rng)) / self.geometry.pixels
+            film = (place + stratified(index, rng)) / count
             return film, stratified(shuffled(index, rng), rng)
+
+        def _on_sensor(self, film: mi.Point2f) -> mi.Point2f:
+            """Points (0..1) of the region of interest, which the film shows, on the whole sensor (0..1)."""
+            geometry, roi = self.geometry, self.geometry.roi
+            if roi is None:
+                return film
+            first, shown, whole = (mi.Point2f(part[1], part[0]) for part in (roi[:2], roi[2:], geometry.shape))
+            return (first + film * shown) / whole
 
         def _active(self, sample: mi.Point2f) -> mi.Point2f:
             """Film points (0..1) drawn together into the active square of their pixels."""
             geometry = self.geometry
             if geometry.pixel_fill_factor == 1:
                 return sample
-            middle = (dr.floor(sample * geometry.pixels) + 0.5) / geometry.pixels
-            return middle + (sample - middle) * (geometry.active_side / geometry.pixel_pitch)
+            count = mi.Point2f(geometry.shape[1], geometry.shape[0])
+            middle = (dr.floor(sample * count) + 0.5) / count
+            return middle + (sample - middle) * (geometry.active_sides[1] / geometry.pixel_pitch)
 
         def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
             """Tan-angles t from sensor points u [mm] to open places of the mask, and the part of all that is open."""

@@ -92,7 +92,7 @@ def reference_of(bench: Bench, spp: int, shown: np.ndarray) -> tuple[np.ndarray,
     """Mean over passes and its variance, while the projector shows ``shown`` (n, n)."""
     import mitsuba as mi
 
-    total = np.zeros((bench.geometry.pixels,) * 2)
+    total = np.zeros(bench.geometry.frame_shape)
     square = total.copy()
     with projected(bench, shown):
         for seed in range(PASSES):
@@ -143,15 +143,21 @@ def probes(factored: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def z_of_whole(pair: Pair, frame: np.ndarray) -> dict[str, float]:
+    """z of the sums over all pixels of the factored ``frame``."""
+    found = {}
+    for name, weight in probes(frame).items():
+        own = np.var(np.tensordot(pair.groups, weight, axes=2), ddof=1) / len(pair.groups)
+        spread = (np.square(weight) * pair.variance).sum() + own
+        found[name] = float((weight * (pair.reference - frame)).sum() / np.sqrt(spread))
+    return found
+
+
 def z_scores(pair: Pair, factored: np.ndarray | None = None) -> dict[str, float]:
     """z of every sum; ``factored`` stands in for the frame under test (mutations)."""
     frame = pair.factored if factored is None else factored
     count = len(pair.groups)
-    found = {}
-    for name, weight in probes(frame).items():
-        own = np.var(np.tensordot(pair.groups, weight, axes=2), ddof=1) / count
-        spread = (np.square(weight) * pair.variance).sum() + own
-        found[name] = float((weight * (pair.reference - frame)).sum() / np.sqrt(spread))
+    found = z_of_whole(pair, frame)
     side = frame.shape[0] // BLOCK
 
     def blocks(values: np.ndarray) -> np.ndarray:

@@ -110,7 +110,7 @@ class Look:
         own = integer(seed, "pilot", "sharp")
         apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
         self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
-        self.samples = dict.fromkeys(STAGES, Sample.of(lighting, bench.geometry.pixels, bench.loaded.mirrors))
+        self.samples = dict.fromkeys(STAGES, Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors))
         self.occluded: OccludedLight | None = None
         for stage in STAGES:
             self._measure(stage)

@@ -170,7 +170,7 @@ class FineLight:
         geometry = self.bench.geometry
         waves = self.bench.spectrum if geometry.diffracts else None
         return Forming(
-            pixels=geometry.pixels,
+            pixels=geometry.frame_side,
             cells=cells,
             lit=self._lit(simulation, light) / cells,
             terms=float(len(self.bench.spectrum.weights) * geometry.mask_terms),

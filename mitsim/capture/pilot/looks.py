@@ -20,6 +20,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.optics.closed_form import Entries
+from mitsim.optics.shadow import Places
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.histogram import Deposits
 
@@ -73,35 +74,39 @@ def known(method: _Method) -> _Method:
 
 @dataclass(frozen=True)
 class Sample:
-    """The shots that the pilot looks at, the rows and columns of pixels (the same ones), and how many samples it takes.
+    """The shots that the pilot looks at, the rows and columns of pixels, and how many samples it takes.
 
     ``effort`` multiplies the samples of the first, shortest look.
     """
 
     lighting: Lighting
-    places: tuple[int, ...]
+    places: Places
     effort: int = 1
 
     @classmethod
-    def of(cls, lighting: Lighting, pixels: int, mirrors: bool) -> Sample:
+    def of(cls, lighting: Lighting, shape: tuple[int, int], mirrors: bool) -> Sample:
         """A few shots of a family, and rows and columns of the sensor, evenly spread.
 
         Parameters
         ----------
         lighting
             the family.
-        pixels
-            of the sensor, a side.
+        shape
+            rows and columns of a frame.
         mirrors
             whether a shot's light may be that of few of the pixels that it shows, in a mirror.
         """
-        shots, count = len(lighting.weights), min(pixels, _PLACES)
-        places = (np.arange(count) + (np.arange(count) * _GOLDEN) % 1) * pixels / count
+        shots = len(lighting.weights)
         lit = np.bincount(lighting.labels, minlength=lighting.weights.shape[1]) @ (lighting.weights[0] != 0)
         few = _MOST_SHOTS if mirrors else _SHOWN // max(int(lit), 1)
         wanted = min(max(_SHOTS, few), _MOST_SHOTS, shots)
         chosen = np.unique(np.linspace(0, shots - 1, wanted).astype(int))
-        return cls(lighting.shots(chosen), tuple(places.astype(int).tolist()))
+        return cls(lighting.shots(chosen), (_spread(shape[0]), _spread(shape[1])))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns that are looked at."""
+        return len(self.places[0]), len(self.places[1])
 
     @property
     def rows(self) -> Labels:
@@ -164,7 +169,7 @@ class Sample:
         emitted: FloatArray | None = None,
         known: Known | None = None,
     ) -> FloatArray:
-        """(looks, shots, places, places) frames of light in each look, nothing set to zero that came out below it.
+        """(looks, shots, rows, columns) frames of light in each look, nothing set to zero that came out below it.
 
         A shot's pattern and what all pixels emit at least make a frame each.
 
@@ -203,8 +208,8 @@ class Sample:
         return self._lit(tray, looks, pattern, known) / samples
 
     def _lit(self, tray: Tray, looks: Sequence[Deposits], patterns: FloatArray, known: Known | None) -> FloatArray:
-        """(looks, rows, places, places) frames of classes that are lit in ``patterns`` (rows, classes), where lamps are
-        the last class; else as for :meth:`frames`."""
+        """(looks, patterns, rows, columns) frames of classes that are lit in ``patterns`` (patterns, classes), where
+        lamps are the last class; else as for :meth:`frames`."""
         known = {} if known is None else known
         classes = self.lighting.weights.shape[1]
         patterns = np.pad(patterns, ((0, 0), (0, classes + 1 - patterns.shape[1])))
@@ -216,7 +221,7 @@ class Sample:
         optics = tray.optics if any(len(place) for place, *_ in entries) else None
 
         def form(row: int) -> None:
-            frames = np.zeros((len(looks), len(self.places), len(self.places)))
+            frames = np.zeros((len(looks), *self.shape))
             if optics:
                 share = patterns[row][classes_of]
                 seen = optics.probe([gathered(place, value * share[pixel], size) for place, value, pixel in entries])
@@ -226,6 +231,13 @@ class Sample:
 
         in_threads(form, missing)
         return np.stack([known[key][1] for key in keys], axis=1)
+
+
+def _spread(count: int) -> tuple[int, ...]:
+    """Some of so many rows or columns, evenly spread."""
+    some = min(count, _PLACES)
+    places = (np.arange(some) + (np.arange(some) * _GOLDEN) % 1) * count / some
+    return tuple(places.astype(int).tolist())
 
 
 def ladder(

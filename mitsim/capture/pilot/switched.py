@@ -218,8 +218,7 @@ class SwitchedEffects:
         parts.append((simulation.sharp, sharp, sample.sharp(simulation)))
         if physics.interreflection:
             parts.append((simulation.smooth, followed.get("indirect", ()), few))
-        side = len(sample.places)
-        frames = np.zeros((LOOKS, len(light), side, side))
+        frames = np.zeros((LOOKS, len(light), *sample.shape))
         for tray, looks, count in parts:
             if any(look.value.size for look in looks):
                 frames += sample.frames(tray, looks, count, light, known)

@@ -101,7 +101,7 @@ LIMITS = {
     "max_depth": Range(-1, 10000),
     "rr_depth": Range(1, 10000),
     # Below a wavelength of light, and too near for a camera whose mask lies in front of it: lengths given in metres.
-    **dict.fromkeys(("pixel_pitch", "mask_feature"), Range(1e-4, FARTHEST, hint=_METRES)),
+    **dict.fromkeys(("pixel_pitch", "row_pitch", "mask_feature"), Range(1e-4, FARTHEST, hint=_METRES)),
     "scene_distance": Range(1, FARTHEST, hint=_METRES),
 }
 """What a number may be, by the name of the parameter, whatever plugin has it; those of the camera it checks itself."""

@@ -42,7 +42,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
     # With fewer data than unknowns noise cannot be told, nor lambda chosen by it.
     image = Image.of(frames, frames.seconds(EQUAL_PEAK), "best", binning)
-    pixels = frames.lit.bench.geometry.pixels // binning
+    pixels = frames.lit.bench.geometry.frame_shape[0] // binning
     return found(point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
 
 

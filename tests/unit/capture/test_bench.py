@@ -55,6 +55,18 @@ def test_parallax_tells_the_window_at_any_depth(small_scene: Callable[..., Path]
     assert columns == pytest.approx(np.add(parallax.column_tan, np.multiply(parallax.column_mm, shift)), abs=1e-6)
 
 
+def test_parallax_of_a_region_is_seen_from_its_middle(small_scene: Callable[..., Path]) -> None:
+    """Which lies 7 rows above and 8 columns beyond the axis. (Planted: seen from the axis.)"""
+    bench = open_bench(small_scene())
+    camera = bench.geometry.model_copy(update={"roi": (10, 20, 30, 40)})
+    parallax = replace(bench, rig=replace(bench.rig, camera=camera)).parallax
+    shift = 1 / 330 - 1 / parallax.depth_mm
+    seen = (parallax.row_tan, parallax.row_mm), (parallax.column_tan, parallax.column_mm)
+    for (tangents, edges), pixels, window in zip(seen, (-7, 8), bench.windows_at(330.0), strict=True):
+        expected = np.array(window) - pixels * 0.01172 / 330
+        assert np.add(tangents, np.multiply(edges, shift)) == pytest.approx(expected, abs=1e-6)
+
+
 @pytest.mark.parametrize("rig", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
 def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[..., Path], rig: str | None) -> None:
     """Its light is that of a sheet of that reflectance on the aligned plane, even where the scene has none."""

@@ -170,6 +170,24 @@ def test_a_turned_mask_casts_the_shadow_that_rays_through_it_make() -> None:
     assert np.linalg.norm(said - change) < 0.7 * np.linalg.norm(change)
 
 
+@pytest.mark.parametrize("spectrum", [None, LINE])
+def test_the_model_of_a_part_of_a_sensor_is_the_models_part(spectrum: Spectrum | None) -> None:
+    """Of what factors make of a region; and to 3 % of its turn, whose derivatives hold how the factors' norms change.
+    (Planted: the falloff of rows for columns; mask coordinates of rows for columns.)"""
+    whole, placement = camera(spectrum), Placement(2.01, 0.02, -0.03)
+    geometry = whole.geometry.model_copy(update={"rows": 80, "columns": 96, "roi": (12, 30, 50, 61)})
+    part = replace(whole, geometry=geometry)
+
+    def operators(model: ModelledCamera) -> list[FloatArray]:
+        products = [model.factors(placement)], model.turned(placement)
+        return [np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in terms)) for terms in products]
+
+    for found, every, most in zip(operators(part), operators(whole), (1e-9, 0.03), strict=True):
+        expected = every[20:70, :, 30:91]
+        print(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+        assert np.linalg.norm(found - expected) < most * np.linalg.norm(expected)
+
+
 def test_frames_are_chosen_from_coarse_to_fine_and_counted() -> None:
     changes = [0, 5, 1, 3]
     assert Modelling("wave", 2).chosen(changes, True, 1) == [("horizontal", 0)]

@@ -248,11 +248,13 @@ def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
 
 @pytest.mark.slow
 def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the sample's pixels, from the same paths, with lamps and black pixels that leak. (Planted: lamps' light lost,
-    the least light of a shot left out.)"""
+    """At the sample's pixels, other rows than columns, from the same paths, with lamps and black pixels that leak.
+    (Planted: lamps' light lost, the least light of a shot left out, places of rows for columns.)"""
     monkeypatch.setattr(looks, "_PLACES", 5)
     lighting = parse_patterns("dots:4", N).lighting
-    sample = looks.Sample.of(lighting, bench.geometry.pixels, bench.loaded.mirrors)
+    sample = looks.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    rows, columns = sample.places
+    sample = replace(sample, places=(rows, tuple(place + 1 for place in columns[:-1])))
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     found = SwitchedEffects(bench, everything, sample, 5)
     made = Simulation(bench, everything)
@@ -261,9 +263,9 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
         + made.file_followed(Deposits.joined(list(followed)), lighting.labels, sample.followed)
         for direct, *followed in zip(found.direct, *found.followed.values(), strict=True)
     ]
-    assert made.physics.lamps and made.physics.black_level and len(sample.places) == 5 < bench.geometry.pixels
+    assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
     formed = [made.expected([light], sample.rows, sample.lighting, 0) for light in filed]
-    expected = np.array([[frame.irradiance[np.ix_(sample.places, sample.places)] for frame in one] for one in formed])
+    expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 
 

@@ -78,7 +78,10 @@ def lit_session(
 ) -> LitSession:
     recipe = load_recipe().model_copy(update={"signed_capture": mode, **recipe_fields})
     bench = SimpleNamespace(
-        n=n, rig=rig, sensor=rig.sensor, geometry=SimpleNamespace(centred=mask == "flatcam", pixels=PIXELS)
+        n=n,
+        rig=rig,
+        sensor=rig.sensor,
+        geometry=SimpleNamespace(centred=mask == "flatcam", frame_shape=(PIXELS, PIXELS + 3)),
     )
     light = ToyLight(n)
     white = light.frames(Lighting.uniform(n), 0)[0]
@@ -308,7 +311,7 @@ RATES = [np.array([[value, 7.0]]) for value in (100.0, 60.0, 30.0, 90.0)]
 
 def played(pairs: bool, monkeypatch: pytest.MonkeyPatch) -> LitSession:
     """A session whose noisy frames are given, the uniform one first where it has one; digital numbers are rates."""
-    lit = LitSession(SimpleNamespace(pairs=pairs), None, Frame(np.ones((1, 2)), 0, 0, 0), 1.0, 0.0)  # type: ignore[arg-type]
+    lit = LitSession(SimpleNamespace(pairs=pairs, filters=None), None, Frame(np.ones((1, 2)), 0, 0, 0), 1.0, 0.0)  # type: ignore[arg-type]
     monkeypatch.setattr(LitSession, "_both", np.ones((1, 2)))
     monkeypatch.setattr(LitSession, "_exposers", (SimpleNamespace(rate=lambda digital: digital),))
     monkeypatch.setattr(LitSession, "_dark", None)

@@ -28,7 +28,13 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def board(n: int, pixels: int, mask: str = "separable") -> Any:
     geometry, spectrum = (
-        SimpleNamespace(pixels=pixels, mask_terms=1 + (mask == "flatcam"), diffracts=True, drawn=lambda waves: False),
+        SimpleNamespace(
+            frame_side=pixels,
+            frame_shape=(pixels, pixels),
+            mask_terms=1 + (mask == "flatcam"),
+            diffracts=True,
+            drawn=lambda waves: False,
+        ),
         SimpleNamespace(weights=(0.5, 0.3, 0.2)),
     )
     return SimpleNamespace(n=n, geometry=geometry, spectrum=spectrum)

@@ -10,7 +10,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import Frame
 from mitsim.rig.patterns import Lighting, hadamard_matrix
 
-N, PIXELS = 12, 20
+N, ROWS, COLUMNS = 12, 20, 23
 
 
 class ToyLight:
@@ -18,7 +18,7 @@ class ToyLight:
 
     def __init__(self, removed: float = 0.0) -> None:
         rng = np.random.default_rng(1)
-        self.left, self.right, self.removed = rng.random((PIXELS, N)), rng.random((PIXELS, N)), removed
+        self.left, self.right, self.removed = rng.random((ROWS, N)), rng.random((COLUMNS, N)), removed
         self.formed = 0
 
     def frames(self, lighting: Lighting, _: int, leaking: bool = True) -> list[Frame]:
@@ -33,7 +33,7 @@ class ToyLight:
 
 def found(light: ToyLight, first: int = 1) -> dict[int, FloatArray]:
     lighting = Lighting(np.repeat(np.arange(N), N), (1.0 + hadamard_matrix(N).T) / 2)
-    numbered = dict(stripes.stripe_frames(light, lighting, 0, PIXELS, first))  # type: ignore[arg-type]
+    numbered = dict(stripes.stripe_frames(light, lighting, 0, (ROWS, COLUMNS), first))  # type: ignore[arg-type]
     assert all(frame.variance == frame.removed == frame.heaviest == 0 for frame in numbered.values())
     return {number: frame.irradiance for number, frame in numbered.items()}
 
@@ -50,7 +50,7 @@ def many_lines(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("first", [1, 6, 11])
 def test_lines_are_mixed_into_the_frames_of_patterns(first: int) -> None:
     """Each line is formed once, and what is mixed has the same bits wherever one goes on. (Planted: the last part of
-    pixels left as it was, the weights of the first lot for all.)"""
+    pixels left as it was, the weights of the first lot for all, rows for columns.)"""
     light = ToyLight()
     mixed = found(light, first)
     assert light.formed == N and list(mixed) == list(range(first, N))

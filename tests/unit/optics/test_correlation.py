@@ -25,8 +25,12 @@ BARE = CameraGeometry(
 ROWS, COLUMNS = Directions.cells(np.linspace(-0.06, 0.07, 10)), Directions.cells(np.linspace(-0.05, 0.07, 12))
 
 
-def turned(**flaws: float) -> CameraGeometry:
-    return MaskProfile(kind="separable", feature_mm=0.06, order=6, rotation_deg=2.0, **flaws).worn(BARE, Path())
+PART = BARE.model_copy(update={"rows": 20, "columns": 12, "roi": (3, 1, 8, 10)})
+"""A region of interest of a sensor that is not square, off its middle."""
+
+
+def turned(bare: CameraGeometry = BARE, **flaws: float) -> CameraGeometry:
+    return MaskProfile(kind="separable", feature_mm=0.06, order=6, rotation_deg=2.0, **flaws).worn(bare, Path())
 
 
 def summed(camera: CameraGeometry, depth: float, light: np.ndarray) -> np.ndarray:
@@ -42,11 +46,11 @@ def summed(camera: CameraGeometry, depth: float, light: np.ndarray) -> np.ndarra
     )
 
 
-@pytest.mark.parametrize("flaws", [{}, {"edge_blur_um": 3.0}])
-def test_a_correlation_is_the_sum_of_all_terms(flaws: dict[str, float]) -> None:
+@pytest.mark.parametrize(("bare", "flaws"), [(BARE, {}), (BARE, {"edge_blur_um": 3.0}), (PART, {})])
+def test_a_correlation_is_the_sum_of_all_terms(bare: CameraGeometry, flaws: dict[str, float]) -> None:
     """Off the axis, with a part of each pixel active, blurred. (Planted: a phase's index swapped; X not conjugated; one
-    raster cell off.)"""
-    camera, light = turned(**flaws), np.random.default_rng(0).random((9, 11))
+    raster cell off; rows' pixels for columns'.)"""
+    camera, light = turned(bare, **flaws), np.random.default_rng(0).random((9, 11))
     expected = summed(camera, 300.0, light)
     optics = FrameOptics(camera, ROWS, COLUMNS, (300.0,), 1)
     frame = optics.frame(np.arange(99), light.ravel())
@@ -54,26 +58,28 @@ def test_a_correlation_is_the_sum_of_all_terms(flaws: dict[str, float]) -> None:
     assert expected.std() > 0.1 * expected.mean()
 
 
-def test_anchors_layers_and_places_are_those_of_separable_frames() -> None:
-    """(Planted: weights of rows for columns; the second layer left out.)"""
-    camera, random = turned(), np.random.default_rng(1)
-    places = tuple(range(1, 12, 3))
+@pytest.mark.parametrize("bare", [BARE, PART])
+def test_anchors_layers_and_places_are_those_of_separable_frames(bare: CameraGeometry) -> None:
+    """(Planted: weights of rows for columns; places of rows for columns; the second layer left out.)"""
+    camera, random = turned(bare), np.random.default_rng(1)
+    places = (1, 4, 7), (0, 2, 5, 8)
     optics = FrameOptics(camera, ROWS, COLUMNS, (300.0, 200.0), 2, places=places)
     light = random.random((2, 2, 9, 2, 11)) * (random.random((2, 2, 9, 2, 11)) < 0.3)
-    weights = anchor_weights(anchor_positions(2, camera.half_width), camera.pixel_centres)
-    expected = np.zeros((12, 12))
+    positions = anchor_positions(2, camera.half_width)
+    by_row, by_column = (anchor_weights(positions, camera.centres(axis)) for axis in (0, 1))
+    expected = np.zeros(camera.frame_shape)
     for depth, of_layer in zip((300.0, 200.0), light, strict=True):
         for row in range(2):
             for column in range(2):
                 seen = summed(camera, depth, of_layer[row, :, column])
-                expected += weights[:, row, None] * seen * weights[:, column]
+                expected += by_row[:, row, None] * seen * by_column[:, column]
     flat = np.flatnonzero(light)
     frame = optics.frame(flat, light.ravel()[flat])
-    np.testing.assert_allclose(frame, expected[np.ix_(places, places)], rtol=0, atol=1e-11 * expected.mean())
-    vectors = random.random((len(places), 3))
+    np.testing.assert_allclose(frame, expected[np.ix_(*places)], rtol=0, atol=1e-11 * expected.mean())
+    vectors = random.random((4, 3))
     estimates = [(flat, light.ravel()[flat]), (flat[::2], light.ravel()[flat[::2]])]
     seen = optics.probe(estimates, vectors)
-    assert seen.shape == (len(places), 6)
+    assert seen.shape == (3, 6)
     np.testing.assert_allclose(seen[:, :3], frame @ vectors, rtol=1e-10)
     both, _ = optics.seen(estimates, None)
     half = optics.frame(*estimates[1])

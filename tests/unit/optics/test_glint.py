@@ -54,6 +54,20 @@ def test_a_beam_aligned_with_the_pixels_covers_parts_of_them_exactly() -> None:
     assert np.allclose(frame, 2.0 / area * np.outer(*cover), rtol=0, atol=1e-9 * 2.0 / area)
 
 
+def test_a_part_of_a_sensor_and_tall_pixels_see_what_the_sensor_does() -> None:
+    """Rows 3 to 12 of 14, columns 2 to 10 of 16, behind a mask; without one pixels of two rows. (Planted: the region's
+    first row left out; rows' number or height as columns'.)"""
+    lit = beams(turned(0.3, 0.5))
+
+    def frame(camera: CameraGeometry) -> np.ndarray:
+        return glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
+
+    whole, part = geometry("separable"), geometry("separable", rows=14, columns=16, roi=(3, 2, 10, 9))
+    np.testing.assert_allclose(frame(part), frame(whole)[4:14, 2:11], rtol=0, atol=1e-9)
+    every, tall = frame(geometry()), frame(geometry(rows=6, columns=16, row_pitch=2 * PITCH))
+    np.testing.assert_allclose(tall, (every[2:14:2] + every[3:14:2]) / 2, rtol=0, atol=1e-9)
+
+
 def test_a_turned_beam_lights_its_inside_evenly() -> None:
     frame = glint_frames(beams(turned(0.3, 0.5)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
     assert frame[6:10, 6:10] == pytest.approx(2.0 / 0.25, rel=2e-3)

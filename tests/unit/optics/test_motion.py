@@ -59,15 +59,22 @@ def test_a_turned_mask_is_the_mask_at_turned_coordinates() -> None:
     assert np.linalg.norm(expected) > 0.005
 
 
+def test_a_turned_mask_on_a_region_casts_that_part_of_its_shadow() -> None:
+    """All rows, which reach farthest and so have the whole sensor's nodes. (Planted: rows' pixels for columns'.)"""
+    part = CAMERA.model_copy(update={"roi": (0, 5, 24, 12), "mask_motion": MaskMotion(rotation_mrad=2.0)})
+    found, whole = (operator(shadow_terms(each, ROWS, COLUMNS, DEPTH)) for each in (part, moving(rotation_mrad=2.0)))
+    np.testing.assert_allclose(found, whole[:, :, 5:17], rtol=0, atol=1e-12)
+
+
 def test_fine_nodes_are_as_good_as_finer_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     """The anchor's pixels of 11.7 um: hats 0.5 um apart leave 1 % of what turning by 1 mrad changes, against a tenth of
     that spacing. (Planted: 5 um apart, 17 %.)"""
     small = CameraGeometry(pixels=512).model_copy(update={"mask_motion": MaskMotion(rotation_mrad=1.0)})
     cell, few = Directions.cells(np.array([0.05, 0.0523])), (3, 4, 5, 250, 508, 509)
-    shadow = [operator(shadow_terms(small, cell, cell, DEPTH, places=few))]
+    shadow = [operator(shadow_terms(small, cell, cell, DEPTH, places=(few, few)))]
     monkeypatch.setattr("mitsim.optics.motion.NODE_UM", 0.05)
-    shadow.append(operator(shadow_terms(small, cell, cell, DEPTH, places=few)))
-    still = operator(shadow_terms(small.model_copy(update={"mask_motion": None}), cell, cell, DEPTH, places=few))
+    shadow.append(operator(shadow_terms(small, cell, cell, DEPTH, places=(few, few))))
+    still = operator(shadow_terms(small.model_copy(update={"mask_motion": None}), cell, cell, DEPTH, places=(few, few)))
     assert np.linalg.norm(shadow[0] - shadow[1]) < 0.01 * np.linalg.norm(shadow[1] - still)
 
 

@@ -1,5 +1,7 @@
 """Computed speckle contrast against fields of a rough surface that are added up, point by point and beam by beam."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import ndtri
@@ -133,3 +135,18 @@ def test_lines_are_as_coherent_as_the_surface_is_smooth(roughness_um: float, lin
 def test_no_light_has_no_speckle() -> None:
     with pytest.raises(MitsimError, match="no projector pixel is lit"):
         contrast_of(rig(), (SIDE, SIDE), np.zeros((N, N)))
+
+
+def test_pixels_that_are_tall_leave_what_wide_ones_leave_of_turned_light() -> None:
+    """And other than square ones do. (Planted: a pixel's width for its height.)"""
+    lit = np.random.default_rng(2).random((4, 6))
+    tall, wide, square = (
+        contrast_of(replace(made, camera=made.camera.model_copy(update=update)), (SIDE, SIDE), light)
+        for made in (rig("separable"),)
+        for update, light in (
+            ({"row_pitch": 2 * PITCH}, lit),
+            ({"pixel_pitch": 2 * PITCH, "row_pitch": PITCH}, lit.T),
+            ({}, lit),
+        )
+    )
+    assert tall == pytest.approx(wide, rel=1e-9) and tall < 0.9 * square

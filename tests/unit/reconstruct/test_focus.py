@@ -83,6 +83,23 @@ def test_moved_columns_are_those_of_the_depth(depth: float, axis: int) -> None:
     assert 0 < PIXELS - (known.stop - known.start) <= 5
 
 
+@pytest.mark.parametrize("depth", [360.0, 440.0])
+def test_columns_of_a_region_of_tall_pixels_are_those_of_the_depth(depth: float) -> None:
+    """As above; 120 pixels of 1.5 pitches, 0.9 mm off the axis, from which all parallax is 0.9 mm less. (Planted: the
+    pixels' width for their height.)"""
+    middle, tall = 0.9, 1.5 * PITCH
+
+    def region(depth: float) -> np.ndarray:
+        edges = depth * (centred_edges(FINE, WINDOW / FINE) + BASELINE[0] * (1 / depth - 1 / 400))
+        return scene_factor(mls_mask().terms[0][1], 0.06, middle + centred_edges(120, tall), edges, 2.0, depth)
+
+    seen = PARALLAX.model_copy(update={"row_mm": (BASELINE[0] - middle,) * 2, "row_pitch_mm": tall})
+    factor, truth = region(400.0), region(depth)
+    found, known = FactorOfDepths(factor, seen, 0).at(1 / depth - 1 / 400)
+    assert np.linalg.norm((found - truth)[known]) < 0.008 * np.linalg.norm(truth[known])
+    assert known.stop - known.start >= 115
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_each_pixel_keeps_its_own_brightness(axis: int) -> None:
     """Seen from its own column, not from that which lends the shadow. (Planted: brightness moves with the shadow, 1.7 %

@@ -1,5 +1,7 @@
 """The camera model: numbers in, pixel grid, mask and the shadow's terms out."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -8,6 +10,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import Directions, shadow_factor
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.profile import MaskProfile
 from mitsim.rig.projector import Spectrum
 
 
@@ -25,9 +28,58 @@ def test_pixel_edges_are_centred_and_one_pitch_apart() -> None:
     assert np.allclose(edges, [-0.25, -0.15, -0.05, 0.05, 0.15, 0.25])
 
 
+def test_a_region_of_a_sensor_that_is_not_square_lies_where_it_does() -> None:
+    """By hand; light is followed to the square of the longer side."""
+    camera = CameraGeometry(pixels=6, rows=4, row_pitch=0.2, pixel_pitch=0.1, pixel_fill_factor=0.25)
+    assert (camera.shape, camera.frame_shape, camera.pitches) == ((4, 6), (4, 6), (0.2, 0.1))
+    assert camera.half_width == pytest.approx(0.4) and camera.active_sides == pytest.approx((0.1, 0.05))
+    part = camera.model_copy(update={"roi": (1, 2, 3, 2)})
+    assert part.frame_shape == (3, 2) and part.frame_side == pytest.approx(6**0.5) and part.half_width == 0.4
+    np.testing.assert_allclose(part.centres(0), [-0.1, 0.1, 0.3])
+    np.testing.assert_allclose(part.centres(1), [-0.05, 0.05])
+    assert not part.axes_alike and CameraGeometry(pixels=6).axes_alike
+    assert not CameraGeometry(pixels=6, roi=(0, 1, 5, 5)).axes_alike
+    known = {"rows", "row_pitch", "roi"}
+    assert known < set(part.identity) and "columns" not in part.identity and not known & set(CameraGeometry().identity)
+
+
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+@pytest.mark.parametrize("spectrum", [None, Spectrum([500.0, 600.0], [0.3, 0.7])])
+def test_shadows_on_a_region_of_tall_pixels_are_parts_and_means_of_those_on_small_ones(
+    kind: str, spectrum: Spectrum | None
+) -> None:
+    """Rows 2 to 4 of pixels of two rows each, columns 3 to 7; off the axis. (Planted: columns of the whole sensor; the
+    row's number as the column's; the width of a pixel as its height.)"""
+    rows, columns = Directions.cells(np.linspace(-0.1, 0.12, 6)), Directions.cells(np.linspace(-0.05, 0.1, 5))
+    small = CameraGeometry(pixels=12, pixel_pitch=0.02, mask=kind, mask_order=6, mask_offset_row=0.03)
+    tall = small.model_copy(update={"rows": 6, "columns": 12, "row_pitch": 0.04, "roi": (2, 3, 3, 5)})
+    got, whole = (shadow_terms(camera, rows, columns, 300.0, spectrum) for camera in (tall, small))
+    for (left, right), (every_left, every_right) in zip(got, whole, strict=True):
+        assert np.allclose(left, (every_left[4:10:2] + every_left[5:10:2]) / 2, rtol=0, atol=1e-9)
+        assert np.allclose(right, every_right[3:8], rtol=0, atol=1e-12)
+    chosen = shadow_terms(tall, rows, columns, 300.0, spectrum, ((0, 2), (1, 3, 4)))
+    for (left, right), (every_left, every_right) in zip(chosen, got, strict=True):
+        assert np.allclose(left, every_left[[0, 2]], rtol=0, atol=1e-12)
+        assert np.allclose(right, every_right[[1, 3, 4]], rtol=0, atol=1e-12)
+
+
+def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
+    """Its cells are square. A mask of one term has no raster. (Planted: let pass.)"""
+    tall = CameraGeometry(pixels=8, row_pitch=0.02)
+    with pytest.raises(MitsimError, match=r"row_pitch: got 0\.02 beside pixel_pitch 0\.01172; .* give square pixels"):
+        MaskProfile(kind="separable", feature_mm=0.06, order=5, rotation_deg=1.0).worn(tall, Path())
+    assert MaskProfile(kind="flatcam", feature_mm=0.06, order=5).worn(tall, Path()).row_pitch == 0.02
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
+        ("rows", 0),
+        ("row_pitch", 0.0),
+        ("roi", (0, 0, 513, 3)),
+        ("roi", (0, 1, 3, 512)),
+        ("roi", (-1, 0, 3, 3)),
+        ("roi", (0, 0, 0, 3)),
         ("pixels", 0),
         ("pixels", 2.5),
         ("pixel_pitch", 0.0),

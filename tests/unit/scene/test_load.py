@@ -146,7 +146,6 @@ def replaced(path: Path, old: str, new: str) -> Path:
         ('"mask_order" value="9"', '"mask_order" value="17"', ["mask_order: got 17"]),
         ('"fov" value="20"', '"fov" value="180"', ["fov: got 180"]),
         ('"max_depth"', '"max_dept"', ["max_dept", ":3: "]),
-        ('"width" value="64"', '"width" value="32"', ["32x64", "square"]),
         ('rfilter type="box"', 'rfilter type="gaussian"', ["rfilter type='box'"]),
         ("small_projector.png", "nope.png", ["nope.png"]),
         ('"mitsim_lensless"', '"mitsim_lenless"', [":4: type: got 'mitsim_lenless'", "mean mitsim_lensless"]),
@@ -189,9 +188,16 @@ def test_a_scene_without_projector_is_for_render_only(small_scene: Write) -> Non
         _ = loaded.pixels
 
 
-def test_a_cropped_film_is_refused(small_scene: Write) -> None:
-    crop = '<rfilter type="box"/><integer name="crop_width" value="32"/><integer name="crop_height" value="32"/>'
-    refusal(replaced(small_scene(), '<rfilter type="box"/>', crop))
+def test_a_film_states_rows_and_columns_and_a_region_of_interest(small_scene: Write) -> None:
+    """Width 48, height 64, of which 40 columns from 5 and 30 rows from 20 are seen; beyond the film it is refused."""
+    numbers = {"crop_offset_x": 5, "crop_offset_y": 20, "crop_width": 40, "crop_height": 30}
+    crop = "".join(f'<integer name="{name}" value="{value}"/>' for name, value in numbers.items())
+    path = replaced(small_scene(), '"width" value="64"', '"width" value="48"')
+    geometry = load_scene(path).camera.geometry
+    assert geometry.shape == geometry.frame_shape == (64, 48) and geometry.roi is None
+    geometry = load_scene(replaced(path, '<rfilter type="box"/>', f'<rfilter type="box"/>{crop}')).camera.geometry
+    assert geometry.shape == (64, 48) and geometry.frame_shape == (30, 40) and geometry.roi == (20, 5, 30, 40)
+    refusal(replaced(path, '"crop_width" value="40"', '"crop_width" value="44"'))
 
 
 @pytest.mark.parametrize("place", ['<scale value="2"/>', '<scale x="-1"/>', '<scale z="0"/>'])

@@ -26,7 +26,7 @@ def rays(geometry: CameraGeometry, count: int = 4000) -> tuple[np.ndarray, ...]:
 
 
 def plugin(geometry: CameraGeometry) -> dict[str, object]:
-    values = geometry.model_dump(exclude={"pixels"})
+    values = geometry.model_dump(exclude={"pixels"}, exclude_none=True)
     film = {
         "type": "hdrfilm",
         "width": geometry.pixels,
@@ -171,17 +171,19 @@ def test_registering_needs_a_variant() -> None:
 
 
 def test_the_manual_lists_the_parameters_of_the_geometry() -> None:
-    """The table of the module's docstring: every field that a scene states but ``pixels`` (the film's), in order, with
-    its default."""
+    """The table of the module's docstring: every field that a scene states but the film's, in order, with its
+    default."""
     from mitsim.rig.camera import CameraGeometry
     from mitsim.transport import lensless
 
     rows = re.findall(r"^``(\w+)`` +(\S+) +(\S+) ", lensless.__doc__, re.M)
+    films = "pixels", "rows", "columns", "roi"
     fields = {
-        name: field for name, field in CameraGeometry.model_fields.items() if not (name == "pixels" or field.exclude)
+        name: field for name, field in CameraGeometry.model_fields.items() if not (name in films or field.exclude)
     }
     assert [name for name, _, _ in rows] == [*fields, "to_world"]
     for name, unit, default in rows[:-1]:
         stated = fields[name]
-        assert default == (stated.default if isinstance(stated.default, str) else f"{stated.default:g}"), name
+        known = "-" if stated.default is None else stated.default
+        assert default == (known if isinstance(known, str) else f"{known:g}"), name
         assert f"[{unit}]" in stated.description or unit == "-", name
