@@ -25,6 +25,7 @@ from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.sensor import SensorModel
 from mitsim.scene.projector import window_at
 from mitsim.sensor.chain import Digital
+from mitsim.sensor.shutter import ripple_level, ripple_response
 
 
 def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float = 0.0) -> FloatArray:
@@ -121,15 +122,32 @@ class DriftedExposer(Exposer):
 
     def lit(self, frame: Frame, *names: str | int) -> FloatArray:
         """Expected photoelectrons of the ``frame`` that ``names`` find, projector and lamps at their level."""
-        power, lamp = self.levels[names]
+        rows = len(frame.irradiance)
+        power, lamp = (
+            level * self._ripple(source, rows, *names)
+            for source, level in zip(("power", "lamp"), self.levels[names], strict=True)
+        )
         light = frame.irradiance + (power - 1) * (frame.irradiance - self.ambient)
         return super().lit(replace(frame, irradiance=light + (lamp - 1) * self.ambient), *names)
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
         """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""
         if names[0] == "ambient":
-            electrons = self.ambient_levels[int(names[1])] * electrons
+            level = self.ambient_levels[int(names[1])] * self._ripple("lamp", len(electrons), *names)
+            electrons = level * electrons
         return self._open.digital(electrons, *names)
+
+    def _ripple(self, source: str, rows: int, *names: str | int) -> FloatArray | float:
+        """(rows, 1) level of a ``source`` that ripples, in the frame that ``names`` find; 1 of one that does not.
+
+        The camera runs free of it: each frame has a phase of its own.
+        """
+        if source not in self.drift.ripples:
+            return 1.0
+        amplitude, hertz = self.drift.ripples[source]
+        response = ripple_response(self.rig.sensor, self._open.exposure_s, hertz, rows)
+        phase = stream(self.seed, "drift", f"{source} ripple", *names).uniform(0, 2 * np.pi)
+        return ripple_level(response, amplitude, phase)
 
     @cached_property
     def _open(self) -> Exposer:

@@ -11,6 +11,8 @@ What any change of the frames does to W is a product of small matrices:
 * frames L (P_ij o X) R^T of other factors: W = G(L) X G(R)^T with ``G(L) = sum_i U_Li^T L diag(p_i)``; of the solver's
   own ones G = S V^T;
 * frames times gains g_ij: W = sum_ij g_ij G_i X G_j^T, with the terms of G one by one;
+* gains of rows, 1 + u_ij d with a vector d of the rows and u_ij of variance 1 from frame to frame: the square of each
+  frame's term of W with diag(d) L in place of L; a ripple of the light has two such d, its cosine and its sine;
 * a frame E added to all: W = (sum_i U_Li)^T E (sum_j U_Rj);
 * noise of variance v in each datum: the variance of each number of W is v, as U_L and U_R are orthonormal; of a frame
   that is taken off all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
@@ -35,6 +37,8 @@ from mitsim.rig.patterns import PatternFamily
 
 Terms = Sequence[tuple[FloatArray, FloatArray]]
 """Separable terms of a camera, left (m, n) and right (m', n') each."""
+Gains = Sequence[float | FloatArray]
+"""Root mean squares of gains that know nothing of each other: of a whole frame, or (m,) of its rows."""
 
 
 def check_foretold(family: PatternFamily) -> None:
@@ -106,23 +110,24 @@ class Changed:
     gain
         (K, K') gains of the frames on average.
     flicker
-        rms of a further gain of each frame, independent.
+        rms of further gains of each frame, all independent: a number each, or (m,) numbers, by row.
     leak
         part of the light of all pixels that is in every frame beside the pattern's.
     added
         (m, m') frame that is added to all frames.
     added_gain, added_flicker, added_common
-        what it is multiplied by: on average, and rms from frame to frame and for all frames alike.
+        what it is multiplied by: on average; and rms of further gains, as ``flicker``, from frame to frame and for all
+        frames alike.
     """
 
     terms: Terms = ()
     gain: FloatArray | float = 1.0
-    flicker: float = 0.0
+    flicker: Gains = ()
     leak: float = 0.0
     added: FloatArray | None = None
     added_gain: float = 1.0
-    added_flicker: float = 0.0
-    added_common: float = 0.0
+    added_flicker: Gains = ()
+    added_common: Gains = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,20 +199,25 @@ class LinearImage:
         gain = np.broadcast_to(changed.gain, (len(left.slabs), len(right.slabs)))
         seen = [(left.seen(first), right.seen(second)) for first, second in cameras]
         for row, column in np.ndindex(gain.shape):
-            part = sum(first[row] @ scene @ second[column].T for first, second in seen)
-            weights += gain[row, column] * part
-            variance += changed.flicker**2 * self._energy(np.square(part))
+            weights += gain[row, column] * _part(seen, scene, row, column)
+        for rms in changed.flicker:
+            varied = [
+                (left.seen(_by_row(rms) * first), other) for (first, _), (_, other) in zip(cameras, seen, strict=True)
+            ]
+            for row, column in np.ndindex(gain.shape):
+                variance += self._energy(np.square(_part(varied, scene, row, column)))
         if changed.leak:
             uniform = sum(first @ scene @ second.T for first, second in cameras)
             weights += changed.leak * left.total.T @ uniform @ right.total
         if changed.added is not None:
             common = left.total.T @ changed.added @ right.total
             weights += changed.added_gain * common
-            variance += changed.added_common**2 * self._energy(np.square(common))
-            if changed.added_flicker:
+            for rms in changed.added_common:
+                variance += self._energy(np.square(left.total.T @ (_by_row(rms) * changed.added) @ right.total))
+            for rms in changed.added_flicker:
+                varying = _by_row(rms) * changed.added
                 for row, column in np.ndindex(gain.shape):
-                    part = left.slabs[row].T @ changed.added @ right.slabs[column]
-                    variance += changed.added_flicker**2 * self._energy(np.square(part))
+                    variance += self._energy(np.square(left.slabs[row].T @ varying @ right.slabs[column]))
         variance += self.variance(scene, noise)
         return Expected(left.basis @ (self._filter * weights) @ right.basis.T, variance)
 
@@ -241,3 +251,13 @@ class LinearImage:
 
     def _centred(self, matrix: FloatArray) -> FloatArray:
         return np.asarray(matrix - matrix.mean(axis=0)) if self.centre else matrix
+
+
+def _by_row(rms: float | FloatArray) -> FloatArray:
+    """(m, 1) by row, or (1, 1) for all rows."""
+    return np.reshape(np.asarray(rms, dtype=np.float64), (-1, 1))
+
+
+def _part(seen: Sequence[tuple[FloatArray, FloatArray]], scene: FloatArray, row: int, column: int) -> FloatArray:
+    """(r, r') what one frame of a scene brings to W, of terms of G on either side."""
+    return np.asarray(sum(first[row] @ scene @ second[column].T for first, second in seen))

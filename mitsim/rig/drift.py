@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError
@@ -20,8 +20,9 @@ LARGEST_ROTATION_MRAD = 10.0
 UNITS: Mapping[str, str] = MappingProxyType({
     "mask_rows_um": "um", "mask_columns_um": "um", "mask_axis_um": "um", "mask_rotation_mrad": "mrad",
     "vibration_um": "um rms", "temperature_k": "K", "exposure": "1", "power": "1", "power_ramp": "1",
-    "power_flicker": "1 rms", "session_ramp": "1", "session_flicker": "1 rms", "lamp": "1", "lamp_flicker": "1 rms",
-    "projector_rows": "pixels", "projector_columns": "pixels", "black_level_dn": "DN",
+    "power_flicker": "1 rms", "power_ripple": "1", "session_ramp": "1", "session_flicker": "1 rms", "lamp": "1",
+    "lamp_flicker": "1 rms", "lamp_ripple": "1", "projector_rows": "pixels", "projector_columns": "pixels",
+    "black_level_dn": "DN",
 })  # fmt: skip
 """Unit of each kind of drift: every field of :class:`Drift` that moves something by itself."""
 
@@ -30,12 +31,15 @@ WORDS: Mapping[str, str] = MappingProxyType({
     "mask_axis_um": "mask away from the sensor", "mask_rotation_mrad": "mask turns in its plane",
     "vibration_um": "vibration of the mask", "temperature_k": "temperature", "exposure": "exposure time",
     "power": "projector's power", "power_ramp": "power over the capture",
-    "power_flicker": "power from frame to frame", "session_ramp": "power over the session",
-    "session_flicker": "power from frame to frame of the session", "lamp": "lamp after its frame",
-    "lamp_flicker": "lamp from frame to frame", "projector_rows": "picture down the rows",
-    "projector_columns": "picture along the columns", "black_level_dn": "black level",
+    "power_flicker": "power from frame to frame", "power_ripple": "ripple of the power",
+    "session_ramp": "power over the session", "session_flicker": "power from frame to frame of the session",
+    "lamp": "lamp after its frame", "lamp_flicker": "lamp from frame to frame", "lamp_ripple": "ripple of the lamp",
+    "projector_rows": "picture down the rows", "projector_columns": "picture along the columns",
+    "black_level_dn": "black level",
 })  # fmt: skip
 """What each kind of drift is, for people."""
+STILL = "gap_um_per_k", "power_ripple_hz", "lamp_ripple_hz"
+"""Fields of :class:`Drift` that move nothing by themselves: they say what a kind does."""
 
 
 class MaskMotion(BaseModel):
@@ -75,6 +79,11 @@ class Drift(BaseModel):
     power_flicker: float = Field(
         default=0.0, ge=0, le=1, description="the same from frame to frame, normal deviates, rms as a part of it"
     )
+    power_ripple: float = Field(
+        default=0.0, ge=0, le=1, description="power during each frame, a sine of any phase, amplitude as a part of it"
+    )
+    power_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7, description="its frequency, Hz")
+    """Mains bring 100 or 120, a projector's pictures some 60, drivers of light-emitting diodes up to 1e6."""
     session_ramp: float = Field(
         default=0.0, ge=-1, le=10, description="power changes from begin to end of the session, as a part of it"
     )
@@ -87,10 +96,30 @@ class Drift(BaseModel):
     lamp_flicker: float = Field(
         default=0.0, ge=0, le=1, description="lamps from frame to frame, normal deviates, rms as a part of their light"
     )
+    lamp_ripple: float = Field(
+        default=0.0, ge=0, le=1, description="lamps during each frame, a sine of any phase, amplitude as a part of it"
+    )
+    lamp_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7, description="its frequency, Hz")
     projector_rows: float = Field(default=0.0, gt=-0.5, lt=0.5, description="picture moves down the rows, its pixels")
     projector_columns: float = Field(default=0.0, gt=-0.5, lt=0.5, description="the same along the columns")
     """Beyond half a pixel, pixels at the window's edge would light nothing."""
     black_level_dn: float = Field(default=0.0, ge=-1e4, le=1e4, description="black level of a pixel moves, DN")
+
+    @model_validator(mode="after")
+    def _ripples_have_a_frequency(self) -> Drift:
+        for name, amplitude, hertz in self._ripples:
+            if amplitude and hertz is None:
+                raise ValueError(f"{name}_ripple {amplitude:g} has no frequency; give {name}_ripple_hz")
+        return self
+
+    @property
+    def _ripples(self) -> tuple[tuple[str, float, float | None], ...]:
+        return ("power", self.power_ripple, self.power_ripple_hz), ("lamp", self.lamp_ripple, self.lamp_ripple_hz)
+
+    @property
+    def ripples(self) -> Mapping[str, tuple[float, float]]:
+        """Amplitude, as a part of its light, and frequency [Hz] of each source that ripples: ``power``, ``lamp``."""
+        return {name: (amplitude, hertz) for name, amplitude, hertz in self._ripples if amplitude and hertz}
 
     def alone(self, kind: str, amount: float | None = None) -> Drift:
         """One ``kind`` of it without the others, by another ``amount`` where one is given.
@@ -100,7 +129,7 @@ class Drift(BaseModel):
         if kind not in UNITS:
             raise MitsimError(f"drift {kind!r}: there is no such kind; use {', '.join(UNITS)}")
         chosen = getattr(self, kind) if amount is None else float(amount)
-        return validated(Drift, {kind: chosen, "gap_um_per_k": self.gap_um_per_k}, "drift")
+        return validated(Drift, {kind: chosen, **{name: getattr(self, name) for name in STILL}}, "drift")
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -104,6 +104,16 @@ class SensorModel(BaseModel):
     binned_full_well_e: float | None = Field(
         default=None, ge=0.1, le=1e14, description="electrons a superpixel holds on chip; none: binning^2 full wells"
     )
+    shutter: Literal["global", "rolling"] = Field(
+        default="global", description="whether all rows are exposed at once, or each some time after the one before"
+    )
+    line_time_us: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e6,
+        description="from the begin of a row's exposure to that of the next one, us; needed where light ripples",
+    )
+    """Some 1 to 100 in cameras; long exposures of a telephone's sensor stretch it to 1e4."""
     quantum_efficiency: float | None = Field(
         default=None,
         ge=1e-6,
@@ -162,6 +172,8 @@ class SensorModel(BaseModel):
                 f"dark_current_spread_e_per_s {self.dark_current_spread_e_per_s:g} is of a dark current of 0; "
                 "give dark_current_e_per_s"
             )
+        if self.line_time_us is not None and self.shutter == "global":
+            raise ValueError(f"line_time_us {self.line_time_us:g} is of a rolling shutter; set shutter 'rolling'")
         if bool(self.hot_pixels) != bool(self.hot_dark_current_e_per_s):
             raise ValueError("hot_pixels and hot_dark_current_e_per_s go together; give both, or none")
         if self.binned_full_well_e is not None and not self.binning_on_chip:
@@ -288,6 +300,20 @@ class SensorModel(BaseModel):
         if self.temperature_c is None or self.dark_current_temperature_c is None or self.dark_doubling_c is None:
             return 1.0
         return float(2 ** ((self.temperature_c - self.dark_current_temperature_c) / self.dark_doubling_c))
+
+    def known_line_time_s(self) -> float:
+        """From the begin of a row's exposure to that of the next one [s]: 0 of a global shutter.
+
+        MitsimError for a rolling one whose file does not state it.
+        """
+        if self.shutter == "global":
+            return 0.0
+        if self.line_time_us is None:
+            raise MitsimError(
+                f"sensor {self.name!r}: its shutter is rolling and its file states no line_time_us, so a ripple of the "
+                "light falls on no known rows; give line_time_us, with its source, or leave ripples out"
+            )
+        return self.line_time_us * 1e-6
 
     @property
     def superpixel_crosstalk(self) -> float:

@@ -25,7 +25,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.perturbation import Changed, Expected, LinearImage, Noise
+from mitsim.reconstruct.perturbation import Changed, Expected, Gains, LinearImage, Noise
 from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.rig.drift import Drift
 from mitsim.rig.order import SIDES
@@ -33,6 +33,7 @@ from mitsim.rig.patterns import PatternFamily, stripe_signs
 from mitsim.rig.projector import Spectrum
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.sensor.shutter import ripple_response
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed, accumulate
 from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import psnr
@@ -274,20 +275,30 @@ class DriftStand:
         """What a ``drift`` changes in the frames, to first order where several things drift at once."""
         count = self.family.left.shape[1], self.family.right.shape[1]
         ramp = levels(self.seed, "power", count[0] * count[1], drift.power_ramp).reshape(count)
-        common = drift.lamp_flicker / shots_for(self.family) ** 0.5
+        flicker = self._gains(drift, "power", drift.power_flicker)
         changed = Changed(
             terms=self._terms(drift),
             leak=self._leak,
             gain=(1 + drift.exposure) * (1 + drift.power) * ramp,
-            flicker=drift.power_flicker,
+            flicker=flicker,
         )
         if self._takes_ambient:  # and with it black level and dark current
             exposer = self._frames.exposer(1.0)
             lamps = exposer.electrons(self._expected.projector_off)
-            return replace(
-                changed, added=lamps, added_gain=drift.lamp, added_flicker=drift.lamp_flicker, added_common=common
-            )
+            each = self._gains(drift, "lamp", drift.lamp_flicker)
+            common = [rms / shots_for(self.family) ** 0.5 for rms in each]
+            return replace(changed, added=lamps, added_gain=drift.lamp, added_flicker=each, added_common=common)
         return replace(changed, added=np.full(self.lit.bench.geometry.frame_shape, self._offset(drift)))
+
+    def _gains(self, drift: Drift, source: str, rms: float) -> Gains:
+        """Gains of a ``source`` from frame to frame: a flicker of ``rms``, and the cosine and sine of its ripple."""
+        found: list[float | FloatArray] = [rms] if rms else []
+        if source in drift.ripples:
+            amplitude, hertz = drift.ripples[source]
+            seconds, (rows, _) = self.exposure_s * (1 + drift.exposure), self.lit.bench.geometry.frame_shape
+            wave = amplitude / 2**0.5 * ripple_response(self.lit.bench.sensor, seconds, hertz, rows)
+            found += [wave.real, wave.imag]
+        return found
 
     @property
     def _leak(self) -> float:

@@ -15,11 +15,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.capture.drift import projecting
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.drift import UNITS, WORDS, Drift
 from mitsim.rig.recipe import SessionRecipe, load_recipe
+from mitsim.rig.sensor import load_sensor
 from mitsim.study.charts import curves, paired
 from mitsim.study.drift import DriftStand
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope, Setup, grouped
@@ -32,7 +33,9 @@ from mitsim.study.table import Mean, Table
 PATTERNS = "dots:7"
 _SEEDS = 4
 """Of noise and of what drifts at random: the fewest whose standard error is worth the name, known to 40 %."""
-_LAMPS = ("lamp", "lamp_flicker")
+_LAMPS = ("lamp", "lamp_flicker", "lamp_ripple")
+_RIPPLES = "power_ripple", "lamp_ripple"
+"""Kinds that a rolling shutter sees by its line time."""
 _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
 """Scene with a lamp beside the projector, a tenth as bright on the sheet, for what lamps do where no scene is given."""
 _LINES = ("measured", "predicted")
@@ -45,6 +48,8 @@ def _points(scope: Scope) -> Sequence[Point]:
     amounts = _amounts(scope, drift)
     if not amounts:
         raise MitsimError(f"study drift: the table [drift] of {scope.recipe} moves nothing; give amounts in it")
+    if any(kind in _RIPPLES for kind in amounts):  # refused before any light is traced
+        load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml")).known_line_time_s()
     found = [
         Point.of(_setup(scope, kind), recipe=scope.recipe, kind=kind, unit=UNITS[kind], amount=amount, seed=seed)
         for seed in scope.chosen(range(first, first + _SEEDS), scope.seeds)

@@ -17,6 +17,7 @@ from mitsim.capture.exposer import Exposer
 from mitsim.capture.session import Session
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
 from mitsim.optics.frames import Frame
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
@@ -29,6 +30,7 @@ from mitsim.rig.projector import ProjectorModel
 from mitsim.rig.recipe import load_recipe
 from mitsim.rig.rig import Rig
 from mitsim.rig.sensor import load_sensor
+from mitsim.sensor.shutter import ripple_level, ripple_response
 
 PIXELS, SECONDS, SEED = 12, 0.01, 5
 SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
@@ -182,3 +184,55 @@ def test_what_cannot_be_formed_is_refused() -> None:
         drifted(bench(mask="plate", mask_plate=turned.mask_plate), Drift(vibration_um=1.0))
     with pytest.raises(MitsimError, match=r"^drift: mask_axis_um [^\n]*$"):
         drifted(bench(mask_distance=0.5), Drift(mask_axis_um=-600.0))
+
+
+ROLLING = replace(RIG, sensor=SENSOR.model_copy(update={"shutter": "rolling", "line_time_us": 300.0}))
+
+
+def rippled(rig: Rig, **drift: float) -> DriftedExposer:
+    return replace(exposer(**drift), rig=rig)
+
+
+def test_a_ripple_is_a_level_of_each_row_by_a_phase_of_each_frame() -> None:
+    """Of the projector's light or of the lamps' alone; a global shutter's rows have one level. Frames are the same in
+    any order. (Planted: both sources rippled; one phase for all frames; columns for rows; the exposure that was asked
+    for in place of the one that the camera has.)"""
+    for source, rig in (("power", ROLLING), ("lamp", ROLLING), ("power", RIG)):
+        camera = rippled(rig, **{f"{source}_ripple": 0.4, f"{source}_ripple_hz": 37.0, "exposure": 0.5})
+        seen = []
+        for shot, frame in reversed(list(zip(FAMILY.shots, FRAMES, strict=True))):
+            open_s = 1.5 * SECONDS
+            own = {"power": frame.irradiance - AMBIENT, "lamp": AMBIENT}
+            unit = Exposer(RIG, SECONDS, SEED).electrons(Frame(own[source], 0.0, 0.0, 0.0))
+            whole = Exposer(RIG, SECONDS, SEED).electrons(frame)
+            level = 1 + (camera.lit(frame, *shot.names) / 1.5 - whole) / unit
+            assert np.allclose(level, level[:, :1], rtol=1e-9)
+            phase = stream(SEED, "drift", f"{source} ripple", *shot.names).uniform(0, 2 * np.pi)
+            response = ripple_response(rig.sensor, open_s, 37.0, PIXELS)
+            assert np.allclose(level, ripple_level(response, 0.4, phase), rtol=1e-9)
+            assert (np.ptp(level[:, 0]) < 1e-9) == (rig is RIG)
+            seen.append(level[0, 0])
+        assert len(set(np.round(seen, 6))) == len(FRAMES)
+
+
+def test_shots_of_an_ambient_frame_ripple_as_well() -> None:
+    """Each by its own phase, frames of a shot the same bit for bit again. (Planted: none in them; the projector's.)"""
+    electrons = np.full((PIXELS, PIXELS), 5e4)
+    camera = rippled(ROLLING, lamp_ripple=0.9, lamp_ripple_hz=37.0)
+    shots = [camera.digital(electrons, "ambient", shot) for shot in range(2)]
+    assert np.array_equal(shots[1], camera.digital(electrons, "ambient", 1))
+    still = [rippled(ROLLING).digital(electrons, "ambient", shot) for shot in range(2)]
+    power = rippled(ROLLING, power_ripple=0.9, power_ripple_hz=37.0)
+    assert np.array_equal(power.digital(electrons, "ambient", 1), still[1])
+    for shot in range(2):
+        phase = stream(SEED, "drift", "lamp ripple", "ambient", shot).uniform(0, 2 * np.pi)
+        level = ripple_level(ripple_response(ROLLING.sensor, SECONDS, 37.0, PIXELS), 0.9, phase)
+        ratio = camera.rate(shots[shot]).sum(axis=1) / camera.rate(still[shot]).sum(axis=1)
+        assert np.allclose(ratio, level[:, 0], rtol=0.02)
+
+
+def test_a_ripple_before_a_rolling_shutter_of_unknown_line_time_is_refused() -> None:
+    unknown = replace(RIG, sensor=SENSOR.model_copy(update={"shutter": "rolling"}))
+    assert np.array_equal(frames(rippled(unknown)), frames(exposer()))
+    with pytest.raises(MitsimError, match=r"^sensor [^\n]*line_time_us[^\n]*$"):
+        frames(rippled(unknown, power_ripple=0.1, power_ripple_hz=100.0))

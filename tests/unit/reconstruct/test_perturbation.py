@@ -107,6 +107,7 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
         one[place] = 1
         return one
 
+    rows = RNG.standard_normal(PIXELS)
     pixels = np.eye(N * N).reshape(-1, N, N)
     data = [single(place) for place in np.ndindex(dark.shape)]
     common = [single((slice(None), slice(None), *place)) for place in np.ndindex(PIXELS, PIXELS)]
@@ -115,6 +116,10 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
     left = [shadow(unit(place), RIGHT, shown) for place in np.ndindex(PIXELS, N)]
     right = [shadow(LEFT, unit(place), shown) for place in np.ndindex(PIXELS, N)]
     light = [np.einsum("mn,ni,nN,Nj,MN->ijmM", LEFT, shown.left, one, shown.right, RIGHT) for one in pixels]
+    by_row = [0.5 * rows, np.full(PIXELS, 0.2)]
+    rippled = [gain[:, None] * one for gain in by_row for one in of_frames]
+    added = [gain[:, None] * one for gain in by_row for one in of_added]
+    common_rows = [dark + gain[:, None] * FRAME for gain in by_row]
     cases = [
         (None, Noise(datum=0.7), 0.7, data),
         (None, Noise(ambient=0.7), 0.7, common),
@@ -122,9 +127,12 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
         (None, Noise(right=0.7), 0.7, right),
         (None, Noise(light=0.7), 0.7, light),
         (None, Noise(datum=0.2, light=0.1) + Noise(datum=0.5, light=0.6), 0.7, data + light),
-        (Changed(flicker=0.3), None, 0.09, of_frames),
-        (Changed(added=FRAME, added_gain=0.0, added_flicker=0.3), None, 0.09, of_added),
-        (Changed(added=FRAME, added_gain=0.0, added_common=0.3), None, 0.09, [dark + FRAME]),
+        (Changed(flicker=(0.3,)), None, 0.09, of_frames),
+        (Changed(added=FRAME, added_gain=0.0, added_flicker=(0.3,)), None, 0.09, of_added),
+        (Changed(added=FRAME, added_gain=0.0, added_common=(0.3,)), None, 0.09, [dark + FRAME]),
+        (Changed(flicker=(0.5 * rows, 0.2)), None, 1.0, rippled),
+        (Changed(added=FRAME, added_gain=0.0, added_flicker=(0.5 * rows, 0.2)), None, 1.0, added),
+        (Changed(added=FRAME, added_gain=0.0, added_common=(0.5 * rows, 0.2)), None, 1.0, common_rows),
     ]
     for changed, noise, variance, disturbances in cases:
         found = image(shown).expected(SCENE, changed, noise).variance

@@ -9,7 +9,7 @@ import pytest
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.drift import UNITS, Drift, MaskMotion
+from mitsim.rig.drift import STILL, UNITS, WORDS, Drift, MaskMotion
 from mitsim.rig.recipe import load_recipe
 
 
@@ -17,7 +17,8 @@ def test_nothing_moves_where_nothing_is_said() -> None:
     """(Planted: a rotation of 1 by default.)"""
     none = Drift()
     assert none.kinds == () and none.mask_mm == (0, 0, 0) and none.motion is None and load_recipe().drift == none
-    assert set(UNITS) == {*Drift.model_fields} - {"gap_um_per_k"}
+    assert set(UNITS) == set(WORDS)
+    assert set(UNITS) == {*Drift.model_fields} - set(STILL)
 
 
 def test_one_kind_alone() -> None:
@@ -27,6 +28,16 @@ def test_one_kind_alone() -> None:
     assert both.alone("mask_rows_um", 5).mask_mm == pytest.approx((5e-3, 0, 0))
     assert both.kinds == ("mask_rows_um", "temperature_k")
     assert Drift(vibration_um=2.0).motion == MaskMotion(vibration_um=2.0)
+
+
+def test_a_ripple_has_a_frequency_and_keeps_it() -> None:
+    """Each source its own. (Planted: the other's frequency; frequencies left behind.)"""
+    both = Drift(power_ripple=0.2, power_ripple_hz=60.0, lamp_ripple=0.5, lamp_ripple_hz=100.0)
+    assert both.ripples == {"power": (0.2, 60.0), "lamp": (0.5, 100.0)}
+    assert both.alone("lamp_ripple", 0.1).ripples == {"lamp": (0.1, 100.0)}
+    assert both.alone("power").ripples == {} and Drift(power_ripple_hz=60.0).kinds == ()
+    with pytest.raises(MitsimError, match=r"^drift[^\n]*lamp_ripple 0\.1 has no frequency; give lamp_ripple_hz[^\n]*$"):
+        Drift(power_ripple_hz=60.0).alone("lamp_ripple", 0.1)
 
 
 @pytest.mark.parametrize(("kind", "amount", "said"), [("speed", 1, "no such kind"), ("power", -2, "power")])
