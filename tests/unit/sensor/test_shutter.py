@@ -75,7 +75,7 @@ def test_over_all_phases_levels_have_the_stated_mean_and_covariance() -> None:
 
 def test_noise_of_a_frame_in_ripple_is_that_of_its_rows_means() -> None:
     """200 frames of one phase against the closed-form mean and variance of every pixel: mean square of the deviations
-    in standard errors, 800 pixels, within five of its own. (Planted: the variance of the light without the ripple.)"""
+    in standard errors, 800 pixels, within five of its own."""
     sensor, frames, seconds = camera(), 200, 3e-3
     expected = ripple_level(ripple_response(sensor, seconds, HERTZ, ROWS), AMPLITUDE, 1.0) * np.full((ROWS, 20), 3000.0)
     shot, read = (np.random.default_rng(seed) for seed in (3, 4))
@@ -92,7 +92,7 @@ def test_noise_of_a_frame_in_ripple_is_that_of_its_rows_means() -> None:
 
 
 def test_under_constant_light_a_rolling_shutter_changes_nothing() -> None:
-    """Bit for bit. (Planted: a level in the chain.)"""
+    """Bit for bit."""
     light = 2000 * np.random.default_rng(1).random((ROWS, 20))
     still, rolling = (
         expose(light, 0.01, sensor, np.random.default_rng(5), np.random.default_rng(6)) for sensor in (SENSOR, camera())
@@ -101,8 +101,7 @@ def test_under_constant_light_a_rolling_shutter_changes_nothing() -> None:
 
 
 def test_shutters_of_the_shipped_cameras(tmp_path: Path) -> None:
-    """Nothing is said of a global one in manifests, so that they stay as they are. (Planted: the IMX477's by its binned
-    mode.)"""
+    """Nothing is said of a global one in manifests, so that they stay as they are."""
     rolling = {name: load_sensor(shipped("calibration", f"{name}.toml")) for name in ("imx477", "ov5647", "mt9m034")}
     assert {name: sensor.shutter for name, sensor in rolling.items()} == dict.fromkeys(rolling, "rolling")
     assert rolling["imx477"].known_line_time_s() * 3040 == pytest.approx(0.0869, abs=1e-4)

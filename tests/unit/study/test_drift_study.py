@@ -75,8 +75,7 @@ def test_closed_forms_say_what_a_drift_costs(stand: DriftStand, kind: str, amoun
 @pytest.mark.parametrize(("source", "waves"), [("power", 0.0), ("power", 2.5), ("lamp", 2.5)])
 def test_closed_forms_say_what_a_ripple_costs(request: pytest.FixtureRequest, source: str, waves: float) -> None:
     """By a global shutter, and by a rolling one that sees two and a half waves down its frame: to 0.5 dB of 3 or more,
-    the mean over five captures, whose phases spread by half of that. (Planted: a sine without its cosine; the amplitude
-    for its root mean square; rows of pixels for those of superpixels; columns; the ambient shots' part left out.)"""
+    the mean over five captures, whose phases spread by half of that."""
     still = request.getfixturevalue("stand" if source == "power" else "lamp_stand")
     bench, hertz = still.lit.bench, 0.6 / still.exposure_s
     line_us = 1e6 * waves / hertz / (bench.geometry.frame_shape[0] * bench.sensor.binning)
