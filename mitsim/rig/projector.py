@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
@@ -77,6 +78,49 @@ class Lines:
         """Each of them alone."""
         pairs = zip(self.wavelengths_nm, self.shares, strict=True)
         return tuple(Lines((wavelength,), (share,)) for wavelength, share in pairs)
+
+    @property
+    def mean_nm(self) -> float:
+        """The one wavelength that carries as many photons per watt [nm], to a picometre."""
+        if not self.several:
+            return self.wavelengths_nm[0]
+        return round(float(np.average(self.wavelengths_nm, weights=self.shares)), 3)
+
+    @property
+    def shining(self) -> Lines:
+        """Those that have power, shortest first."""
+        power: dict[float, float] = {}
+        for wavelength, share in sorted(zip(self.wavelengths_nm, self.shares, strict=True)):
+            if share > 0:
+                power[wavelength] = power.get(wavelength, 0.0) + share
+        return Lines(tuple(power), tuple(power.values()))
+
+    def bands(self, count: int) -> tuple[Lines, ...]:
+        """The lines of each of ``count`` bands, shortest first: neighbours, cut where the power's mean squared distance
+        from its band's :attr:`mean_nm` is least. By each band's mean and power, a sum over lines is a Gauss rule of
+        one node for it.
+
+        MitsimError for fewer than one band, or more than lines with power.
+        """
+        lines = self.shining
+        size = len(lines.shares)
+        if not 1 <= count <= size:
+            raise MitsimError(f"{count} bands of {size} lines of light: give 1 to {size}")
+        shares, waves = np.array(lines.shares), np.array(lines.wavelengths_nm)
+        power, first, second = (np.append(0, np.cumsum(shares * waves**k)) for k in range(3))
+        start, end = np.meshgrid(np.arange(size + 1), np.arange(size + 1), indexing="ij")
+        own, mean, square = (part[end] - part[start] for part in (power, first, second))
+        spread = np.where(end > start, square - mean**2 / np.where(end > start, own, 1), np.inf)
+        least, cuts = spread[0], []
+        for _ in range(count - 1):
+            through = least[:, None] + spread
+            cuts.append(through.argmin(axis=0))
+            least = through.min(axis=0)
+        edges = [size]
+        for cut in reversed(cuts):
+            edges.insert(0, int(cut[edges[0]]))
+        edges.insert(0, 0)
+        return tuple(Lines(lines.wavelengths_nm[a:b], lines.shares[a:b]) for a, b in pairwise(edges))
 
 
 Nanometres = Annotated[float, Field(ge=1, le=1e6)]
@@ -211,6 +255,16 @@ class ProjectorModel(BaseModel):
         """The same projector that shows one line of ``wavelength_nm`` alone."""
         alone = {"wavelengths_nm": (wavelength_nm,), "radiant_shares": (1.0,), "effective_wavelength_nm": wavelength_nm}
         return self.model_copy(update=alone)
+
+    def in_bands(self, count: int) -> ProjectorModel:
+        """The same projector whose lines are ``count`` bands of its own, each at its mean wavelength, as
+        :meth:`Lines.bands` cuts them. MitsimError as there."""
+        bands = self.lines.bands(count)
+        merged = {
+            "wavelengths_nm": tuple(band.mean_nm for band in bands),
+            "radiant_shares": tuple(sum(band.shares) for band in bands),
+        }
+        return self.model_copy(update=merged)
 
     @property
     def spectrum(self) -> Spectrum:

@@ -30,7 +30,8 @@ class LoadedScene:
     other emitters; ``mirrors`` tells whether a surface reflects or bends light into single directions, ``glossy``
     whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
     estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
-    several; ``small_lamps`` are lamps that no path runs into, with their tags.
+    several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
+    differ by wavelength, none of a scene in greys.
     """
 
     path: Path
@@ -45,6 +46,7 @@ class LoadedScene:
     unfit: Unfit
     shapes: tuple[Tag, ...]
     small_lamps: tuple[tuple[mi.Emitter, Tag], ...]
+    coloured: tuple[Tag, ...]
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -105,7 +107,7 @@ def load_scene(
     shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
     lit = tuple(zip(small, checked.small_lamps, strict=True))
-    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit
+    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit, checked.coloured
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")

@@ -23,7 +23,7 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.scene.guard import limits
 from mitsim.scene.guard.estimators import SMALL_LAMPS, Unfit
 from mitsim.scene.guard.files import SceneFiles
-from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply
+from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
 from mitsim.scene.guard.limits import Range
 from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
 from mitsim.scene.guard.vocabulary import PLUGINS, check_plugin
@@ -32,6 +32,10 @@ _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")
 _LARGEST_MATERIAL = 256
 """Objects of one BSDF: all of them are compiled into every kernel; shipped materials have up to 4."""
+_COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_grating", "regular")
+"""Plugins whose light or reflectance is one by wavelength, lies in a mesh that may hold colours, or turns with it."""
+_METALS = ("conductor", "roughconductor")
+"""Materials that are copper where nothing else is said."""
 _Type = mi.Properties.Type
 
 
@@ -42,7 +46,7 @@ class CheckedScene:
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
     the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
     ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
-    into.
+    into; ``coloured`` those of what may differ by wavelength.
     """
 
     outline: Outline
@@ -53,6 +57,7 @@ class CheckedScene:
     unfit: Unfit
     shapes: tuple[Tag, ...]
     small_lamps: tuple[Tag, ...]
+    coloured: tuple[Tag, ...]
 
 
 def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
@@ -87,7 +92,9 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
     # Groups are in the scene by their instances alone.
     shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
     listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
-    return CheckedScene(outline, config, state, tuple(files.used), tree.limits, unfit, *listed)
+    facts = tuple(files.used), tree.limits, unfit
+    shown, small = listed
+    return CheckedScene(outline, config, state, *facts, shown, small, tuple(tree.coloured))
 
 
 @contextmanager
@@ -114,12 +121,15 @@ class _Tree:
     nodes: list[mi.parser.SceneNode]
     limits: dict[str, Range] = field(default_factory=lambda: dict(limits.LIMITS))
     texels: int = 0
+    coloured: list[Tag] = field(default_factory=list)
 
     def check(self) -> None:
         """MitsimError for the first object that a scene cannot have."""
         for node in self.nodes:
             tag, plugin = self.outline.tag(node), node.props.plugin_name()
             check_plugin(tag, plugin)
+            if plugin in _COLOURED or (plugin in _METALS and not _is_plain(node)):
+                self.coloured.append(tag)
             for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
                 self._check_property(node, name)
             if plugin in _READERS:
@@ -164,7 +174,10 @@ class _Tree:
             table = self.outline.tag(node).name in ("texture", "spectrum") and name in limits.TABLES
             light = table or kind in (_Type.Color, _Type.Spectrum, _Type.String)
             other = {_Type.Vector: limits.COORDINATE, _Type.Integer: limits.WHOLE}.get(kind, limits.ANY)
-            limits.LIMITS.get(name, limits.LIGHT if light else other).check(tag, name, self._numbers(node, name))
+            numbers = self._numbers(node, name)
+            limits.LIMITS.get(name, limits.LIGHT if light else other).check(tag, name, numbers)
+            if kind in (_Type.Color, _Type.Spectrum) and len(set(numbers)) > 1:
+                self.coloured.append(tag)
 
     def _check_texture(self, node: mi.parser.SceneNode, name: str, limit: Range) -> None:
         """What a texture stands for keeps the limit of the parameter ``name`` that it is given for."""
@@ -191,6 +204,8 @@ class _Tree:
         try:
             if plugin in _IMAGES:
                 self.texels += check_image(path)
+                if not is_grey(path):
+                    self.coloured.append(tag)
             else:
                 (check_ply if plugin == "ply" else check_obj)(path)
         except (ValueError, OSError) as error:
@@ -253,6 +268,11 @@ class _Tree:
 def _text(node: mi.parser.SceneNode, name: str) -> str | None:
     """A property that is text; None when there is none, or an object in its place, which Mitsuba cannot give out."""
     return node.props[name] if name in node.props and node.props.type(name) == _Type.String else None
+
+
+def _is_plain(node: mi.parser.SceneNode) -> bool:
+    """Whether a metal reflects all wavelengths alike: by constants of its own, looked at as spectra, or as no metal."""
+    return _text(node, "material") == "none" or ("material" not in node.props and "eta" in node.props)
 
 
 def _words(node: mi.parser.SceneNode, name: str) -> list[str]:

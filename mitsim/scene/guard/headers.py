@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core import exr
+
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile
 
 MOST_TEXELS = 1 << 25
 """An environment map of 8192 x 4096."""
@@ -19,6 +23,8 @@ FARTHEST = 1e7
 """Largest coordinate [mm], 10 km: single precision resolves 1 mm there."""
 _HEADER = 1 << 16
 """Bytes in which a header must end; those of meshes and Radiance pictures have some 500."""
+_GREY = ("1", "L", "LA", "I", "I;16")
+"""What Pillow calls pictures without colours."""
 _PLY_TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -57,6 +63,18 @@ def check_image(path: Path) -> int:
     if width * height == 0 or width * height > MOST_TEXELS:
         raise ValueError(f"has {width}x{height} texels; 1 to {MOST_TEXELS} are allowed")
     return width * height
+
+
+def is_grey(path: Path) -> bool:
+    """Whether the header of the picture at ``path``, which :func:`check_image` passes, says that it has no colours."""
+    with open(path, "rb") as file:
+        start = file.read(len(exr.MAGIC))
+    if start == exr.MAGIC:
+        return exr.read_header(path).channels < 3
+    if start.startswith((b"#?", b"PF", b"Pf")):
+        return start.startswith(b"Pf")
+    with _pillow(path, start) as image:
+        return image.mode in _GREY
 
 
 def check_ply(path: Path) -> None:
@@ -104,7 +122,13 @@ def _check_points(points: npt.NDArray[np.float64]) -> None:
 
 
 def _pillow_size(path: Path, start: bytes) -> tuple[int, int]:
-    """Width and height in the header of a PNG or JPEG file. Not by ``PIL.Image.open``, which warns of large images."""
+    """Width and height in the header of a PNG or JPEG file."""
+    with _pillow(path, start) as image:
+        return image.size
+
+
+def _pillow(path: Path, start: bytes) -> ImageFile:
+    """A PNG or JPEG file, its header read. Not by ``PIL.Image.open``, which warns of large images."""
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile
 
@@ -112,8 +136,7 @@ def _pillow_size(path: Path, start: bytes) -> tuple[int, int]:
     if reader is None:
         raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
     try:
-        with reader(path) as image:
-            return image.size
+        return reader(path)
     except (SyntaxError, OSError, ValueError):
         raise ValueError("is a damaged PNG or JPEG image; save it again") from None
 

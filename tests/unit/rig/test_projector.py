@@ -1,6 +1,8 @@
 """Projector files: what is in them is checked, what is unknown is refused, and the spectrum counts photons."""
 
 import math
+from collections.abc import Sequence
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from mitsim.core.configuration import load_model, shipped, validated
 from mitsim.core.errors import MitsimError
-from mitsim.rig.projector import ProjectorModel, Spectrum
+from mitsim.rig.projector import Lines, ProjectorModel, Spectrum
 
 BASE = {"name": "test", "effective_wavelength_nm": 550.0}
 
@@ -94,3 +96,48 @@ def test_speckle_is_a_number_or_a_table(tmp_path: Path) -> None:
         path.write_text(head + text)
         with pytest.raises(MitsimError, match=words):
             load_model(path, ProjectorModel)
+
+
+LED = Lines((630.0, 460.0, 450.0, 440.0, 620.0), (0.2, 0.1, 0.3, 0.1, 0.3))
+
+
+def test_bands_are_cut_between_lines_that_are_far_apart() -> None:
+    """Each keeps its lines' power at the wavelength of as many photons (planted: the plain mean, 450 and 625)."""
+    blue, red = LED.bands(2)
+    assert blue == Lines((440.0, 450.0, 460.0), (0.1, 0.3, 0.1)) and red == Lines((620.0, 630.0), (0.3, 0.2))
+    assert (blue.mean_nm, red.mean_nm) == (450.0, 624.0)
+    model = ProjectorModel(**BASE, wavelengths_nm=LED.wavelengths_nm, radiant_shares=LED.shares)
+    assert model.in_bands(2).wavelengths_nm == (450.0, 624.0)
+    assert model.in_bands(2).radiant_shares == pytest.approx((0.5, 0.5))
+    assert model.in_bands(2).lines.mean_nm == pytest.approx(model.lines.mean_nm)
+
+
+def spread(bands: Sequence[Lines]) -> float:
+    """Power times squared distance from the band's mean."""
+    return sum(
+        share * (wave - np.average(band.wavelengths_nm, weights=band.shares)) ** 2
+        for band in bands
+        for wave, share in zip(band.wavelengths_nm, band.shares, strict=True)
+    )
+
+
+def test_no_other_cuts_leave_less_of_the_power_off_its_bands_mean() -> None:
+    """Against all cuts of nine random lines (planted: cuts by the widest gap)."""
+    rng = np.random.default_rng(3)
+    for count in (1, 2, 3, 4):
+        lines = Lines(tuple(rng.uniform(400, 700, 9).tolist()), tuple(rng.uniform(0.1, 1, 9).tolist())).shining
+        waves, shares = lines.wavelengths_nm, lines.shares
+
+        every = combinations(range(1, 9), count - 1)
+        least = min(spread([Lines(waves[a:b], shares[a:b]) for a, b in pairwise((0, *at, 9))]) for at in every)
+        assert len(lines.bands(count)) == count and spread(lines.bands(count)) == pytest.approx(least)
+
+
+def test_bands_of_as_many_as_lines_are_the_lines() -> None:
+    """To the last bit, so that folders and calibrations are the same; lines without power are none, and two of one
+    wavelength one."""
+    assert [band.mean_nm for band in LED.bands(5)] == sorted(LED.wavelengths_nm)
+    assert Lines((600.0, 500.0, 600.0), (0.25, 0.0, 0.75)).bands(1) == (Lines((600.0,), (1.0,)),)
+    for count in (0, 6):
+        with pytest.raises(MitsimError, match=f"{count} bands of 5 lines of light: give 1 to 5"):
+            LED.bands(count)
