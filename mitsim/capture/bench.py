@@ -16,6 +16,7 @@ from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.outline import Outline
 
 if TYPE_CHECKING:
+    from mitsim.capture.bands import Coloured
     from mitsim.capture.glint import Glint
     from mitsim.capture.light import Light
     from mitsim.capture.plan import Plan
@@ -152,7 +153,7 @@ class Bench:
 
     def capture_lines(
         self,
-        patterns: str = "dots:7",
+        patterns: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
@@ -166,7 +167,7 @@ class Bench:
         Parameters
         ----------
         patterns
-            name of the family.
+            name of the family, or a plan of this bench, of :meth:`choose_colour`.
         output
             folder that holds a run's folder for each line, and colour.json; None keeps them in memory.
         resume, job
@@ -184,9 +185,47 @@ class Bench:
         job = job or Job()
         with job.clock.stage("imports"):
             from mitsim.capture.colour import capture_lines
-            from mitsim.capture.request import Request
+            from mitsim.capture.run import request_of
 
-        return capture_lines(self, Request.of(patterns=patterns, **request), job, output, resume)
+        known = None if isinstance(patterns, str) else patterns
+        return capture_lines(self, request_of(patterns, request), job, output, resume, known)
+
+    def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured:
+        """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
+
+        Looks at the scene in this variant and in the spectral one, and sets that of the bench that it returns.
+
+        Parameters
+        ----------
+        patterns
+            name of the family.
+        **request
+            other fields of :class:`mitsim.capture.request.Request`, but for ``seconds``.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture_lines` where lines or bands are called for; for a bench in a spectral variant.
+        """
+        from mitsim.capture.bands import choose_colour
+        from mitsim.capture.request import Request
+
+        return choose_colour(self, Request.of(patterns=patterns, **request))
+
+    def in_variant(self, variant: str) -> Bench:
+        """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
+        not be used with it. MitsimError as :func:`open_bench`."""
+        from mitsim.rig.profile import load_mask
+
+        loaded, camera = _loaded(variant, self.loaded.path, self.defines, outside=True), Path(self.rig.camera_file)
+        if (mask := load_mask(camera)) is not None:
+            loaded.camera.wear(mask.worn(loaded.camera.geometry, camera.parent))
+        return replace(self, loaded=loaded, variant=variant)
+
+    def in_bands(self, count: int) -> Bench:
+        """The same bench whose projector has ``count`` bands of its lines as lines; MitsimError as
+        :meth:`mitsim.rig.projector.ProjectorModel.in_bands`."""
+        return replace(self, rig=replace(self.rig, projector=self.projector.in_bands(count)))
 
     def calibrate_lines(
         self,
@@ -624,7 +663,7 @@ class Bench:
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
         bare = replace(self.loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False)
-        alone = replace(bare, unfit=Unfit(), shapes=())
+        alone = replace(bare, unfit=Unfit(), shapes=(), coloured=())
         return replace(self, loaded=alone)
 
 
@@ -680,13 +719,7 @@ def open_bench(
         except MitsimError as error:
             raise MitsimError(f"camera {sensor_path}: {error}") from None
     # Only now, with all else checked: the renderer takes a second to import.
-    mitsuba = load_variant(variant)
-    from mitsim.scene.load import load_scene
-    from mitsim.transport import plugins
-
-    mitsuba.set_log_level(mitsuba.LogLevel.Error)
-    plugins.register()
-    loaded = load_scene(path, defines, needs_projector=not for_render, outside=allow_outside_files)
+    loaded = _loaded(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
     row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning
     of_rows, of_columns = zip((row_um, sensor.superpixel_pitch_um), loaded.camera.geometry.pitches, strict=True)
     for name, (um, stated) in (("pixel_pitch", of_columns), ("row_pitch", of_rows)):
@@ -704,6 +737,17 @@ def open_bench(
         loaded.camera.wear(mask.worn(loaded.camera.geometry, sensor_path.parent))
     rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
     return Bench(loaded, rig, variant, defines)
+
+
+def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:
+    """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
+    mitsuba = load_variant(variant)
+    from mitsim.scene.load import load_scene
+    from mitsim.transport import plugins
+
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    plugins.register()
+    return load_scene(path, defines, **options)
 
 
 def _text(value: object) -> str:

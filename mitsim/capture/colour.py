@@ -25,7 +25,7 @@ from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import trace_truths
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colours import CALIBRATION, RUN, ColourManifest, Line, write_colours
+from mitsim.core.colours import CALIBRATION, MOST_LINES, RUN, ColourManifest, Line, spectral_of, write_colours
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.output import output_folder
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
 
-_WAVELENGTHS = 4
-"""Wavelengths that a path carries in Mitsuba's spectral variants."""
 _RAYS, _ALIKE = 4, 0.9
 """Rays of each pixel that tell how rough a line's light is, a tenth of a second; and the part of the roughest line's
 differences from which a line counts as rough: what a plan leaves follows their root, of which this is a twentieth."""
@@ -65,13 +63,13 @@ class ColourBench:
     def of(cls, bench: Bench, kind: str) -> ColourBench:
         """Of a ``bench``, for folders of a ``kind``. MitsimError where its light cannot be traced by line."""
         if not bench.variant.endswith("_spectral"):
-            spectral = f"{bench.variant.rpartition('_')[0]}_spectral"
-            raise ArgumentError("variant", f"{bench.variant}: knows no wavelengths; open the bench with {spectral}")
+            needed = spectral_of(bench.variant)
+            raise ArgumentError("variant", f"{bench.variant}: knows no wavelengths; open the bench with {needed}")
         lines = bench.projector.lines
-        if len(lines.shares) > _WAVELENGTHS:
+        if len(lines.shares) > MOST_LINES:
             raise MitsimError(
                 f"colour: projector {bench.projector.name} has {len(lines.shares)} lines, and a path carries "
-                f"{_WAVELENGTHS}; give a projector of {_WAVELENGTHS} or fewer, or leave colour out"
+                f"{MOST_LINES}; give bands, bands:{MOST_LINES} at most, or leave colour out"
             )
         named = [
             Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
@@ -84,12 +82,7 @@ class ColourBench:
     def benches(self) -> tuple[Bench, ...]:
         """The bench of each line alone."""
         assert self.whole.lines is not None, "of the projector"
-        return tuple(map(self._alone, self.whole.lines.single))
-
-    def _alone(self, line: Lines) -> Bench:
-        rig = self.whole.rig
-        alone = replace(rig, projector=rig.projector.at(line.wavelengths_nm[0]))
-        return replace(self.whole, rig=alone, lines=line)
+        return tuple(line_alone(self.whole, line) for line in self.whole.lines.single)
 
     def roughest(self, seed: int) -> Bench:
         """The line that is planned for: that whose light differs most between neighbouring pixels of the projector.
@@ -117,7 +110,12 @@ class ColourBench:
 
 
 def capture_lines(
-    bench: Bench, request: Request, job: Job | None = None, output: Path | str | None = None, resume: bool = False
+    bench: Bench,
+    request: Request,
+    job: Job | None = None,
+    output: Path | str | None = None,
+    resume: bool = False,
+    plan: Plan | None = None,
 ) -> dict[str, Capture]:
     """A run for each line, by its name; see :meth:`mitsim.capture.bench.Bench.capture_lines`.
 
@@ -125,6 +123,8 @@ def capture_lines(
     ----------
     bench, request, job, output, resume
         as there.
+    plan
+        of all lines together, made already.
 
     Raises
     ------
@@ -137,12 +137,25 @@ def capture_lines(
     with _claimed(output, colours.manifest, resume) as places:
         for each, place in zip(colours.benches, places, strict=True):
             check_run(each, request, place, resume)
-        lights = traced_lines(colours, request, job)
+        lights = traced_lines(colours, request, job, plan)
         runs = zip(colours.manifest.names, colours.benches, lights, places, strict=True)
         return {name: capture(each, request, job, place, resume, light=light) for name, each, light, place in runs}
 
 
-def traced_lines(colours: ColourBench, request: Request, job: Job) -> list[Light]:
+def line_alone(bench: Bench, line: Lines) -> Bench:
+    """The ``bench`` whose projector shows a ``line`` alone."""
+    rig = replace(bench.rig, projector=bench.projector.at(line.wavelengths_nm[0]))
+    return replace(bench, rig=rig, lines=line)
+
+
+def plan_lines(colours: ColourBench, request: Request) -> Plan:
+    """The plan of all lines of ``colours`` together, which is that of the roughest, for a ``request``. MitsimError for
+    what is not simulated in colour."""
+    refuse(colours.whole, request)
+    return plan_request(colours.roughest(request.seed), request)
+
+
+def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | None = None) -> list[Light]:
     """Light of each line with its truth, traced on the same paths.
 
     Parameters
@@ -151,6 +164,8 @@ def traced_lines(colours: ColourBench, request: Request, job: Job) -> list[Light
         bench and lines.
     request, job
         what is asked for; clock, progress and limits.
+    plan
+        made already.
 
     Raises
     ------
@@ -158,7 +173,7 @@ def traced_lines(colours: ColourBench, request: Request, job: Job) -> list[Light
         for what is not simulated in colour, and work beyond the limits.
     """
     with job.clock.stage("plan"):
-        plan = plan_request(colours.roughest(request.seed), request)
+        plan = plan or plan_lines(colours, request)
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
     lighting = colours.whole.family(request.patterns, request.seed).lighting

@@ -28,6 +28,7 @@ from mitsim.capture.prices import (
     truth_seconds,
 )
 from mitsim.capture.request import Request, check_accuracy
+from mitsim.core.colours import MONO
 from mitsim.core.errors import MitsimError
 from mitsim.core.pictures import table
 
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from mitsim.scene.guard.outline import Tag
 
 State = Literal["exact", "approximate", "off"]
+_GREY = "no surface differs by wavelength; the mask's shadow is the mean of all lines'"
+"""What is said of a scene in greys."""
 _TOLD = 2.0
 """An estimate whose bound is above this much of it is told as a bound."""
 
@@ -60,6 +63,60 @@ class PlanRow:
     reason: str
     error_if_off: float | None
     seconds: float
+
+
+@dataclass(frozen=True)
+class ColourCandidate:
+    """One way to simulate the colours of a projector's light.
+
+    Attributes
+    ----------
+    name
+        ``mono``, ``bands:K`` or ``lines``.
+    error
+        what it leaves of the light's lines in direct light: relative rms error of the noise-free frames in electrons,
+        of the worst band; None where that was not looked for.
+    seconds
+        predicted, from start to finish.
+    """
+
+    name: str
+    error: float | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class ColourChoice:
+    """Which of several ways is taken.
+
+    Attributes
+    ----------
+    chosen
+        its name.
+    candidates
+        all of them, the cheapest first.
+    """
+
+    chosen: str
+    candidates: tuple[ColourCandidate, ...]
+
+    @property
+    def taken(self) -> ColourCandidate:
+        """The one that is chosen."""
+        return next(each for each in self.candidates if each.name == self.chosen)
+
+    def later(self, seconds: float) -> ColourChoice:
+        """The same, every way by so many ``seconds`` longer."""
+        return replace(self, candidates=tuple(replace(e, seconds=e.seconds + seconds) for e in self.candidates))
+
+    @property
+    def words(self) -> str:
+        """What is said of it in one line."""
+        errors = ", ".join(
+            f"{each.name} {'not known' if each.error is None else f'{each.error:.1e}' if each.error else '0'}"
+            for each in self.candidates
+        )
+        return f"Colour: {self.chosen} (error that each leaves: {errors})"
 
 
 @dataclass(frozen=True)
@@ -88,6 +145,8 @@ class Plan:
         what it is for, and what that takes; None where it was decided without them.
     asked_seconds
         for the whole run, of which the accuracy is the finest that they buy; None where the accuracy was asked for.
+    colour
+        what was weighed for the light's colours; None where that was not asked for.
     """
 
     accuracy: float
@@ -102,6 +161,7 @@ class Plan:
     request: Request | None = None
     cost: Cost | None = None
     asked_seconds: float | None = None
+    colour: ColourChoice | None = None
 
     def row(self, name: str) -> PlanRow:
         """What is said of the effect or discretisation called ``name``; MitsimError when there is none."""
@@ -118,12 +178,14 @@ class Plan:
     def taking(self, **seconds: float) -> Plan:
         """The same plan, with the ``seconds`` of more stages in its prediction."""
         stages = {**self.predicted, **seconds}
-        return replace(self, predicted=stages, predicted_seconds=sum(stages.values()))
+        more = sum(stages.values()) - sum(self.predicted.values())
+        colour = self.colour and self.colour.later(more)
+        return replace(self, predicted=stages, predicted_seconds=sum(stages.values()), colour=colour)
 
     def block(self) -> dict[str, Any]:
         """The plan as JSON holds it."""
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
-        own = replace(self, request=None, cost=None)
+        own = replace(self, request=None, cost=None, colour=self.colour or self._uncoloured)
         return {**{name: value for name, value in asdict(own).items() if value is not None}, "settings": settings}
 
     def payload(self) -> dict[str, Any]:
@@ -137,8 +199,17 @@ class Plan:
             "systematic_error": self.systematic_error,
             "systematic_bound": self.systematic_bound,
             "asked_seconds": self.asked_seconds,
+            "colour": block.get("colour"),
             **{f"predicted_{what}_bytes": count for what, count in cost.items()},
         }
+
+    @property
+    def _uncoloured(self) -> ColourChoice | None:
+        """Monochrome frames, where nothing else was asked for; None of light of some lines."""
+        row = next((row for row in self.effects if row.name == "spectrum"), None)
+        if row is None or row.state != "off":
+            return None
+        return ColourChoice(MONO, (ColourCandidate(MONO, row.error_if_off, self.predicted_seconds),))
 
     def __repr__(self) -> str:
         states = ", ".join(f"{row.name} {row.state}" for row in self.effects if row.state != "off")
@@ -178,12 +249,15 @@ class SceneFacts:
         what the model of the devices does not cover, and which of the scene's light frames are known to lack.
     shapes
         where the scene's shapes are written, if that is known.
+    spectrum
+        what to say of colours.
     """
 
     notes: Mapping[str, str]
     keystone: float
     warnings: tuple[str, ...] = ()
     shapes: tuple[Tag, ...] = ()
+    spectrum: PlanRow = field(default_factory=lambda: PlanRow("spectrum", "off", _GREY, 0.0, 0.0))
 
     @classmethod
     def of(cls, bench: Bench, switches: Mapping[str, bool] | None = None) -> SceneFacts:
@@ -224,7 +298,7 @@ class SceneFacts:
                 "of masks needs features above it, so the shadow is a guess"
             )
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes)
+        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes, _spectrum(bench))
 
 
 def decide(
@@ -477,16 +551,31 @@ def _said(error: Estimate) -> str:
     return f"{error.value:.1e}" if error.bound < _TOLD * error.value else f"less than {error.bound:.1e}"
 
 
+def _spectrum(bench: Bench) -> PlanRow:
+    """What monochrome frames of a ``bench`` leave out of colours, as far as that is known without tracing."""
+    if bench.lines is not None:
+        nanometres = ", ".join(f"{wave:g}" for wave in bench.lines.wavelengths_nm)
+        return PlanRow("spectrum", "exact", f"all is simulated at {nanometres} nm", None, 0.0)
+    coloured = bench.loaded.coloured
+    if coloured:
+        place = f"{coloured[0].path.name}:{coloured[0].line}"
+        may = f"{len(coloured)} of the scene's tags may have colours, the first {place}"
+        reason = f"one panchromatic reflectance; {may}; what that leaves out: --colour auto"
+        return PlanRow("spectrum", "off", reason, None, 0.0)
+    if bench.sensor.quantum_efficiency_curve is not None:
+        return PlanRow("spectrum", "off", f"{_GREY}, but the camera does; what that leaves: --colour auto", None, 0.0)
+    return PlanRow("spectrum", "off", _GREY, 0.0, 0.0)
+
+
 def _fixed(facts: SceneFacts) -> tuple[PlanRow, ...]:
     keystone = (
         f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
         if facts.keystone
         else "the projector faces the aligned plane squarely"
     )
-    spectrum = "one panchromatic reflectance; wavelengths differ in the mask's shadow only"
     noise = "Poisson, full well, read noise and quantisation of each frame"
     return (
         PlanRow("keystone", "exact" if facts.keystone else "off", keystone, None, 0.0),
-        PlanRow("spectrum", "off", spectrum, None, 0.0),
+        facts.spectrum,
         PlanRow("sensor-noise", "exact", noise, None, 0.0),
     )

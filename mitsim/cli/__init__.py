@@ -16,7 +16,20 @@ import typer
 
 import mitsim
 from mitsim.cli import calibration, exchange, image, sensor, study
-from mitsim.cli.colour import LINES, MOSAIC, Colour, of_capture, of_mosaic, variant_for
+from mitsim.cli.colour import (
+    AUTO,
+    MOSAIC,
+    NO,
+    Colour,
+    by_line,
+    chosen_of,
+    in_colour,
+    of_capture,
+    of_mosaic,
+    plan_of,
+    variant_for,
+    weighed,
+)
 from mitsim.cli.options import (
     DAY,
     Accuracy,
@@ -151,6 +164,7 @@ def plan(
     outside: Outside = False,
     effects: Effects = "",
     variant: Variant = DEFAULT_VARIANT,
+    colour: Colour = NO,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -158,9 +172,9 @@ def plan(
     from mitsim.core.resources import running_seconds
 
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
-    bench = bench_of(scene, variant, camera, projector, define, outside)
+    bench = bench_of(scene, variant_for(colour, variant, camera), camera, projector, define, outside)
     starting = running_seconds()
-    plan = bench.plan(**request).taking(start=starting)
+    plan = plan_of(bench, colour, request).taking(start=starting)
     if not as_json:
         print_plan(plan)
     return finish(as_json, plan.payload(), [], plan.warnings)
@@ -192,7 +206,7 @@ def capture(
     outside: Outside = False,
     resume: Resume = False,
     variant: Variant = DEFAULT_VARIANT,
-    colour: Colour = "no",
+    colour: Colour = NO,
     max_seconds: MaxSeconds = DAY,
     max_memory: MaxMemory = None,
     as_json: Json = False,
@@ -224,12 +238,16 @@ def capture(
             payload, lines = of_mosaic(seen)
             payload["memory_bytes"] = max(peak_memory() - held, 0.0)
             return finish(as_json, payload, lines, seen.warnings)
-        if colour == LINES:
-            runs = bench.capture_lines(request.pop("patterns"), output, resume, job, **request)
+        what, more = request.pop("patterns"), request
+        if colour == AUTO:
+            bench, what, colour = chosen_of(bench, {"patterns": what, **request}, job, output, resume)
+            more = {}
+        if by_line(colour):
+            runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **more)
             payload, lines = of_capture(runs, output)
             payload["memory_bytes"] = max(peak_memory() - held, 0.0)
             return finish(as_json, payload, lines, payload["warnings"])
-        shots = bench.capture(request.pop("patterns"), output, resume, job, **request)
+        shots = bench.capture(what, output, resume, job, **more)
     payload = {**shots.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
     taken = payload["seconds"]
     lines = [
@@ -240,6 +258,7 @@ def capture(
         f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
         f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
     ]
+    lines += weighed(payload)
     if seconds is not None:
         lines.append(
             f"Asked for {seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken {taken['total']:.1f}: "

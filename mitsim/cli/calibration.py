@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.cli.colour import LINES, NO, Colour, of_calibration, variant_for
+from mitsim.cli.colour import MOSAIC, NO, Colour, in_colour, of_calibration, variant_for
 from mitsim.cli.modelling import calibrate_model, modelling_of
 from mitsim.cli.options import (
     DAY,
@@ -140,7 +140,8 @@ def calibrate(
             bench = bench_of(scene, traced_in, camera, projector, define, outside)
         held = memory_from_here()
         if colour != NO:
-            by_line = bench.calibrate_lines if colour == LINES else bench.calibrate_mosaic
+            seen = in_colour(bench, colour)
+            by_line = seen.calibrate_mosaic if colour == MOSAIC else seen.calibrate_lines
             shown = None if recipe is None else session
             colours = by_line(**request, recipe=shown, output=folder, resume=resume, job=job)
             payload, lines = of_calibration(colours, folder)

@@ -10,29 +10,50 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsim.cli.screen import finish
-from mitsim.core.colours import CALIBRATION, RUN, check_way, is_mosaic, read_colours, read_mosaic
+from mitsim.core.colours import (
+    BANDS,
+    CALIBRATION,
+    LINES,
+    RUN,
+    bands_of,
+    check_way,
+    is_mosaic,
+    read_colours,
+    read_mosaic,
+    spectral_of,
+)
 from mitsim.core.errors import MitsimError
 
 if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench
+    from mitsim.capture.plan import Plan
+    from mitsim.core.job import Job
     from mitsim.core.mosaics import MosaicCapture
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
 
-NO, LINES, MOSAIC = _CHOICES = ("no", "lines", "mosaic")
+NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 
 
-def _choice(name: str) -> str:
-    if name not in _CHOICES:
-        raise MitsimError(f"--colour {name!r}: use {', '.join(_CHOICES[:-1])} or {_CHOICES[-1]}")
+def _choice(context: typer.Context, name: str) -> str:
+    words = [NO, LINES, f"{BANDS}:K", MOSAIC, AUTO]
+    for word, command in ((MOSAIC, "plan"), (AUTO, "calibrate")):
+        if context.info_name == command:
+            words.remove(word)
+    if name.startswith(f"{BANDS}:"):
+        bands_of(name)
+    elif name not in words:
+        raise MitsimError(f"--colour {name!r}: use {', '.join(words[:-1])} or {words[-1]}")
     return name
 
 
 Colour = Annotated[
     str,
     typer.Option(
-        help="lines: sequential colour, each line of the projector in a folder of its own; mosaic: all lines at once, "
-        "by a camera under colour filters; no: light that is not told apart",
-        metavar="no|lines|mosaic",
+        help="lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K "
+        "bands of its lines; mosaic: all lines at once, by a camera under colour filters (not plan); auto: no, bands "
+        "or lines, as the accuracy needs (not calibrate); no: light that is not told apart",
+        metavar="no|lines|bands:K|mosaic|auto",
         callback=_choice,
     ),
 ]
@@ -65,12 +86,62 @@ def variant_for(colour: str, variant: str, camera: str | None) -> str:
             f"--colour mosaic: camera {path} has no mosaic of colour filters; give one that has, such as "
             "--camera imx249_rggb, or use --colour lines"
         )
-    if colour == LINES and mosaic is not None:
+    if colour != MOSAIC and mosaic is not None:
         raise MitsimError(
-            f"--colour lines: camera {path} has a mosaic {mosaic}, whose frames show all lines at once; use "
+            f"--colour {colour}: camera {path} has a mosaic {mosaic}, whose frames show all lines at once; use "
             "--colour mosaic"
         )
-    return f"{variant.rpartition('_')[0]}_spectral"
+    return variant if colour == AUTO else spectral_of(variant)
+
+
+def by_line(colour: str) -> bool:
+    """Whether ``colour`` is of lines, or bands of them, one after the other."""
+    return colour.partition(":")[0] in (LINES, BANDS)
+
+
+def in_colour(bench: Bench, colour: str) -> Bench:
+    """The ``bench`` with the lines that ``colour`` names; MitsimError for more bands than its projector has lines."""
+    return bench.in_bands(bands_of(colour)) if colour.startswith(BANDS) else bench
+
+
+def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
+    """The plan that a command line asks for.
+
+    Parameters
+    ----------
+    bench, colour, request
+        what it names.
+    """
+    if colour == AUTO:
+        return bench.choose_colour(**request).plan
+    if colour == NO:
+        return bench.plan(**request)
+    from mitsim.capture.colour import ColourBench, plan_lines
+    from mitsim.capture.request import Request
+
+    return plan_lines(ColourBench.of(in_colour(bench, colour), RUN), Request.of(**request))
+
+
+def chosen_of(bench: Bench, request: dict[str, Any], job: Job, output: Path, resume: bool) -> tuple[Bench, Plan, str]:
+    """What ``--colour auto`` of `mitsim capture` is captured with: a bench, its plan, and :data:`NO` or lines.
+
+    Parameters
+    ----------
+    bench, request, job, output, resume
+        what the command line names.
+
+    Raises
+    ------
+    MitsimError
+        for an output that cannot be used, and as :meth:`Bench.choose_colour`.
+    """
+    from mitsim.core.output import prepare_output
+
+    if output.exists():
+        prepare_output(output, overwrite=resume)  # before work
+    with job.clock.stage("plan"):
+        chosen = bench.choose_colour(**request)
+    return chosen.bench, chosen.plan, NO if chosen.mono else LINES
 
 
 def mosaic_options(options: Mapping[str, Any], way: str) -> dict[str, Any]:
@@ -97,7 +168,16 @@ def of_capture(runs: Mapping[str, Capture], output: Path) -> tuple[dict[str, Any
         "s a frame"
         for part in payload["channels"]
     ]
-    return payload, [*lines, _last(payload)]
+    return payload, [*lines, _last(payload), *weighed(payload)]
+
+
+def weighed(payload: Mapping[str, Any]) -> list[str]:
+    """The line that a capture's ``payload`` says of what was weighed for colour; none where that was not asked for."""
+    choice = payload["colour"]
+    if choice is None or len(choice["candidates"]) < 2:
+        return []
+    errors = ", ".join(f"{each['name']} {each['error']:.1e}" for each in choice["candidates"])
+    return [f"Colour: {choice['chosen']} (error that each leaves: {errors})"]
 
 
 def of_mosaic(shots: MosaicCapture) -> tuple[dict[str, Any], list[str]]:
@@ -172,6 +252,7 @@ def _payload(kind: str, results: Mapping[str, Mapping[str, Any]], output: Path) 
         "kind": colours.kind,
         "channels": [{**line.model_dump(), **results[line.name]} for line in colours.channels],
         "seconds": results[colours.names[-1]]["seconds"],
+        **{name: results[colours.names[0]].get(name) for name in ("colour",) if kind == RUN},
         "warnings": tuple(f"{name}: {text}" for name, result in results.items() for text in result["warnings"]),
         "output": str(output),
     }

@@ -26,9 +26,26 @@ _COMMANDS = {
     MOSAIC: "capture --colour mosaic",
 }
 """What makes a folder of each kind."""
+MONO, LINES, BANDS = "mono", "lines", "bands"
+"""Ways to simulate a projector's light: not told apart by wavelength, each line, or ``bands:K`` of lines."""
+MOST_LINES = 4
+"""Lines that light is traced at together: wavelengths that a path carries in Mitsuba's spectral variants."""
 JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
 """Ways to images of lines from frames behind colour filters (:mod:`mitsim.study.filters`), that of most PSNR first."""
 Weight = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+def bands_of(name: str) -> int:
+    """K of ``bands:K``, 1 to :data:`MOST_LINES`; ArgumentError for another ``name``."""
+    word, _, count = name.partition(":")
+    if word != BANDS or count not in map(str, range(1, MOST_LINES + 1)):
+        raise ArgumentError("colour", f"{name!r}: give {BANDS}:1 to {BANDS}:{MOST_LINES}")
+    return int(count)
+
+
+def spectral_of(variant: str) -> str:
+    """The variant that knows wavelengths, of the same backend as ``variant``."""
+    return f"{variant.rpartition('_')[0]}_spectral"
 
 
 class Line(BaseModel):

@@ -219,7 +219,10 @@ class Capture:
             "seed": manifest.configuration.get("seed"),
             "output": None if self.folder is None else str(self.folder),
             "exposure_s": self.exposure_s,
-            **{name: (manifest.plan or {}).get(name) for name in ("accuracy", "asked_seconds", "predicted_seconds")},
+            **{
+                name: (manifest.plan or {}).get(name)
+                for name in ("accuracy", "asked_seconds", "predicted_seconds", "colour")
+            },
             "ambient_frame": None if manifest.ambient_frame is None else manifest.ambient_frame.model_dump(),
             **{name: getattr(manifest, name) for name in known},
         }

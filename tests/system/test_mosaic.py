@@ -108,7 +108,11 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
         ),
         ("capture", ("--colour", "lines", "--camera", "ov5647", "--patterns", "dots:2"), "use --colour mosaic"),
         ("capture", ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"), "or colour mosaic"),
-        ("capture", ("--colour", "red", "--patterns", "dots:2"), "--colour 'red': use no, lines or mosaic"),
+        (
+            "capture",
+            ("--colour", "red", "--patterns", "dots:2"),
+            "--colour 'red': use no, lines, bands:K, mosaic or auto",
+        ),
     ],
 )
 def test_a_camera_without_filters_has_no_mosaic(

@@ -26,7 +26,11 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         field_stop_cuts=cuts,
         geometry=geometry,
         spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
-        loaded=SimpleNamespace(pixels=SimpleNamespace(keystone=2.5), unfit=Unfit(), shapes=(), small_lamps=()),
+        loaded=SimpleNamespace(
+            pixels=SimpleNamespace(keystone=2.5), unfit=Unfit(), shapes=(), small_lamps=(), coloured=()
+        ),
+        lines=None,
+        sensor=SimpleNamespace(quantum_efficiency_curve=None),
     )
 
 
