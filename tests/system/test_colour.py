@@ -165,11 +165,7 @@ def luminance(reflectance: Callable[[float], float]) -> float:
 def test_the_error_of_mono_and_of_bands_is_that_of_their_reflectances(
     shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    """An even sheet without a mask: frames differ by the photons that come back, which its spectrum tells.
-
-    (Planted: lines weighted by power instead of photons; the band's reflectance at the plain mean of its lines; the
-    whole light as the measure of a band.)
-    """
+    """An even sheet without a mask: frames differ by the photons that come back, which its spectrum tells."""
     whole, scene = projector(tmp_path / "all.toml", LINES), coloured("sheet")
     bare = scene.with_name("bare.xml")
     bare.write_text(scene.read_text().replace('name="mask" value="separable"', 'name="mask" value="open"'))
