@@ -27,6 +27,9 @@ from mitsim.scene.projector import window_at
 from mitsim.sensor.chain import Digital
 from mitsim.sensor.shutter import ripple_level, ripple_response
 
+_OF_TERMS = ("mask_rotation_mrad", "mask_tilt_rows_mrad", "mask_tilt_columns_mrad", "vibration_um")
+"""Kinds after which the mask's shadow is formed of other separable terms than at rest."""
+
 
 def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float = 0.0) -> FloatArray:
     """(count,) light of a source in frames one after the other, 1 at their begin.
@@ -50,21 +53,27 @@ def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float =
 def drifted(bench: Bench, drift: Drift) -> Bench:
     """A ``bench`` whose mask has moved as a ``drift`` says, for all that is made of light traced before.
 
-    MitsimError for a mask that turns or shakes before mirrors, whose light is formed ray by ray, or whose shadow is
-    drawn on a raster, and for one that moves into the sensor or the scene.
+    MitsimError for a mask that turns, tilts or shakes before mirrors, whose light is formed ray by ray, or whose
+    shadow is drawn on a raster; for one that tilts and is thick, or is tilted too far; and for one that moves into the
+    sensor or the scene.
     """
     row, column, axis = drift.mask_mm
-    if drift.motion is not None and bench.geometry.correlated(bench.geometry.diffracts):
+    camera, kinds = bench.geometry, " and ".join(kind for kind in drift.kinds if kind in _OF_TERMS)
+    if kinds and camera.correlated(camera.diffracts):
         raise MitsimError(
-            "drift: mask_rotation_mrad and vibration_um are formed of separable terms, and "
-            f"{bench.geometry.mask_words} has none; turn that mask in the camera file's [mask]"
+            f"drift: {kinds} would be formed of separable terms, and {camera.mask_words} has none; turn or tilt that "
+            "mask in the camera file's [mask]"
         )
-    if drift.motion is not None and bench.loaded.mirrors:
+    if kinds and bench.loaded.mirrors:
         raise MitsimError(
-            "drift: mask_rotation_mrad and vibration_um are formed of light in cells, and mirrors bring light in none; "
-            "take a scene without mirrors"
+            f"drift: {kinds} would be formed of light in cells, and mirrors bring light in none; take a scene without "
+            "mirrors"
         )
-    camera = bench.geometry
+    if drift.tilt_mrad and camera.mask_thickness:
+        raise MitsimError(
+            f"drift: {kinds} would tilt a mask of {camera.mask_thickness:g} mm, and only thin ones are formed tilted; "
+            "set mask_thickness to 0"
+        )
     if not camera.mask_distance + axis > 0:
         raise MitsimError(
             f"drift: mask_axis_um moves the mask {-axis:g} mm, to the sensor; it is {camera.mask_distance:g} mm off"
@@ -74,8 +83,15 @@ def drifted(bench: Bench, drift: Drift) -> Bench:
         "mask_offset_column": camera.mask_offset_column + column,
         "mask_distance": camera.mask_distance + axis,
         "mask_motion": drift.motion,
+        "mask_lean_mrad": drift.tilt_mrad,
     }
-    return replace(bench, rig=replace(bench.rig, camera=camera.model_copy(update=changed)))
+    moved = camera.model_copy(update=changed)
+    if drift.tilt_mrad and moved.tilt_left_out(moved.diffracts):
+        raise MitsimError(
+            f"drift: {kinds} would tilt the mask until its shadow takes more terms than are formed; give less, or one "
+            "of the two alone"
+        )
+    return replace(bench, rig=replace(bench.rig, camera=moved))
 
 
 def projecting(bench: Bench, drift: Drift) -> Bench:

@@ -137,10 +137,10 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
     if name == "sweep":
         varied = tuple(values_of(text) for text in over)
         return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
-    if name == "drift" and patterns == _MAIN_PATTERNS and measure == _MAIN_MEASURE:
-        return replace(scope, sweep=tuple(values_of(text) for text in over))
+    if name == "drift" and measure == _MAIN_MEASURE:
+        return replace(scope, sweep=tuple(values_of(text) for text in over), patterns=patterns)
     if over or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
-        others = "--measure and --patterns are for sweep, --over for drift and sweep"
+        others = "--measure is for sweep, --over and --patterns for drift and sweep"
         raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
 

@@ -14,11 +14,17 @@ What any change of the frames does to W is a product of small matrices:
 * gains of rows, 1 + u_ij d with a vector d of the rows and u_ij of variance 1 from frame to frame: the square of each
   frame's term of W with diag(d) L in place of L; a ripple of the light has two such d, its cosine and its sine;
 * a frame E added to all: W = (sum_i U_Li)^T E (sum_j U_Rj);
+* pixels whose responses differ by R from what the factors know: W = sum_ij U_Li^T (R o Y_ij) U_Rj;
 * noise of variance v in each datum: the variance of each number of W is v, as U_L and U_R are orthonormal; of a frame
   that is taken off all others v |sum_i U_Li|^2 |sum_j U_Rj|^2, column by column;
 * noise of variance nu^2 in each number of the left factor that the frames do not know of: that of G is
   nu^2 |sum_i p_i(x) U_Li|^2, and so on through the product, and the same of the right one;
-* an error of variance e^2 in each scene pixel's light, equal in all frames: that of W is e^2 s_L^2 s_R^2^T.
+* an error of variance e^2 in each scene pixel's light, equal in all frames: that of W is e^2 s_L^2 s_R^2^T;
+* columns x of the left factor times 1 + eta_x of variance eta^2: eta^2 sum_x (s_L V_L(x))^2 (X V_R S_R)(x)^2; and of
+  the right one.
+
+A pattern of +-1 is the difference of two frames (1 +- P) / 2. What is added to both is gone, their noise and their
+flicker add up, and with gains g+ and g- it is (g+ + g-) / 2 of the pattern and (g+ - g-) / 2 of uniform light.
 
 The expected squared error of X^ is that of its mean and, as V is orthonormal, the sum of F^2 times these variances.
 """
@@ -32,19 +38,12 @@ from functools import cached_property
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.rig.patterns import PatternFamily
 
 Terms = Sequence[tuple[FloatArray, FloatArray]]
 """Separable terms of a camera, left (m, n) and right (m', n') each."""
 Gains = Sequence[float | FloatArray]
 """Root mean squares of gains that know nothing of each other: of a whole frame, or (m,) of its rows."""
-
-
-def check_foretold(family: PatternFamily) -> None:
-    """MitsimError for patterns of a ``family`` whose images are not foretold."""
-    if family.signed:
-        raise MitsimError(f"patterns {family.name!r}: are shown as pairs of frames; take uniform, dots or random")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +69,10 @@ class _Axis:
     def seen(self, factor: FloatArray) -> FloatArray:
         """(K, r, n) terms of G of a ``factor``."""
         return np.asarray(np.einsum("kmr,mn,nk->krn", self.slabs, factor, self.patterns, optimize=True))
+
+    def seen_evenly(self, factor: FloatArray) -> FloatArray:
+        """(K, r, n) the same of uniform light."""
+        return np.asarray(np.einsum("kmr,mn->krn", self.slabs, factor, optimize=True))
 
     @cached_property
     def noise(self) -> FloatArray:
@@ -107,10 +110,14 @@ class Changed:
     ----------
     terms
         what is added to the camera's own separable operator.
-    gain
-        (K, K') gains of the frames on average.
+    gain, gain_apart
+        (K, K') gains of the frames on average; of a pattern that is a difference of two, their mean, and half of what
+        the first has more than the second.
     flicker
         rms of further gains of each frame, all independent: a number each, or (m,) numbers, by row.
+    response
+        (m, m') what each pixel's response differs by from what the factors know, as a part of it; the same in every
+        frame.
     leak
         part of the light of all pixels that is in every frame beside the pattern's.
     added
@@ -122,7 +129,9 @@ class Changed:
 
     terms: Terms = ()
     gain: FloatArray | float = 1.0
+    gain_apart: FloatArray | float = 0.0
     flicker: Gains = ()
+    response: FloatArray | None = None
     leak: float = 0.0
     added: FloatArray | None = None
     added_gain: float = 1.0
@@ -137,13 +146,15 @@ class Noise:
     Attributes
     ----------
     datum
-        of each datum of a frame.
+        of each datum of a frame; of a pattern that is a difference of two, of each of these.
     ambient
         of each datum of a frame that is taken off all others.
     left, right
         of each number of the factors, as far as frames do not share it.
     light
         of each scene pixel's light, as parts of a white board's, in all frames alike.
+    left_light, right_light
+        of what each column of a factor is multiplied by.
     """
 
     datum: float = 0.0
@@ -151,6 +162,8 @@ class Noise:
     left: float = 0.0
     right: float = 0.0
     light: float = 0.0
+    left_light: float = 0.0
+    right_light: float = 0.0
 
     def __add__(self, other: Noise) -> Noise:
         """Both, of sources that do not know of each other."""
@@ -159,14 +172,14 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class LinearImage:
-    """A solver with its lambda fixed; MitsimError for patterns of -1, which are differences of two frames.
+    """A solver with its lambda fixed.
 
     Attributes
     ----------
     left, right
         Phi_L (m, n), Phi_R (m', n').
     family
-        patterns of 0 and 1.
+        the patterns.
     lam
         lambda, above 0.
     centre
@@ -178,9 +191,6 @@ class LinearImage:
     family: PatternFamily
     lam: float
     centre: bool = False
-
-    def __post_init__(self) -> None:
-        check_foretold(self.family)
 
     def expected(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
         """The image of a scene.
@@ -196,43 +206,83 @@ class LinearImage:
         left, right = self._axes
         cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs
         weights, variance = np.zeros_like(self._filter), 0.0
-        gain = np.broadcast_to(changed.gain, (len(left.slabs), len(right.slabs)))
+        gain, apart = (np.broadcast_to(each, self._count) for each in (changed.gain, changed.gain_apart))
         seen = [(left.seen(first), right.seen(second)) for first, second in cameras]
         for row, column in np.ndindex(gain.shape):
-            weights += gain[row, column] * _part(seen, scene, row, column)
-        for rms in changed.flicker:
-            varied = [
-                (left.seen(_by_row(rms) * first), other) for (first, _), (_, other) in zip(cameras, seen, strict=True)
-            ]
+            weights += gain[row, column] * _together(seen, row, column, scene)
+        even = [(left.seen_evenly(first), right.seen_evenly(second)) for first, second in cameras]
+        lit = 1 + 2 * changed.leak
+        if self.family.signed and apart.any():
             for row, column in np.ndindex(gain.shape):
-                variance += self._energy(np.square(_part(varied, scene, row, column)))
-        if changed.leak:
+                weights += apart[row, column] * lit * _together(even, row, column, scene)
+        for rms in changed.flicker:
+            rows = [_by_row(rms) * first for first, _ in cameras]
+            varied = [(left.seen(first), other) for first, (_, other) in zip(rows, seen, strict=True)]
+            varied_evenly = [(left.seen_evenly(first), other) for first, (_, other) in zip(rows, even, strict=True)]
+            for row, column in np.ndindex(gain.shape):
+                squares = np.square(_together(varied, row, column, scene))
+                if self.family.signed:
+                    squares = (squares + np.square(lit * _together(varied_evenly, row, column, scene))) / 2
+                variance += self._energy(squares)
+        if changed.response is not None:
+            weights += self._by_response(changed.response, cameras, scene, gain)
+        if changed.leak and not self.family.signed:
             uniform = sum(first @ scene @ second.T for first, second in cameras)
             weights += changed.leak * left.total.T @ uniform @ right.total
         if changed.added is not None:
-            common = left.total.T @ changed.added @ right.total
-            weights += changed.added_gain * common
-            for rms in changed.added_common:
-                variance += self._energy(np.square(left.total.T @ (_by_row(rms) * changed.added) @ right.total))
-            for rms in changed.added_flicker:
-                varying = _by_row(rms) * changed.added
-                for row, column in np.ndindex(gain.shape):
-                    variance += self._energy(np.square(left.slabs[row].T @ varying @ right.slabs[column]))
+            added, more = self._by_added(changed.added, changed)
+            weights, variance = weights + added, variance + more
         variance += self.variance(scene, noise)
         return Expected(left.basis @ (self._filter * weights) @ right.basis.T, variance)
+
+    def _by_added(self, frame: FloatArray, changed: Changed) -> tuple[FloatArray | float, float]:
+        """What a ``frame`` that is added to all adds to W and to the image's variance."""
+        left, right = self._axes
+        variance, frames = 0.0, 2 if self.family.signed else 1
+        for rms in changed.added_flicker:
+            varying = _by_row(rms) * frame
+            for row, column in np.ndindex(self._count):
+                variance += frames * self._energy(np.square(left.slabs[row].T @ varying @ right.slabs[column]))
+        if self.family.signed:
+            return 0.0, variance
+        for rms in changed.added_common:
+            variance += self._energy(np.square(left.total.T @ (_by_row(rms) * frame) @ right.total))
+        return changed.added_gain * left.total.T @ frame @ right.total, variance
+
+    def _by_response(self, response: FloatArray, cameras: Terms, scene: FloatArray, gain: FloatArray) -> FloatArray:
+        """What pixels' ``response`` adds to W, in frames of a ``scene`` behind ``cameras`` with a ``gain`` (K, K')
+        each."""
+        left, right = self._axes
+        weights = np.zeros_like(self._filter)
+        for row, column in np.ndindex(self._count):
+            lit = np.outer(left.patterns[:, row], right.patterns[:, column]) * scene
+            frame = sum(first @ lit @ second.T for first, second in cameras)
+            weights += gain[row, column] * left.slabs[row].T @ (response * frame) @ right.slabs[column]
+        return weights
 
     def variance(self, scene: FloatArray, noise: Noise) -> float:
         """Sum of the variances of all numbers of the image of a ``scene`` (n, n') by ``noise``."""
         left, right = self._axes
-        total = np.full(self._filter.shape, noise.datum)
+        total = np.full(self._filter.shape, 2 * noise.datum if self.family.signed else noise.datum)
         total += noise.ambient * np.outer(*(np.square(axis.total).sum(axis=0) for axis in (left, right)))
         if noise.left:
             total += noise.left * left.noise @ np.square(scene @ (right.basis * right.singular))
         if noise.right:
             total += noise.right * np.square(scene.T @ (left.basis * left.singular)).T @ right.noise.T
+        if noise.left_light:
+            light = np.square(left.basis * left.singular).T
+            total += noise.left_light * light @ np.square(scene @ (right.basis * right.singular))
+        if noise.right_light:
+            light = np.square(right.basis * right.singular)
+            total += noise.right_light * np.square(scene.T @ (left.basis * left.singular)).T @ light
         if noise.light:
             total += noise.light * np.outer(np.square(left.singular), np.square(right.singular))
         return self._energy(total)
+
+    @property
+    def _count(self) -> tuple[int, int]:
+        """Patterns of rows, and of columns."""
+        return len(self._axes[0].slabs), len(self._axes[1].slabs)
 
     def _energy(self, variance: FloatArray) -> float:
         """Sum over the image of what has this ``variance``, or squares, in W."""
@@ -258,6 +308,15 @@ def _by_row(rms: float | FloatArray) -> FloatArray:
     return np.reshape(np.asarray(rms, dtype=np.float64), (-1, 1))
 
 
-def _part(seen: Sequence[tuple[FloatArray, FloatArray]], scene: FloatArray, row: int, column: int) -> FloatArray:
-    """(r, r') what one frame of a scene brings to W, of terms of G on either side."""
+def _together(seen: Terms, row: int, column: int, scene: FloatArray) -> FloatArray:
+    """(r, r') part of W that one frame of a scene (n, n') has, whose cameras' terms of G are ``seen``, (K, r, n) and
+    (K', r', n').
+
+    Parameters
+    ----------
+    seen, scene
+        as above.
+    row, column
+        of the frame's pattern.
+    """
     return np.asarray(sum(first[row] @ scene @ second[column].T for first, second in seen))

@@ -25,7 +25,17 @@ _NODES_PER_PIXEL = 14
 mrad at the paper's geometry (benchmarks/masks.py)."""
 _MOST_TILTED_TERMS = 64
 """Separable terms that a tilted mask is formed of: 0.8 GB at 512 pixels and as many cells a side."""
-_NOT_KNOWN_BEFORE = ("mask_offset", "mask_plate", "mask_motion", "mask_fft", "rows", "columns", "row_pitch", "roi")
+_NOT_KNOWN_BEFORE = (
+    "mask_offset",
+    "mask_plate",
+    "mask_motion",
+    "mask_lean",
+    "mask_fft",
+    "rows",
+    "columns",
+    "row_pitch",
+    "roi",
+)
 """Beginnings of the names of fields that calibrations of 0.4 do not know."""
 
 
@@ -86,6 +96,10 @@ class CameraGeometry(BaseModel):
     """The mask ``plate``, which no scene states."""
     mask_motion: SkipJsonSchema[MaskMotion | None] = Field(None, exclude=True, description="turn and vibration")
     """What a drift adds between calibration and capture, which no scene states."""
+    mask_lean_mrad: SkipJsonSchema[tuple[float, float] | None] = Field(
+        None, exclude=True, description="tilt by a drift"
+    )
+    """Beside the tilt of a camera file's mask: along rows and along columns, which no scene states."""
     mask_fft: SkipJsonSchema[bool] = Field(False, exclude=True, description="frames by FFT where that is a choice")
     """What a plan chooses, which no scene states."""
 
@@ -237,8 +251,9 @@ class CameraGeometry(BaseModel):
     @property
     def mask_tilt(self) -> tuple[float, float]:
         """How the mask's distance grows along rows and along columns, tangents; (0, 0) for a mask that is even."""
-        tilt = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
-        return math.tan(tilt[0] * 1e-3), math.tan(tilt[1] * 1e-3)
+        made = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
+        lean = self.mask_lean_mrad or (0.0, 0.0)
+        return math.tan((made[0] + lean[0]) * 1e-3), math.tan((made[1] + lean[1]) * 1e-3)
 
     @property
     def tilt_shift_mm(self) -> float:

@@ -17,18 +17,21 @@ from mitsim.core.errors import MitsimError
 
 LARGEST_ROTATION_MRAD = 10.0
 """Beyond it the cosine, which is taken for 1, moves a mask's edge 3 mm off the axis by 0.15 um."""
+LARGEST_TILT_MRAD = 50.0
+"""It lifts that edge by 0.15 mm: a mask that has come loose."""
 UNITS: Mapping[str, str] = MappingProxyType({
     "mask_rows_um": "um", "mask_columns_um": "um", "mask_axis_um": "um", "mask_rotation_mrad": "mrad",
-    "vibration_um": "um rms", "temperature_k": "K", "exposure": "1", "power": "1", "power_ramp": "1",
-    "power_flicker": "1 rms", "power_ripple": "1", "session_ramp": "1", "session_flicker": "1 rms", "lamp": "1",
-    "lamp_flicker": "1 rms", "lamp_ripple": "1", "projector_rows": "pixels", "projector_columns": "pixels",
-    "black_level_dn": "DN",
+    "mask_tilt_rows_mrad": "mrad", "mask_tilt_columns_mrad": "mrad", "vibration_um": "um rms", "temperature_k": "K",
+    "exposure": "1", "power": "1", "power_ramp": "1", "power_flicker": "1 rms", "power_ripple": "1",
+    "session_ramp": "1", "session_flicker": "1 rms", "lamp": "1", "lamp_flicker": "1 rms", "lamp_ripple": "1",
+    "projector_rows": "pixels", "projector_columns": "pixels", "black_level_dn": "DN",
 })  # fmt: skip
 """Unit of each kind of drift: every field of :class:`Drift` that moves something by itself."""
 
 WORDS: Mapping[str, str] = MappingProxyType({
     "mask_rows_um": "mask down the rows", "mask_columns_um": "mask along the columns",
     "mask_axis_um": "mask away from the sensor", "mask_rotation_mrad": "mask turns in its plane",
+    "mask_tilt_rows_mrad": "mask tilts down the rows", "mask_tilt_columns_mrad": "mask tilts along the columns",
     "vibration_um": "vibration of the mask", "temperature_k": "temperature", "exposure": "exposure time",
     "power": "projector's power", "power_ramp": "power over the capture",
     "power_flicker": "power from frame to frame", "power_ripple": "ripple of the power",
@@ -62,6 +65,15 @@ class Drift(BaseModel):
     """A millimetre: a mask that has come loose."""
     mask_rotation_mrad: float = Field(
         default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD, description="mask turns in its plane, mrad"
+    )
+    mask_tilt_rows_mrad: float = Field(
+        default=0.0,
+        ge=-LARGEST_TILT_MRAD,
+        le=LARGEST_TILT_MRAD,
+        description="mask tilts about its centre, its distance growing down the rows, mrad",
+    )
+    mask_tilt_columns_mrad: float = Field(
+        default=0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD, description="the same along the columns, mrad"
     )
     vibration_um: float = Field(
         default=0.0, ge=0, le=1000, description="normal motion of the mask during each exposure, um rms along each axis"
@@ -141,6 +153,12 @@ class Drift(BaseModel):
         """How far the mask moves along rows, columns and axis [mm], for all reasons."""
         axis = self.mask_axis_um + self.gap_um_per_k * self.temperature_k
         return self.mask_rows_um / 1e3, self.mask_columns_um / 1e3, axis / 1e3
+
+    @property
+    def tilt_mrad(self) -> tuple[float, float] | None:
+        """How the mask's distance comes to grow along rows and along columns [mrad]; None where it does not."""
+        tilt = self.mask_tilt_rows_mrad, self.mask_tilt_columns_mrad
+        return tilt if any(tilt) else None
 
     @property
     def motion(self) -> MaskMotion | None:

@@ -30,13 +30,12 @@ from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.calibration import Estimate, decibels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.perturbation import check_foretold
 from mitsim.rig.board import BoardShape
 from mitsim.rig.drift import WORDS, Drift
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.study import plots
-from mitsim.study.budget import CAPTURE, DRIFT, SOLVER, LossRow, losses
+from mitsim.study.budget import CAPTURE, DRIFT, SOLVER, LossRow, entry_variances, losses
 from mitsim.study.charts import bars
 from mitsim.study.drift import SESSION, DriftStand
 from mitsim.study.exposures import LitScene
@@ -111,8 +110,9 @@ class CalibrationFindings:
     session
         frames, seconds of exposure, photoelectrons and photons.
     image
-        of a capture with these factors: ``patterns``, ``psnr_db``, and ``frames``, ``exposure_seconds``,
-        ``photoelectrons`` and ``photons`` of the capture; empty where none was made.
+        of a capture with these factors: ``patterns``, ``psnr_db``, ``predicted_psnr_db`` of all sources of noise
+        together, and ``frames``, ``exposure_seconds``, ``photoelectrons`` and ``photons`` of the capture; empty where
+        none was made.
     losses
         what each source of noise and each drift costs it.
     not_predicted
@@ -175,7 +175,8 @@ class CalibrationFindings:
             return
         image = self.image
         yield (
-            f"image under {image['patterns']}: PSNR {image['psnr_db']:.2f} dB, {image['frames']} frames, "
+            f"image under {image['patterns']}: PSNR {image['psnr_db']:.2f} dB, {image['predicted_psnr_db']:.2f} as "
+            f"predicted of all its sources of noise, {image['frames']} frames, "
             f"{image['exposure_seconds']:.3g} s of exposure, {image['photons']:.3g} photons; it loses by"
         )
         yield from (
@@ -252,6 +253,7 @@ class CalibrationFindings:
         return tuple(f"{name}.png" for name in self.maps)
 
     def _losses_part(self) -> Part:
+        told, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
         ordered = sorted(self.losses, key=lambda row: -row.lost_db)
         rows = [
             (
@@ -259,20 +261,24 @@ class CalibrationFindings:
                 WORDS.get(row.source, row.source),
                 row.amount,
                 f"{row.lost_db:.2f} \N{PLUS-MINUS SIGN} {row.error_db:.2f}",
+                "" if row.of == DRIFT else f"{row.squared_error / told:.2%}",
             )
             for row in ordered
         ]
         untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
         return Part(
             "What an image loses",
-            f"The image of this scene under {self.image['patterns']} has a PSNR of {self.image['psnr_db']:.2f} dB with "
-            "these factors. Noise: what it would gain without that source alone. Drift between calibration and "
-            "capture, by the amounts of the recipe: what it would lose. All are predicted in closed form with lambda "
-            "as it is; the uncertainty is the prediction's own. Losses do not add up. Rendering is the simulation's "
-            "own sampling, which no camera has."
+            f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
+            f"these factors; all sources of noise together are predicted to leave {image['predicted_psnr_db']:.2f} dB. "
+            "Noise: what the image would gain without that source alone, and the source's part of the squared error "
+            "that is predicted; these parts add up, decibels do not. Drift between calibration and capture, by the "
+            "amounts of the recipe: what the image would lose. All are predicted in closed form with lambda as it is; "
+            "the uncertainty is the prediction's own. Nonuniformity: the session has seen the same pixels, so its "
+            "factors hold what the pixels of a row or of a column have alike, and the image loses by the rest. "
+            "Rendering is the simulation's own sampling, which no camera has."
             + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
             + untold,
-            ("Where", "Source", "Amount", "PSNR lost [dB]"),
+            ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
             tuple(rows),
             ("losses.png",),
         )
@@ -313,7 +319,7 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     Raises
     ------
     MitsimError
-        for a recipe with depths, for light beyond what is allowed, and for patterns that losses are not predicted for.
+        for a recipe with depths, and for light beyond what is allowed.
 
     Notes
     -----
@@ -326,7 +332,6 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
             "depths out, and move the board's plane by -D or the scene's scene_distance"
         )
     family = bench.family(request.patterns, request.seed)
-    check_foretold(family)
     Exposure(None, recipe.exposure_fraction).check(bench.rig)
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), request.seed)
     plan = session.plan(request.accuracy, job)
@@ -336,7 +341,8 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
     rows, refused = losses(stand, lit)
-    return replace(found, image=_image(stand), losses=tuple(rows), not_predicted=tuple(refused))
+    told = sum(row.squared_error for row in rows)
+    return replace(found, image=_image(stand, told), losses=tuple(rows), not_predicted=tuple(refused))
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:
@@ -352,13 +358,15 @@ def _factors(lit: LitSession, estimate: Estimate) -> Factors:
     return Factors.of(estimate, manifest)
 
 
-def _image(stand: DriftStand) -> dict[str, Any]:
-    """PSNR of the image without a drift, and what its capture takes."""
+def _image(stand: DriftStand, told: float) -> dict[str, Any]:
+    """PSNR of the image without a drift, that of the squared error which is ``told`` of all sources, and what its
+    capture takes."""
     frames = len(stand.family.shots)
     electrons = stand.electrons
     return {
         "patterns": stand.family.name,
         "psnr_db": stand.before_db,
+        "predicted_psnr_db": -decibels(np.sqrt(told)),
         "frames": frames,
         "exposure_seconds": frames * stand.exposure_s,
         "photoelectrons": electrons,
@@ -403,11 +411,7 @@ def judged(lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[Caus
 
 
 def entry_deviation(lit: LitSession, clean: Estimate, side: str) -> FloatArray:
-    """(m, n) predicted standard deviation of the entries of a factor.
-
-    u_i = Y_i v / |v|^2 has the variance sum_c V_rc v_c^2 / |v|^4 in row r, V being that of a response's pixels, and
-    U H^T / N averages N of them with signs. Noise that all responses share comes into column p by the mean of its
-    signs: all of it where they are all +1, and nothing elsewhere.
+    """(m, n) predicted standard deviation of the entries of a factor, from all sources.
 
     Parameters
     ----------
@@ -416,17 +420,8 @@ def entry_deviation(lit: LitSession, clean: Estimate, side: str) -> FloatArray:
     side
         whose stripes give the factor.
     """
-    common = (clean.right if side == SIDES[0] else clean.left).sum(axis=1)
-    own, shared = (_spread(lit, parts, side, np.square(common)) for parts in lit.response_variances(side))
-    signs = lit.session.signs
-    spread = np.add.outer(own / signs.shape[1], np.zeros(len(signs))) + np.outer(shared, signs.mean(axis=1) ** 2)
-    return np.asarray(np.sqrt(spread) / np.dot(common, common))
-
-
-def _spread(lit: LitSession, parts: dict[str, FloatArray], side: str, weights: FloatArray) -> FloatArray:
-    """(m,) sum over the other side's pixels of the variance of all ``parts``, by ``weights``."""
-    variance = np.broadcast_to(sum(parts.values(), np.zeros(1)), lit.uniform_rate.shape)
-    return np.asarray((variance if side == SIDES[0] else variance.T) @ weights)
+    variances = entry_variances(lit, (clean.left, clean.right), side)
+    return np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
 
 
 def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: FloatArray) -> Iterator[SingularRow]:

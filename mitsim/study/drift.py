@@ -34,12 +34,18 @@ from mitsim.rig.projector import Spectrum
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.sensor.shutter import ripple_response
-from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed, accumulate
+from mitsim.sensor.specimen import specimen
+from mitsim.study.exposures import EQUAL_PEAK, NONUNIFORMITY, RENDERED, LitScene, Unexposed, accumulate
 from mitsim.study.ideal import IdealCamera
 from mitsim.study.metrics import psnr
 
 AMBIENT, SESSION = "ambient frame", "session"
 """Sources of noise beside those of frames."""
+OFFSETS = "offset nonuniformity"
+"""Of pixels: what they read without light, their dark currents' too."""
+_SPLITS = 4
+"""Rounds in which what all pixels of a row, and of a column, respond alike is found. Each leaves (s2 / s1)^2 of what is
+left, s1 and s2 the map's largest singular values: 2e-3 for 24 x 24 pixels that differ by a tenth, less for more."""
 _STEP_MM = 5e-4
 """Shift over which a shadow's slope is taken either way: half a micrometre, a twentieth of a pixel."""
 _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
@@ -167,7 +173,7 @@ class DriftStand:
 
     def _solved(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
         bench = scene.bench
-        moved = any(drift.mask_mm) or drift.motion is not None
+        moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
         expected = scene.expected(RENDERED, self.family, bench=drifted(bench, drift) if moved else None)
         base = self._frames.exposer(self.exposure_s)
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
@@ -240,8 +246,16 @@ class DriftStand:
 
     @property
     def still(self) -> Expected:
-        """What the image without a drift and without any noise is expected to be."""
-        return self.linear.expected(self.lit.truth, self._changed(Drift()))
+        """What the image without a drift, any noise and any difference of pixels is expected to be."""
+        return self.linear.expected(self.lit.truth, replace(self._changed(Drift()), response=None, added=None))
+
+    @cached_property
+    def fixed(self) -> Mapping[str, float]:
+        """Squared error, mean over the image, that each difference of the sensor's pixels makes."""
+        still = self.linear.expected(self.lit.truth).image
+        alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
+        found = {source: self.linear.expected(self.lit.truth, each).image for source, each in alone.items()}
+        return {source: float(np.square(image - still).mean()) for source, image in found.items()}
 
     @cached_property
     def linear(self) -> LinearImage:
@@ -257,7 +271,8 @@ class DriftStand:
     @cached_property
     def noises(self) -> Mapping[str, Noise]:
         """The same by source: those of the frames by name, ``ambient frame`` and ``session``."""
-        found = {name: Noise(datum=variance) for name, variance in self._frames.noises(self.exposure_s).items()}
+        frames = self._frames.noises(self.exposure_s)
+        found = {name: Noise(datum=variance) for name, variance in frames.items() if name != NONUNIFORMITY}
         if self._takes_ambient:
             exposer = self._frames.exposer(self.exposure_s)
             off = exposer.electrons(self._expected.projector_off)
@@ -274,21 +289,48 @@ class DriftStand:
     def _changed(self, drift: Drift) -> Changed:
         """What a ``drift`` changes in the frames, to first order where several things drift at once."""
         count = self.family.left.shape[1], self.family.right.shape[1]
-        ramp = levels(self.seed, "power", count[0] * count[1], drift.power_ramp).reshape(count)
-        flicker = self._gains(drift, "power", drift.power_flicker)
+        ramp = levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
+        gain = (1 + drift.exposure) * (1 + drift.power) * ramp
         changed = Changed(
             terms=self._terms(drift),
             leak=self._leak,
-            gain=(1 + drift.exposure) * (1 + drift.power) * ramp,
-            flicker=flicker,
+            gain=gain.mean(axis=2),
+            gain_apart=(gain[:, :, 0] - gain[:, :, -1]) / 2,
+            flicker=self._gains(drift, "power", drift.power_flicker),
+            response=self._response,
         )
-        if self._takes_ambient:  # and with it black level and dark current
+        if self._expected.has_ambient:  # and with it black level, dark current and offsets, or as parts of a difference
             exposer = self._frames.exposer(1.0)
             lamps = exposer.electrons(self._expected.projector_off)
             each = self._gains(drift, "lamp", drift.lamp_flicker)
             common = [rms / shots_for(self.family) ** 0.5 for rms in each]
             return replace(changed, added=lamps, added_gain=drift.lamp, added_flicker=each, added_common=common)
-        return replace(changed, added=np.full(self.lit.bench.geometry.frame_shape, self._offset(drift)))
+        frame = np.full(self.lit.bench.geometry.frame_shape, self._offset(drift))
+        return replace(changed, added=frame if self._fixed_frame is None else frame + self._fixed_frame)
+
+    @cached_property
+    def _response(self) -> FloatArray | None:
+        """(m, m') what pixels' responses differ by from what factors know: these were measured behind the same pixels,
+        and hold what all pixels of a row, and of a column, have alike."""
+        response = specimen(self.lit.bench.sensor, self.lit.bench.geometry.frame_shape).response
+        if response is None:
+            return None
+        left, right = (np.square(side.sum(axis=1)) for side in (self.factors.left, self.factors.right))
+        columns = np.ones(response.shape[1])
+        for _ in range(_SPLITS):
+            rows = response @ (right * columns) / (right * np.square(columns)).sum()
+            columns = response.T @ (left * rows) / (left * np.square(rows)).sum()
+        return np.asarray(response / np.outer(rows, columns) - 1)
+
+    @cached_property
+    def _fixed_frame(self) -> FloatArray | None:
+        """(m, m') what pixels read beyond what a user takes off without an ambient frame [electrons/s]."""
+        sensor, shape = self.lit.bench.sensor, self.lit.bench.geometry.frame_shape
+        own = specimen(sensor, shape)
+        if (own.offset_e is None and own.dark_e_per_s is None) or self._expected.has_ambient:
+            return None
+        frame = np.zeros(shape) if own.offset_e is None else own.offset_e.astype(np.float64) / self.exposure_s
+        return frame if own.dark_e_per_s is None else frame + own.dark_e_per_s - sensor.superpixel_dark_current_e_per_s
 
     def _gains(self, drift: Drift, source: str, rms: float) -> Gains:
         """Gains of a ``source`` from frame to frame: a flicker of ``rms``, and the cosine and sine of its ripple."""
@@ -333,8 +375,8 @@ class DriftStand:
         camera = IdealCamera(self.lit.bench, self.lit.bench.geometry.mask)
         shadow = ShadowGeometry.of(camera.bench.geometry, camera.bench.geometry.scene_distance)
         row, column = (
-            shadow.crossings(directions) - offset
-            for directions, offset in zip(camera.directions, camera.bench.geometry.mask_offset, strict=True)
+            shadow.along(axis).crossings(directions) - camera.bench.geometry.mask_offset[axis]
+            for axis, directions in enumerate(camera.directions)
         )
         still, ahead, behind = (self._shifted(shift) for shift in (0.0, _STEP_MM, -_STEP_MM))
         found: SeparableTerms = []

@@ -135,7 +135,7 @@ class Scope:
     sweep, measures
         what `mitsim study sweep` varies, values by name, and what it shows; empty for other studies.
     patterns
-        of a sweep that does not vary them.
+        of a sweep that does not vary them, and of a drift.
     recipe
         of a calibration whose drift is studied; None: the shipped one.
     """

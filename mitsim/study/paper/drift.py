@@ -19,6 +19,7 @@ from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.drift import UNITS, WORDS, Drift
+from mitsim.rig.families import check_patterns
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.rig.sensor import load_sensor
 from mitsim.study.charts import curves, paired
@@ -30,7 +31,6 @@ from mitsim.study.pictures import TEST_IMAGES
 from mitsim.study.studio import Studio
 from mitsim.study.table import Mean, Table
 
-PATTERNS = "dots:7"
 _SEEDS = 4
 """Of noise and of what drifts at random: the fewest whose standard error is worth the name, known to 40 %."""
 _LAMPS = ("lamp", "lamp_flicker", "lamp_ripple")
@@ -45,17 +45,21 @@ AGREE_DB = 0.5
 
 def _points(scope: Scope) -> Sequence[Point]:
     drift, first = recipe_of(scope.recipe).drift, scope.seeds[0]
+    check_patterns(scope.patterns)
     amounts = _amounts(scope, drift)
     if not amounts:
         raise MitsimError(f"study drift: the table [drift] of {scope.recipe} moves nothing; give amounts in it")
     if any(kind in _RIPPLES for kind in amounts):  # refused before any light is traced
         load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml")).known_line_time_s()
     found = [
-        Point.of(_setup(scope, kind), recipe=scope.recipe, kind=kind, unit=UNITS[kind], amount=amount, seed=seed)
+        Point.of(
+            _setup(scope, kind), recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=UNITS[kind],
+            amount=amount, seed=seed,
+        )
         for seed in scope.chosen(range(first, first + _SEEDS), scope.seeds)
         for kind, each in amounts.items()
         for amount in each
-    ]
+    ]  # fmt: skip
     return grouped(found)
 
 
@@ -95,10 +99,10 @@ def _measure(studio: Studio, point: Point) -> Found:
     lit = studio.lit(setup)
 
     def stand() -> DriftStand:
-        family = lit.bench.family(PATTERNS, seed)
+        family = lit.bench.family(point["patterns"], seed)
         return DriftStand(lit, _session(studio, point, recipe, Drift()), recipe, family, seed)
 
-    known = studio.once("drift", 1, (setup, point["recipe"], seed), stand)
+    known = studio.once("drift", 1, (setup, point["recipe"], point["patterns"], seed), stand)
     session = _session(studio, point, recipe, drift) if kind.startswith("session") else None
     moved = None
     if kind.startswith("projector"):

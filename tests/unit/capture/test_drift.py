@@ -169,6 +169,35 @@ def test_a_mask_moves_along_the_axis_that_its_drift_names() -> None:
     assert moved.mask_offset_column - still.mask_offset_column == pytest.approx(-5e-3)
 
 
+def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
+    """Of a camera file's mask with that tilt, and with a part of it in the file. (Planted: rows for columns; the file's
+    tilt forgotten; the tilt as if in degrees.)"""
+
+    def made(rows: float, columns: float) -> CameraGeometry:
+        table = {
+            "kind": "separable",
+            "feature_mm": 0.06,
+            "order": 7,
+            "tilt_row_mrad": rows,
+            "tilt_column_mrad": columns,
+        }
+        return MaskProfile.model_validate(table).worn(RIG.camera.model_copy(update={"pixels": 48}), Path())
+
+    def frame(camera: CameraGeometry) -> np.ndarray:
+        cells = Directions.cells(np.linspace(-0.15, 0.15, 4))
+        return np.asarray(sum(left @ right.T for left, right in shadow_terms(camera, cells, cells, 400.0)))
+
+    expected, even = frame(made(6.0, -2.0)), frame(made(0.0, 0.0))
+    for before, drift in (
+        (made(0.0, 0.0), Drift(mask_tilt_rows_mrad=6.0, mask_tilt_columns_mrad=-2.0)),
+        (made(2.0, -2.0), Drift(mask_tilt_rows_mrad=4.0)),
+    ):
+        moved = drifted(replace(bench(), rig=replace(RIG, camera=before)), drift).geometry
+        assert np.linalg.norm(frame(moved) - expected) < 1e-3 * np.linalg.norm(expected - even)
+    assert Drift().tilt_mrad is None and drifted(bench(), Drift()).geometry.identity == bench().geometry.identity
+    assert drifted(bench(), Drift(mask_tilt_rows_mrad=4.0)).geometry.identity != bench().geometry.identity
+
+
 def test_warmth_moves_the_mask_away() -> None:
     moved = drifted(bench(), Drift(temperature_k=20.0, gap_um_per_k=0.5, mask_axis_um=2.0)).geometry
     assert moved.mask_distance == pytest.approx(2.012)
@@ -180,8 +209,16 @@ def test_what_cannot_be_formed_is_refused() -> None:
         drifted(bench(mirrors=True), Drift(vibration_um=1.0))
     mask = MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, "order": 5, "rotation_deg": 1.0})
     turned = mask.worn(RIG.camera, Path())
-    with pytest.raises(MitsimError, match=r"^drift: mask_rotation_mrad [^\n]*\[mask\]$"):
-        drifted(bench(mask="plate", mask_plate=turned.mask_plate), Drift(vibration_um=1.0))
+    for drift in (Drift(vibration_um=1.0), Drift(mask_tilt_columns_mrad=1.0)):
+        with pytest.raises(MitsimError, match=rf"^drift: {drift.kinds[0]} [^\n]*\[mask\]$"):
+            drifted(bench(mask="plate", mask_plate=turned.mask_plate), drift)
+    with pytest.raises(MitsimError, match=r"^drift: mask_tilt_rows_mrad [^\n]*mirrors$"):
+        drifted(bench(mirrors=True), Drift(mask_tilt_rows_mrad=1.0))
+    with pytest.raises(MitsimError, match=r"^drift: mask_tilt_rows_mrad [^\n]*mask_thickness to 0$"):
+        drifted(bench(mask_thickness=0.1), Drift(mask_tilt_rows_mrad=1.0))
+    both = Drift(mask_tilt_rows_mrad=20.0, mask_tilt_columns_mrad=20.0)
+    with pytest.raises(MitsimError, match=r"^drift: mask_tilt_rows_mrad and mask_tilt_columns_mrad [^\n]*alone$"):
+        drifted(bench(pixels=512), both)
     with pytest.raises(MitsimError, match=r"^drift: mask_axis_um [^\n]*$"):
         drifted(bench(mask_distance=0.5), Drift(mask_axis_um=-600.0))
 

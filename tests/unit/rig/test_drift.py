@@ -27,6 +27,8 @@ def test_one_kind_alone() -> None:
     assert both.alone("temperature_k").mask_mm == pytest.approx((0, 0, 1e-3))
     assert both.alone("mask_rows_um", 5).mask_mm == pytest.approx((5e-3, 0, 0))
     assert both.kinds == ("mask_rows_um", "temperature_k")
+    assert Drift(mask_tilt_rows_mrad=2.0, mask_tilt_columns_mrad=-1.0).tilt_mrad == (2.0, -1.0)
+    assert Drift(mask_tilt_columns_mrad=-1.0).tilt_mrad == (0.0, -1.0) and both.tilt_mrad is None
     assert Drift(vibration_um=2.0).motion == MaskMotion(vibration_um=2.0)
 
 
@@ -40,7 +42,10 @@ def test_a_ripple_has_a_frequency_and_keeps_it() -> None:
         Drift(power_ripple_hz=60.0).alone("lamp_ripple", 0.1)
 
 
-@pytest.mark.parametrize(("kind", "amount", "said"), [("speed", 1, "no such kind"), ("power", -2, "power")])
+@pytest.mark.parametrize(
+    ("kind", "amount", "said"),
+    [("speed", 1, "no such kind"), ("power", -2, "power"), ("mask_tilt_rows_mrad", 51, "50")],
+)
 def test_what_cannot_be_is_one_line(kind: str, amount: float, said: str) -> None:
     with pytest.raises(MitsimError, match=rf"^drift[^\n]*{said}[^\n]*$"):
         Drift().alone(kind, amount)

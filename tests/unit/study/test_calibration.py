@@ -1,23 +1,42 @@
-"""The report of a session: errors of factors beside their prediction, on drawn noise; no scene is loaded."""
+"""The report of a session: errors of factors beside their prediction, on drawn noise; losses of an image."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimates
+from mitsim.capture.bench import open_bench
+from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.capture.request import Request
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
+from mitsim.optics.frames import Frame
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import load_recipe
-from mitsim.study.budget import LossRow, gained
+from mitsim.study.budget import LossRow, gained, session_rendering
 from mitsim.study.calibration import CalibrationFindings, _row, judged, measure, singular_rows, spent
 from mitsim.study.page import build_findings
-from tests.unit.capture.test_responses import CLIPPED, EXPOSURE_S, lit_session
+from tests.unit.capture.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 SEEDS = 40
+
+
+class SampledLight(ToyLight):
+    """A toy's light of which each projector pixel has ``parts`` (n, n)."""
+
+    def __init__(self, parts: FloatArray) -> None:
+        super().__init__(len(parts))
+        self.parts = parts
+
+    def frames(self, lighting: Lighting, _: int, leaking: bool = True) -> list[Frame]:
+        pictures = [weights[lighting.labels].reshape(self.parts.shape) * self.parts for weights in lighting.weights]
+        return [Frame(self.left @ picture @ self.right.T / self.unit, 0.0, 0.0, 0.0) for picture in pictures]
 
 
 @pytest.mark.parametrize("mode", ["pair", "uniform"])
@@ -135,21 +154,67 @@ def test_noise_by_source_is_all_noise() -> None:
     assert own["quantisation"] == pytest.approx(own["read noise"] / 12 / sensor.read_noise_e**2)
 
 
+def test_sampled_light_of_a_session_multiplies_columns_of_its_factors() -> None:
+    """30 sessions without noise, each pixel's light 1 % off on its own: squares of 7 and 7 columns, less their common
+    scale; sqrt(2 / 180) is 11 %, three times that. (Planted: spreads of the other side; the error not squared.)"""
+    lit, rng, squares = lit_session(7), np.random.default_rng(8), []
+    assert isinstance(lit.light, ToyLight)
+    factors = lit.light.left, lit.light.right
+    for _ in range(30):
+        light = SampledLight(1 + 0.01 * rng.standard_normal((7, 7)))
+        white = light.frames(Lighting.uniform(7), 0)[0]
+        found, _ = estimate(replace(lit, light=light, white=white), Job(), noise_free=True)  # type: ignore[arg-type]
+        sides = zip((found.left, found.right), factors, strict=True)
+        columns = [(own * exact).sum(axis=0) / np.square(exact).sum(axis=0) for own, exact in sides]
+        squares.append([np.var(each / each.mean(), ddof=1) for each in columns])
+    flux = rng.random(49) + 0.5
+    told = session_rendering(flux, 0.01 * flux, factors)
+    assert np.mean(squares, axis=0) == pytest.approx([told.left_light, told.right_light], rel=0.33)
+    assert told.left_light == pytest.approx(1e-4 / 7, rel=0.5), "the mean over a row of pixels"
+    dark = session_rendering(np.zeros(49), flux, factors)
+    assert dark.left_light == dark.right_light == 0
+
+
+@pytest.mark.parametrize(
+    ("camera", "largest"),
+    [({"prnu_pixel": 0.08, "prnu_row": 0.02, "prnu_column": 0.02}, "response nonuniformity"),
+     ({"dsnu_pixel_e": 400.0, "dsnu_row_e": 100.0, "dark_current_spread_e_per_s": 5.0, "dark_current_e_per_s": 10.0},
+      "offset nonuniformity")],
+)  # fmt: skip
+def test_all_sources_together_are_what_the_image_is_off(
+    camera: dict[str, float], largest: str, small_scene: Callable[..., Path], tmp_path: Path, variant: str
+) -> None:
+    """An even print, of which the model leaves nothing out: to 0.5 dB of a loss that the nonuniformity is most of, its
+    rows' and columns' part of the response nothing of it. (Planted: rows' and columns' responses counted; offsets an
+    exposure time too large; each source twice.)"""
+    own = tmp_path / "camera.toml"
+    stated = shipped("calibration", "imx249.toml").read_text().splitlines()
+    kept = [line for line in stated if line.partition(" =")[0] not in camera]
+    own.write_text("\n".join([*(f"{name} = {value}" for name, value in camera.items()), *kept]))
+    bench = open_bench(str(small_scene(name="even")), variant, camera=own)
+    found = measure(bench, Request.of(patterns="dots:4", accuracy=2e-3, seed=1), Job())
+    assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.5)
+    told = {(row.of, row.source): row.squared_error for row in found.losses}
+    assert told["capture", largest] > 0.7 * sum(told.values()) and told["session", "rendering"] > 0
+    assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(told.values())))
+
+
 def test_the_page_has_every_loss_in_one_table() -> None:
     """With its uncertainty, the largest first; what could not be predicted is said. (Planted: the order of the rows;
-    losses that are 0.00 left out of the table.)"""
+    losses that are 0.00 left out of the table; parts of the error that is measured.)"""
     rows = (
-        LossRow("capture", "shot noise", "", 2.0, 0.1),
+        LossRow("capture", "shot noise", "", 2.0, 0.1, 3e-5),
         LossRow("drift", "mask_rows_um", "0.4 um", 3.0, 0.2),
-        LossRow("session", "read noise", "", 0.0, 0.0),
+        LossRow("session", "read noise", "", 0.0, 0.0, 1e-5),
     )
-    image = {"patterns": "dots:7", "psnr_db": 40.0, "frames": 49, "exposure_seconds": 4.0, "photoelectrons": 1e9,
-             "photons": 2e9}  # fmt: skip
+    image = {"patterns": "dots:7", "psnr_db": 40.0, "predicted_psnr_db": 43.9794, "frames": 49,
+             "exposure_seconds": 4.0, "photoelectrons": 1e9, "photons": 2e9}  # fmt: skip
     spent_ = {"frames": 512.0, "exposure_seconds": 3.0, "photoelectrons": 1e10, "photons": 2e10}
     found = CalibrationFindings((), (), (), {}, (0.1, 0.2), spent_, image, rows, ("vibration_um: no",))
     part = found.parts()[0]
     assert [row[3] for row in part.rows] == ["3.00 \N{PLUS-MINUS SIGN} 0.20", "2.00 \N{PLUS-MINUS SIGN} 0.10",
                                              "0.00 \N{PLUS-MINUS SIGN} 0.00"]  # fmt: skip
+    assert [row[4] for row in part.rows] == ["", "75.00%", "25.00%"] and "to leave 43.98 dB" in part.lead
     assert part.rows[0][:3] == ("drift", "mask down the rows", "0.4 um") and "vibration_um: no" in part.lead
     assert set(found.figures()) >= {"losses.png"} and len(found.tables()["losses.csv"]) == 3
     text = " ".join(found.lines())
