@@ -184,7 +184,6 @@ def test_the_model_of_a_part_of_a_sensor_is_the_models_part(spectrum: Spectrum |
 
     for found, every, most in zip(operators(part), operators(whole), (1e-9, 0.03), strict=True):
         expected = every[20:70, :, 30:91]
-        print(np.linalg.norm(found - expected) / np.linalg.norm(expected))
         assert np.linalg.norm(found - expected) < most * np.linalg.norm(expected)
 
 

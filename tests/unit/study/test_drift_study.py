@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -140,6 +142,19 @@ def test_a_session_whose_power_drifts_gives_other_factors(stand: DriftStand, sig
         assert np.linalg.norm(after - before @ mix) < 0.02 * np.linalg.norm(after - before)
     found = own.outcome(drift, factors)
     assert found.lost_db > 1 and found.predicted_lost_db == pytest.approx(found.lost_db, abs=0.5)
+
+
+def test_a_mask_turned_over_a_region_shifts_that_part_of_its_shadow(stand: DriftStand) -> None:
+    """As many rows as columns, which lie elsewhere. (Planted: rows' places for the columns'.)"""
+    bench = stand.lit.bench
+    camera = bench.geometry.model_copy(update={"roi": (3, 20, 30, 30)})
+    part = replace(bench, rig=replace(bench.rig, camera=camera))
+    lit = cast(LitScene, SimpleNamespace(bench=part, light=stand.lit.light))
+    found, whole = (
+        np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in each._turned(1e-3)))
+        for each in (replace(stand, lit=lit), stand)
+    )
+    np.testing.assert_allclose(found, whole[3:33, :, 20:50], rtol=0, atol=1e-9 * np.abs(whole).max())
 
 
 def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
