@@ -188,8 +188,11 @@ class CalibrationFindings:
 
     def figures(self) -> dict[str, Figure]:
         """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
-        parts = {row.cause: abs(row.part) for row in self.causes if row.part}
-        found = {f"{name}.png": plots.deviations(values, _SHOWN_DEVIATIONS) for name, values in self.maps.items()}
+        parts = {row.cause: row.part for row in self.causes if row.part > 0}
+        found = {
+            f"{name}.png": plots.deviations(values, _SHOWN_DEVIATIONS, f"{name} factor")
+            for name, values in self.maps.items()
+        }
         rows = {
             name: np.array(
                 [(row.value, row.noisy - row.bias, row.standard_error) for row in self.singular if row.factor == name]

@@ -45,7 +45,7 @@ Point = tuple[float, float]
 
 
 def frame(values: npt.ArrayLike) -> Figure:
-    """A sensor frame ``values`` (m, m) [DN] with its colour bar; pixel (0, 0) is top left."""
+    """A sensor frame ``values`` (m, m') [DN] with its colour bar; pixel (0, 0) is top left."""
     # "compressed" makes room around an image of fixed aspect; "constrained" lets the row label run off the figure.
     figure, axes = figure_of(0.75 * _FRAME_WIDTH, _FRAME_WIDTH, layout="compressed")
     drawn = axes.imshow(np.asarray(values, dtype=np.float64), cmap="viridis", interpolation="none")
@@ -77,9 +77,18 @@ def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
     return figure
 
 
-def deviations(values: npt.ArrayLike, largest: float) -> Figure:
-    """Errors of a factor's entries ``values`` (m, n) in predicted deviations, up to ``largest`` of either sign."""
+def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
+    """A map of a factor's errors.
+
+    Parameters
+    ----------
+    values, largest
+        (m, n) error of each entry in predicted deviations, and up to how many the scale goes, of either sign.
+    title
+        what is said above.
+    """
     figure, axes = figure_of(0.5 * WIDTH, 0.5 * WIDTH)
+    axes.set_title(title, fontsize=FONT)
     drawn = axes.imshow(
         np.asarray(values), vmin=-largest, vmax=largest, cmap="RdBu_r", interpolation="none", aspect="auto"
     )
@@ -265,11 +274,11 @@ def shadow_profiles(
     position_mm, profiles
         (pixels,) along the row, and relative irradiance there by light.
     reach_mm, message
-        how far from the middle is shown, and what is said above.
+        how far from the middle of the ``position_mm`` is shown, and what is said above.
     """
     figure, axes = figure_of(0.4 * WIDTH)
     position = np.asarray(position_mm, dtype=np.float64)
-    inside = np.abs(position) <= reach_mm
+    inside = np.abs(position - position.mean()) <= reach_mm
     for index, (name, values) in enumerate(profiles.items()):
         axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **line_style(index))
     axes.set_title(message, fontsize=FONT)

@@ -78,7 +78,8 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
 
 
 def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
-    """What each part buys, and what it takes: the error that is left without it beside the seconds, row by row.
+    """What each part buys, and what it takes: the error that is left without it, and beside it the seconds where any
+    part was timed, row by row.
 
     Parameters
     ----------
@@ -89,10 +90,11 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     """
     figure, _ = figure_of(_AROUND_IN + _ROW_IN * max(len(costs), 1))
     figure.clear()
-    panels: Any = figure.subplots(1, 2, sharey=True)
+    timed = any(part.extra is not None for part in costs)
+    panels: Any = figure.subplots(1, 1 + timed, sharey=True, squeeze=False)[0]
     places = range(len(costs))[::-1]
-    errors, seconds = panels
-    figure.suptitle("What each part of the light buys, and what it takes", fontsize=FONT + 1)
+    errors = panels[0]
+    figure.suptitle(f"What each part of the light buys{', and what it takes' if timed else ''}", fontsize=FONT + 1)
     told = [part.error_if_off for part in costs if part.error_if_off > 0]
     floor = min(told, default=1e-6) / 3
     spans = [part.extra.most for part in costs if part.extra is not None and part.extra.most > 0]
@@ -107,22 +109,9 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
             _beside(errors, part.error_bound, place, f"{part.error_if_off:.1e}")
         else:
             _beside(errors, floor, place, "none")
-        extra = part.extra
-        if extra is None:
-            seconds.plot([shortest], [place], ls="")  # an axis that holds the words
-            _beside(seconds, shortest, place, "not timed")
-        elif extra.within_noise:
-            most = max(extra.most, shortest)
-            seconds.plot([shortest, most], [place, place], color=LINK, lw=2, ls=":", zorder=1)
-            _beside(seconds, most, place, f"within noise, below {extra.most:.1g} s")
-        else:
-            seconds.plot([extra.least, extra.most], [place, place], color=VERMILION, lw=2, zorder=2)
-            seconds.plot([extra.median], [place], "o", **{**dot, "color": VERMILION, "mfc": VERMILION})
-            _beside(seconds, extra.most, place, f"{extra.median:.2g} s")
-    for axes, title in (
-        (errors, "error that is left without it"),
-        (seconds, "seconds that it takes"),
-    ):
+        if timed:
+            _draw_seconds(panels[1], part, place, shortest)
+    for axes, title in zip(panels, ("error that is left without it", "seconds that it takes"), strict=False):
         axes.set_xscale("log")
         axes.set_title(title, fontsize=FONT)
         axes.spines[["top", "right"]].set_visible(False)
@@ -133,12 +122,31 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     errors.set_yticks(list(places), [part.label for part in costs], fontsize=FONT)
     errors.set_ylim(-0.7, len(costs) - 0.3)
     label_axes(errors, "relative error of the frames [1]", "", grid="x")
-    label_axes(seconds, f"wall time of light and frames at {accuracy:g} [s]", "", grid="x")
-    errors.plot([], [], "|-", color=BLUE, lw=1, label="below this at 95 %")
+    if timed:
+        label_axes(panels[1], f"wall time of light and frames at {accuracy:g} [s]", "", grid="x")
+    if any(part.error_bound > part.error_if_off for part in costs):
+        errors.plot([], [], "|-", color=BLUE, lw=1, label="below this at 95 %")
     if not all(part.in_plan for part in costs):
         errors.plot([], [], "o", color=BLUE, mfc="white", ms=8, label="left out by the plan")
-    figure.legend(fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=2)
+    if errors.get_legend_handles_labels()[0]:
+        figure.legend(fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=2)
     return figure
+
+
+def _draw_seconds(axes: Axes, part: PartCost, place: int, shortest: float) -> None:
+    """What a ``part`` takes, in the row at ``place``; lines begin at ``shortest``."""
+    extra = part.extra
+    if extra is None:
+        axes.plot([shortest], [place], ls="")  # an axis that holds the words
+        _beside(axes, shortest, place, "not timed")
+    elif extra.within_noise:
+        most = max(extra.most, shortest)
+        axes.plot([shortest, most], [place, place], color=LINK, lw=2, ls=":", zorder=1)
+        _beside(axes, most, place, f"within noise, below {extra.most:.1g} s")
+    else:
+        axes.plot([extra.least, extra.most], [place, place], color=VERMILION, lw=2, zorder=2)
+        axes.plot([extra.median], [place], "o", color=VERMILION, ms=6 if part.of else 8, zorder=3)
+        _beside(axes, extra.most, place, f"{extra.median:.2g} s")
 
 
 def _draw(axes: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:

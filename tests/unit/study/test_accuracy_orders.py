@@ -57,3 +57,10 @@ def test_rows_of_one_part_stand_by_their_names_in_the_chart() -> None:
     errors, _ = figures.parts(rows, 1e-3).axes
     assert [label.get_text() for label in errors.get_yticklabels()] == ["fog", "fog: 2 surfaces"]
     assert [0.1, 0.2] in [list(line.get_xdata()) for line in errors.lines]
+
+
+def test_a_chart_of_parts_that_were_not_timed_has_no_empty_panel() -> None:
+    """(Planted: both panels always.)"""
+    (errors,) = figures.parts([PartCost("fog", 0.1, 0.1, None, None, True)], 1e-3).axes
+    assert errors.figure.get_suptitle() == "What each part of the light buys"
+    assert not errors.figure.legends, "no bound and nothing left out"

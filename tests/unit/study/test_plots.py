@@ -147,6 +147,15 @@ def test_quality_by_factors_shows_every_value_on_the_line_of_its_system() -> Non
 
 
 def test_shadow_profiles_show_the_middle_of_the_sensor() -> None:
-    axes = plots.shadow_profiles([-1.0, -0.5, 0.0, 0.5, 1.0], {"rays": [1, 2, 3, 4, 5]}, 0.5, "a message").axes[0]
-    assert axes.lines[0].get_xydata().tolist() == [[-0.5, 2.0], [0.0, 3.0], [0.5, 4.0]]
+    """Of a region of interest, its middle. (Planted: the axis, which need not be on it.)"""
+    for middle in (0.0, 4.0):
+        position = [middle + place for place in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+        axes = plots.shadow_profiles(position, {"rays": [1, 2, 3, 4, 5]}, 0.5, "a message").axes[0]
+        shown = [[middle - 0.5, 2.0], [middle, 3.0], [middle + 0.5, 4.0]]
+        assert axes.lines[0].get_xydata().tolist() == shown
     assert "mm" in axes.get_xlabel() and axes.get_title() == "a message"
+
+
+def test_maps_of_errors_say_of_which_factor() -> None:
+    axes, _ = plots.deviations([[1.0, -2.0]], 4.0, "left factor").axes
+    assert axes.get_title() == "left factor" and axes.images[0].get_clim() == (-4.0, 4.0)
