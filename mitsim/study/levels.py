@@ -179,10 +179,9 @@ class Levels:
         asked = request.changed(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)
         shots = capture(bench, asked, light=self._anatomy.without(off))
         calibrated = self._sessions.factors(off, CALIBRATION_NOISE not in off)
-        identity = bench.identity()
         found = {}
         for model, factors in zip(MODELS, (self._assumed, calibrated), strict=True):
-            fitting = replace(factors, manifest=factors.manifest.model_copy(update={"camera": identity}))
+            fitting = replace(factors, manifest=factors.manifest.model_copy(update={"camera": shots.manifest.camera}))
             found[model] = reconstruct(shots, fitting).image
         return found
 
