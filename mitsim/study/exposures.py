@@ -24,6 +24,7 @@ from mitsim.capture.light import Light
 from mitsim.capture.request import Exposure
 from mitsim.capture.session import DARK, READ, ROUNDING, SHOT
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.accumulator import Accumulator
@@ -171,7 +172,14 @@ class Unexposed:
         return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
 
     def prepared(self, binning: int = 1) -> Prepared:
-        """The factorised model of frames whose pixels are averaged ``binning`` x ``binning``."""
+        """The factorised model of frames whose pixels are averaged ``binning`` x ``binning``. MitsimError where such
+        squares do not fill a frame."""
+        rows, columns = (len(side) for side in self.sides)
+        if rows % binning or columns % binning:
+            raise MitsimError(
+                f"frames of {rows} x {columns} pixels: cannot be averaged {binning} x {binning}; give the scene's film "
+                f"multiples of {binning}"
+            )
         left, right = (side.reshape(-1, binning, side.shape[1]).mean(axis=1) for side in self.sides)
         return prepare(left, right, self.family.left, self.family.right, centre=self.centre)
 
@@ -239,6 +247,14 @@ def peak_time(bench: Bench, expected: ExpectedFrames) -> float:
     return Exposure().choose(bench.rig, peak_irradiance(expected))
 
 
+def averaged(frame: FloatArray, binning: int) -> FloatArray:
+    """A ``frame`` (m, m') whose pixels are averaged ``binning`` x ``binning``, which divides both sides."""
+    if binning == 1:
+        return frame
+    rows, columns = (size // binning for size in frame.shape)
+    return np.asarray(frame.reshape(rows, binning, columns, binning).mean(axis=(1, 3)))
+
+
 def accumulate(
     exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
 ) -> list[Accumulator]:
@@ -255,9 +271,7 @@ def accumulate(
     with single_threaded_blas():
         ambient = taken_off(exposer, family, expected)
         for measurement, row, column in exposer.measurements(family, expected):
-            frame = measurement - ambient
-            size = len(frame) // binning
-            binned = frame.reshape(size, binning, size, binning).mean(axis=(1, 3)) if binning > 1 else frame
+            frame = averaged(measurement - ambient, binning)
             for each in sums:
-                each.add(binned, row, column)
+                each.add(frame, row, column)
     return sums

@@ -74,12 +74,12 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    drawn = {"psnr.png": curves(panels(by_patterns(table), "pixels"), "sensor pixels a side, equal peak", log=True)}
+    drawn = {"psnr.png": curves(panels(by_patterns(table), "pixels"), "sensor rows, equal peak", log=True)}
     pixels = table.distinct("pixels")
     for family in _SHOWN:
         if grid := pictured(results, by_print(table.where(patterns=family)), "pixels", pixels):
             drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
-                grid, [f"{each} x {each}" for each in pixels], f"{label(family)}, {EQUAL_PEAK}, by sensor pixels"
+                grid, [f"{each} rows" for each in pixels], f"{label(family)}, {EQUAL_PEAK}, by sensor rows"
             )
     return drawn
 

@@ -1,6 +1,7 @@
 """A studio: the same images as a user gets step by step, the paper's test images on a scene's print, light kept."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import scene_factor
 from mitsim.rig.mask import mls_mask
 from mitsim.study.experiment import Setup
-from mitsim.study.exposures import DIM, DIM_E, EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
+from mitsim.study.exposures import DIM, DIM_E, EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED, averaged
 from mitsim.study.ideal import Plane
 from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
 from mitsim.study.studio import Image, Studio
@@ -143,6 +144,16 @@ def test_binned_frames_are_those_of_larger_pixels(studio: Studio, setup: Setup, 
         assert automatic - 0.05 < best[patterns, 1] < automatic + 6
     assert best["dots:4", 4] > best["dots:4", 1] - 1
     assert best["uniform", 4] < best["uniform", 1] - 1
+
+
+def test_frames_that_are_not_square_are_averaged_by_rows_and_columns(studio: Studio, setup: Setup) -> None:
+    """And refused where squares do not fill them. (Planted: as many columns as rows; columns not looked at.)"""
+    found = averaged(np.arange(24.0).reshape(4, 6), 2)
+    assert found.tolist() == [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]
+    frames = studio.frames(setup, IDEALISED, "dots:4")
+    wide = replace(frames, sides=(np.ones((48, 16)), np.ones((84, 16))))
+    with pytest.raises(MitsimError, match=r"frames of 48 x 84 pixels: cannot be averaged 8 x 8; .* multiples of 8"):
+        wide.prepared(8)
 
 
 def test_an_idealised_plane_casts_the_shadow_of_its_depth(studio: Studio, setup: Setup) -> None:
