@@ -191,6 +191,12 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     return _checked(data, kind, place, ColourManifest)
 
 
+def checked_mosaic(data: Any, place: Path) -> MosaicManifest:
+    """What the ``data`` of a colour.json, found in ``place``, say of a run behind colour filters. MitsimError as
+    :func:`checked_colours`."""
+    return _checked(data, MOSAIC, place, MosaicManifest)
+
+
 def same_lines(run: Path, calibration: Path) -> ColourManifest:
     """The lines of a coloured ``run``; MitsimError where its ``calibration`` has others, or either is not coloured."""
     lines = read_colours(run, RUN)

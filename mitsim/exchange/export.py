@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.core.colours import RUN, is_coloured, read_colours, same_lines
+from mitsim.core.colours import RUN, check_lines, is_coloured, is_mosaic, read_colours, read_mosaic, same_lines
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.output import prepare_output
 
 if TYPE_CHECKING:
-    from mitsim.exchange.coloured import Coloured
+    from mitsim.exchange.coloured import Coloured, Filtered
     from mitsim.exchange.packed import Packed
 
     Run = Packed[RunManifest]
     Calibration = Packed[CalibrationManifest]
-    ColouredRun = Coloured[RunManifest]
+    ColouredRun = Coloured[RunManifest] | Filtered
     ColouredCalibration = Coloured[CalibrationManifest]
 Written = tuple[str, ...]
 """Sentences on what of the run the format does not hold, or how it is used."""
@@ -39,14 +39,17 @@ class Format:
     write
         from the place, the run, the calibration and a projector's name to what is said about them.
     write_lines
-        the same of a coloured run; None: the format has no place for its lines.
+        the same of a coloured run, but for the calibration where there may be none.
+    filters
+        whether it holds runs behind colour filters.
     """
 
     what: str
     kind: Literal["file", "folder"]
     calibration: Literal["needed", "optional", "none"]
     write: Callable[[Path, Run, Calibration | None, str | None], Written]
-    write_lines: Callable[[Path, ColouredRun, ColouredCalibration | None], Written] | None = None
+    write_lines: Callable[[Path, Any, ColouredCalibration | None, str | None], Written]
+    filters: bool = True
 
 
 def _hdf5(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
@@ -56,7 +59,9 @@ def _hdf5(path: Path, run: Run, calibration: Calibration | None, projector: str 
     return ()
 
 
-def _hdf5_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+def _hdf5_lines(
+    path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None
+) -> Written:
     from mitsim.exchange.hdf5 import write_hdf5_lines
 
     write_hdf5_lines(path, run, calibration)
@@ -71,7 +76,7 @@ def _mat(path: Path, run: Run, calibration: Calibration | None, projector: str |
     return (*without, f"Left out: {ELECTRONS}")
 
 
-def _mat_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+def _mat_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None) -> Written:
     from mitsim.exchange.matlab import ELECTRONS, write_matlab_lines
 
     write_matlab_lines(path, run, calibration)
@@ -88,10 +93,29 @@ def _flatcam(path: Path, run: Run, calibration: Calibration | None, projector: s
     return (f"Left out: {ELECTRONS}",)
 
 
+def _flatcam_lines(
+    path: Path, run: Coloured[RunManifest], calibration: ColouredCalibration | None, projector: str | None
+) -> Written:
+    from mitsim.exchange.flatcam import write_flatcam_lines
+    from mitsim.exchange.matlab import ELECTRONS
+
+    if calibration is not None:  # what export_run has seen to
+        write_flatcam_lines(path, run, calibration)
+    return (f"Left out: {ELECTRONS}",)
+
+
 def _png(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
     from mitsim.exchange.pngs import write_pngs
 
     return write_pngs(path, run, projector)
+
+
+def _png_lines(
+    path: Path, run: Coloured[RunManifest], calibration: ColouredCalibration | None, projector: str | None
+) -> Written:
+    from mitsim.exchange.pngs import write_pngs_lines
+
+    return write_pngs_lines(path, run, projector)
 
 
 def _torch(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
@@ -101,7 +125,9 @@ def _torch(path: Path, run: Run, calibration: Calibration | None, projector: str
     return ()
 
 
-def _torch_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+def _torch_lines(
+    path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None
+) -> Written:
     from mitsim.exchange.tensors import write_tensors_lines
 
     write_tensors_lines(path, run, calibration)
@@ -116,11 +142,13 @@ def _deepinv(path: Path, run: Run, calibration: Calibration | None, projector: s
     return _read_by(path)
 
 
-def _deepinv_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None) -> Written:
+def _deepinv_lines(
+    path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None
+) -> Written:
     from mitsim.exchange.tensors import extra
 
     extra("deepinv")
-    _torch_lines(path, run, calibration)
+    _torch_lines(path, run, calibration, projector)
     return _read_by(path)
 
 
@@ -131,10 +159,10 @@ def _read_by(path: Path) -> Written:
 FORMATS: dict[str, Format] = {
     "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", _hdf5, _hdf5_lines),
     "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", _mat, _mat_lines),
-    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", _flatcam),
+    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", _flatcam, _flatcam_lines, False),
     "deepinv": Format("tensors of a deepinv physics", "file", "needed", _deepinv, _deepinv_lines),
     "torch": Format("tensors for torch.load", "file", "optional", _torch, _torch_lines),
-    "png": Format("frames as pictures, patterns for a real projector", "folder", "none", _png),
+    "png": Format("pictures of frames, patterns for a real projector", "folder", "none", _png, _png_lines, False),
 }
 """Formats by the name that `--format` takes."""
 
@@ -152,7 +180,7 @@ def export_run(
     Parameters
     ----------
     run
-        RUN folder, or a coloured one.
+        RUN folder, a coloured one, or one behind colour filters.
     format
         a key of :data:`FORMATS`.
     output
@@ -186,23 +214,23 @@ def export_run(
         raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
     lines = _lines(folder, factors)
-    if lines and chosen.write_lines is None:
-        raise MitsimError(
-            f"{folder}: is coloured, and {format} has no place for its lines; export the folder of each, as "
-            f"{folder / lines[0]}"
-        )
+    filtered = is_mosaic(folder)
+    if filtered and not chosen.filters:
+        able = ", ".join(name for name, other in FORMATS.items() if other.filters)
+        raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
     for line in lines or ("",):  # refused before numpy is imported
-        read_manifest(folder / line, RunManifest)
+        read_manifest(folder if filtered else folder / line, RunManifest)
         if factors is not None:
             read_manifest(factors / line, CalibrationManifest)
     if chosen.kind == "file":
         prepare_output(place, overwrite, "file")
-    if chosen.write_lines is not None and lines:
-        from mitsim.exchange.coloured import coloured_calibration, coloured_run
+    if lines:
+        from mitsim.exchange.coloured import coloured_calibration, coloured_run, filtered_run, run_parts
 
-        coloured = coloured_run(folder)
-        shots = [*coloured.lines.values()]
-        notes = chosen.write_lines(place, coloured, None if factors is None else coloured_calibration(factors))
+        coloured = filtered_run(folder) if filtered else coloured_run(folder)
+        shots = [*run_parts(coloured).values()]
+        calibrated = None if factors is None else coloured_calibration(factors)
+        notes = chosen.write_lines(place, coloured, calibrated, projector)
     else:
         from mitsim.exchange.packed import packed_calibration, packed_run
 
@@ -218,7 +246,12 @@ def export_run(
 
 
 def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:
-    """Names of a coloured run's lines, which are its calibration's too; none of another run."""
+    """Names of a run's lines, which are its calibration's too; none of a run that tells none apart."""
+    if is_mosaic(run):
+        colours = read_mosaic(run)
+        if calibration is not None:
+            check_lines(colours, str(run), calibration)
+        return colours.names
     if not is_coloured(run):
         if calibration is not None and is_coloured(calibration):
             raise ArgumentError("calibration", f"{calibration}: is coloured, but {run} is not; give a line's folder")

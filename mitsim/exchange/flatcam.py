@@ -3,25 +3,35 @@
 FlatCam (Asif et al. 2017, arXiv 1509.00116) has a colour sensor and calibrates each of its four planes: a plane of a
 frame, less the means of its rows and columns, is P1 X Q1^T. The loader of https://github.com/tanjasper/flatcam takes
 plane b from row 0 and column 0 on, every second one, gb from (0, 1), gr from (1, 0), r from (1, 1). A monochrome frame
-has the same four planes, whose factors are every second row of both.
+has the same four planes, whose factors are every second row of both. A coloured run has a whole frame of each line: it
+is a plane of a frame of twice the rows and columns, so that nothing is left out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.colours import RUN, ColourManifest
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channels, Metadata
-from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest, ShotFile
+from mitsim.core.manifests import CalibrationManifest, RunManifest, ShotFile
+from mitsim.exchange.coloured import Coloured, unpacked_colours
 from mitsim.exchange.matlab import (
+    COLOURED,
+    Variables,
     array_in,
     calibration_in,
+    colours_in,
     dn_per_rate,
+    endings,
     factors_in_dn,
+    lines_in,
     matrix_in,
     of_folders,
     read_variables,
@@ -31,6 +41,9 @@ from mitsim.exchange.matlab import (
 )
 from mitsim.exchange.packed import FACTORS, Packed, checked_channel, shots_of, unpacked_run
 from mitsim.exchange.planes import PLANES, check_channel
+
+_COLOURS = (("r",), ("gr", "gb"), ("b",))
+"""Planes of each colour, the longest wavelength first. Either green plane has the whole frame."""
 
 
 def write_flatcam(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest]) -> None:
@@ -50,24 +63,50 @@ def write_flatcam(path: Path, run: Packed[RunManifest], calibration: Packed[Cali
     MitsimError
         for other frames, or more of them than such a file holds.
     """
-    factors = factors_in_dn(calibration, dn_per_rate(run.manifest.digital))
-    rows, columns = (len(factors[side]) for side in SIDES)
-    if rows % 2 or columns % 2:
-        raise MitsimError(f"{run.place}: frames are {rows}x{columns}; FlatCam's four planes need even sides, use mat")
-    count = len(run.manifest.patterns.captures)
-    meas = np.empty((rows, columns, count), order="F")
-    for index, (shot, channels, _) in enumerate(shots_of(run)):
-        if channels["DN"].shape != (rows, columns):
-            raise MitsimError(f"{run.place / shot.file}: is not {rows}x{columns}, as the calibration; calibrate again")
-        meas[:, :, index] = channels["DN"]
-    variables: dict[str, Any] = {"meas": meas, "dn_class": channels["DN"].dtype.name}
-    variables["cSize"], variables["angle"] = np.array([[rows // 2, columns // 2]], float), 0.0
-    for name, (row, column) in PLANES.items():
-        variables[f"P1{name}"] = _centred(factors["left"][row::2])
-        variables[f"Q1{name}"] = _centred(factors["right"][column::2])
-    exact = {f"phi_{side}": factor for side, factor in factors.items()}
-    left, right = run.manifest.patterns.matrices
-    write_variables(path, {**variables, **exact, "PL": left, "PR": right, **of_folders(run, calibration)})
+    left, right = factors_in_dn(calibration, dn_per_rate(run.manifest.digital)).values()
+    if len(left) % 2 or len(right) % 2:
+        size = f"{len(left)}x{len(right)}"
+        raise MitsimError(f"{run.place}: frames are {size}; FlatCam's four planes need even sides, use mat")
+    meas = np.empty((len(left), len(right), len(run.manifest.patterns.captures)), order="F")
+    kind = _fill(meas, run)
+    factors = {name: (left[row::2], right[column::2]) for name, (row, column) in PLANES.items()}
+    variables = {"meas": meas, "dn_class": kind, **_planes(factors)}
+    write_variables(path, {**variables, **of_folders(run, calibration)})
+
+
+def write_flatcam_lines(path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest]) -> None:
+    """Write a coloured run with FlatCam's variables, whole or not at all: each plane is the whole frame of a line.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        of three lines, of which the longest is taken for red and the shortest for blue.
+    calibration
+        of the same lines.
+
+    Raises
+    ------
+    MitsimError
+        for lines that are not three or differ in the number or size of their frames, and as for :func:`write_flatcam`.
+    """
+    ends, planes = endings(run.colours.names, path), _lines_of_planes(run.colours, path)
+    counts = {name: len(run.lines[name].manifest.patterns.captures) for name in run.colours.names}
+    if len({*counts.values()}) > 1:
+        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise MitsimError(f"{path}: frames are {told}, but FlatCam's planes are of one frame; use mat")
+    sides, variables = {}, colours_in(run, calibration)
+    for name, shots in run.lines.items():
+        sides[name] = tuple(factors_in_dn(calibration.lines[name], dn_per_rate(shots.manifest.digital)).values())
+    rows, columns = (len(side) for side in sides[planes["r"]])
+    meas = np.empty((2 * rows, 2 * columns, counts[planes["r"]]), order="F")
+    for plane, name in planes.items():
+        row, column = PLANES[plane]
+        kind = _fill(meas[row::2, column::2], run.lines[name])
+        own = {"dn_class": kind, **of_folders(run.lines[name], calibration.lines[name])}
+        variables.update({f"{key}{ends[name]}": values for key, values in own.items()})
+    write_variables(path, {**variables, "meas": meas, **_planes({plane: sides[planes[plane]] for plane in PLANES})})
 
 
 def read_flatcam(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
@@ -76,17 +115,25 @@ def read_flatcam(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationMan
     MitsimError for a file that is none, or is damaged.
     """
     variables = read_variables(path)
-    manifest = unpacked_run(text_in(variables, "run_manifest", path), path)
-    captures = manifest.patterns.captures
-    shape = np.asarray(variables.get("meas")).shape[:2]
-    meas = array_in(variables, "meas", (*shape, len(captures)), path)
-    index = {shot.file: number for number, shot in enumerate(captures)}
+    return _folders_in(variables, _meas_in(variables, path), path)
 
-    def frame(shot: ShotFile) -> Any:
-        """The frame of a ``shot``, (rows, columns)."""
-        return meas[:, :, index[shot.file]]
 
-    return run_in(variables, manifest, frame, path), calibration_in(variables, manifest.digital, path)
+def read_flatcam_lines(path: Path) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
+    """Coloured run and calibration in the file ``path`` of :func:`write_flatcam_lines`.
+
+    MitsimError for a file that is none, or is damaged.
+    """
+    variables = read_variables(path)
+    meas = _meas_in(variables, path)
+    colours = unpacked_colours(text_in(variables, COLOURED, path), RUN, path)
+    planes = {name: plane for plane, name in _lines_of_planes(colours, path).items()}
+
+    def folders_in(name: str, own: Variables) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
+        """Run and calibration of the line ``name``, whose other variables are its ``own``."""
+        row, column = PLANES[planes[name]]
+        return _folders_in(own, meas[row::2, column::2], path)
+
+    return lines_in(variables, folders_in, path)
 
 
 def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]:
@@ -133,3 +180,56 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
 def _centred(factor: FloatArray) -> FloatArray:
     """A ``factor`` (pixels, n) of frames that lose the means of their rows and columns."""
     return np.asarray(factor - factor.mean(axis=0))
+
+
+def _lines_of_planes(colours: ColourManifest, path: Path) -> dict[str, str]:
+    """Name of the line that each plane is of."""
+    if len(colours.names) != len(_COLOURS):
+        raise MitsimError(
+            f"{path}: lines are {', '.join(colours.names)}; FlatCam has red, green and blue, so use mat, or export the "
+            "folder of a line"
+        )
+    by_length = sorted(colours.channels, key=lambda line: -line.wavelength_nm)
+    return {plane: line.name for line, planes in zip(by_length, _COLOURS, strict=True) for plane in planes}
+
+
+def _fill(meas: npt.NDArray[Any], run: Packed[RunManifest]) -> str:
+    """Put a run's frames into ``meas`` (rows, columns, shots); returns the type of their numbers."""
+    for index, (shot, channels, _) in enumerate(shots_of(run)):
+        if channels["DN"].shape != meas.shape[:2]:
+            rows, columns = meas.shape[:2]
+            raise MitsimError(f"{run.place / shot.file}: is not {rows}x{columns}, as the calibration; calibrate again")
+        meas[:, :, index] = channels["DN"]
+    return channels["DN"].dtype.name
+
+
+def _meas_in(variables: Variables, path: Path) -> npt.NDArray[Any]:
+    meas = np.asarray(variables["meas"])
+    if meas.ndim < 2:
+        raise MitsimError(f"{path}: meas is {meas.dtype} of shape {meas.shape}, and no frames; export it again")
+    return meas
+
+
+def _planes(factors: Mapping[str, tuple[FloatArray, ...]]) -> dict[str, Any]:
+    """FlatCam's variables of the left and right ``factors`` of each plane."""
+    variables: dict[str, Any] = {"angle": 0.0}
+    for plane, (left, right) in factors.items():
+        variables["cSize"] = np.array([[len(left), len(right)]], float)
+        variables.update({f"P1{plane}": _centred(left), f"Q1{plane}": _centred(right)})
+    return variables
+
+
+def _folders_in(
+    variables: Variables, meas: npt.NDArray[Any], path: Path
+) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
+    """Run and calibration of whose frames ``meas`` is."""
+    manifest = unpacked_run(text_in(variables, "run_manifest", path), path)
+    captures = manifest.patterns.captures
+    frames = array_in({"meas": meas}, "meas", (*meas.shape[:2], len(captures)), path)
+    index = {shot.file: number for number, shot in enumerate(captures)}
+
+    def frame(shot: ShotFile) -> Any:
+        """The frame of a ``shot``, (rows, columns)."""
+        return frames[:, :, index[shot.file]]
+
+    return run_in(variables, manifest, frame, path), calibration_in(variables, manifest.digital, path)

@@ -1,6 +1,6 @@
 """A RUN folder, and a CAL folder beside it, in one HDF5 file: folders in, the file out, and back, bit for bit.
 
-The layout stands in docs/formats.md. Shots are chunks of their own, so that one is read without the others.
+The layout stands in docs/exchange.md. Shots are chunks of their own, so that one is read without the others.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim import __version__
-from mitsim.core.colours import CALIBRATION, RUN
+from mitsim.core.colours import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import Channels, Metadata, Value
 from mitsim.core.jsonfile import parse_json
@@ -24,7 +24,7 @@ from mitsim.core.output import whole_file
 from mitsim.core.plainfile import MOST_SIDE, check_plain
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture
-from mitsim.exchange.coloured import Coloured, line_of, unpacked_colours
+from mitsim.exchange.coloured import Coloured, Filtered, line_of, run_parts, unpacked_colours, unpacked_filters
 from mitsim.exchange.packed import (
     FACTORS,
     Packed,
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 
     from mitsim.reconstruct.factors import Factors
 
-Run = Packed[RunManifest] | Coloured[RunManifest]
+Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
 Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
 _LINES = "lines"
-"""Group that has a group of each line of a coloured run."""
+"""Group that has a group of each line."""
 LAYOUT = 1
 """Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
 _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
@@ -69,20 +69,21 @@ def write_hdf5(path: Path, run: Packed[RunManifest], calibration: Packed[Calibra
         for shots that differ in shape or channels, or a file that cannot be read or written.
     """
     with _begun(path) as file:
-        _write_folders(file, run, calibration)
+        _write_run(file, run)
+        _write_calibration(file, calibration)
 
 
 def write_hdf5_lines(
-    path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest] | None = None
+    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None = None
 ) -> None:
-    """Write a coloured run to one file, whole or not at all.
+    """Write a run of several lines to one file, whole or not at all.
 
     Parameters
     ----------
     path
         of the file.
     run
-        whose lines have shots of one shape each.
+        with shots of one shape, each line's where they are told apart.
     calibration
         of the same lines.
 
@@ -92,12 +93,19 @@ def write_hdf5_lines(
         as for :func:`write_hdf5`.
     """
     with _begun(path) as file:
-        _write_text(file, RUN, run.text)
+        _write_text(file, run.colours.kind, run.text)
         if calibration is not None:
             _write_text(file, CALIBRATION, calibration.text)
+        if isinstance(run, Filtered):
+            _write_run(file, run.shots)
         lines = file.create_group(_LINES, track_order=True)
-        for name, shots in run.lines.items():
-            _write_folders(lines.create_group(name, track_order=True), shots, line_of(calibration, name))
+        for name in run.colours.names:
+            line = lines.create_group(name, track_order=True)
+            if not isinstance(run, Filtered):
+                _write_run(line, run.lines[name])
+            elif name in run.truths:
+                _write_frame(line.create_group("truth"), *run.truths[name])
+            _write_calibration(line, line_of(calibration, name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,17 +141,20 @@ class ExchangeFile:
 @contextmanager
 def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFile]:
     """The file ``path`` of :func:`write_hdf5`, or one ``line`` of that of :func:`write_hdf5_lines`, while the context
-    lasts.
+    lasts. Behind colour filters the run is that of all lines, and a ``line`` is needed for its calibration alone.
 
     MitsimError for a file that is missing or damaged, is none of these, or leads to other files; and for a line that it
     does not have.
     """
     with open_folders(path) as (run, calibration):
-        runs = {**run.lines} if isinstance(run, Coloured) else {"": run}
+        runs = {**run.lines} if isinstance(run, Coloured) else run_parts(run)
+        if isinstance(run, Filtered):
+            runs.update(dict.fromkeys(run.colours.names, run.shots))
         factors = {**calibration.lines} if isinstance(calibration, Coloured) else {"": calibration}
         name = line or ""
         if name not in runs:
-            known = f"{', '.join(runs)}; give one" if isinstance(run, Coloured) else "no lines; leave it out"
+            lines = ", ".join(filter(None, runs))
+            known = f"{lines}; give one" if lines else "no lines; leave it out"
             raise ArgumentError("line", f"{line!r}: {path} has {known}")
         yield ExchangeFile(runs[name], factors.get(name))
 
@@ -197,9 +208,7 @@ def _begun(path: Path) -> Iterator[h5py.File]:
         yield file
 
 
-def _write_folders(
-    place: h5py.Group, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None
-) -> None:
+def _write_run(place: h5py.Group, run: Packed[RunManifest]) -> None:
     group = _begin(place, "run", run)
     _write_shots(group, run)
     ambient = run.manifest.ambient_frame
@@ -207,6 +216,9 @@ def _write_folders(
     for name, source in {**named, "truth": TRUTH}.items():
         if source in run.names:
             _write_frame(group.create_group(name), *run.read(source))
+
+
+def _write_calibration(place: h5py.Group, calibration: Packed[CalibrationManifest] | None) -> None:
     if calibration is not None:
         group = _begin(place, "calibration", calibration)
         for name in FACTORS:
@@ -258,21 +270,39 @@ def _of_one(place: h5py.Group, path: Path) -> tuple[Packed[RunManifest], Packed[
     return _run(place, path), _calibration(place, path) if "calibration" in place else None
 
 
-def _of_lines(file: h5py.File, path: Path) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
-    text, group = _text_in(file, RUN, path), _group(file, _LINES, path)
-    colours = unpacked_colours(text, RUN, path)
-    held = {name: _of_one(_group(group, name, path), path) for name in colours.names}
-    run = Coloured(colours, text, {name: shots for name, (shots, _) in held.items()})
+def _of_lines(
+    file: h5py.File, path: Path
+) -> tuple[Coloured[RunManifest] | Filtered, Coloured[CalibrationManifest] | None]:
+    group, run = _group(file, _LINES, path), _coloured(file, path) if RUN in file else _filtered(file, path)
     if CALIBRATION not in file:
         return run, None
     text = _text_in(file, CALIBRATION, path)
     colours, calibrations = unpacked_colours(text, CALIBRATION, path), {}
     for name in colours.names:
-        calibration = held.get(name, (None, None))[1]
-        if calibration is None:
+        if name not in run.colours.names or "calibration" not in group[name]:
             raise MitsimError(f"{path}: has no calibration of {name}; export it again")
-        calibrations[name] = calibration
+        calibrations[name] = _calibration(_group(group, name, path), path)
     return run, Coloured(colours, text, calibrations)
+
+
+def _coloured(file: h5py.File, path: Path) -> Coloured[RunManifest]:
+    text = _text_in(file, RUN, path)
+    colours = unpacked_colours(text, RUN, path)
+    return Coloured(colours, text, {name: _run(line, path) for name, line in _lines_of(file, colours, path).items()})
+
+
+def _filtered(file: h5py.File, path: Path) -> Filtered:
+    text, shots = _text_in(file, MOSAIC, path), _run(file, path)
+    colours = unpacked_filters(text, shots, path)
+    lines = _lines_of(file, colours, path)
+    truths = {name: _frame(_group(line, "truth", path), path) for name, line in lines.items() if "truth" in line}
+    return Filtered(colours, text, shots, truths)
+
+
+def _lines_of(file: h5py.File, colours: ColourManifest, path: Path) -> dict[str, h5py.Group]:
+    """The group of each line."""
+    group = _group(file, _LINES, path)
+    return {name: _group(group, name, path) for name in colours.names}
 
 
 def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:

@@ -15,7 +15,7 @@ from mitsim.exchange.planes import check_channel
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import CalibrationManifest, RunManifest
-    from mitsim.exchange.coloured import Coloured
+    from mitsim.exchange.coloured import Coloured, Filtered
     from mitsim.exchange.packed import Packed
 
 
@@ -31,7 +31,7 @@ class Loaded:
         parts of a run that the file does not hold.
     """
 
-    run: Packed[RunManifest] | Coloured[RunManifest] | None
+    run: Packed[RunManifest] | Coloured[RunManifest] | Filtered | None
     calibration: Packed[CalibrationManifest] | Coloured[CalibrationManifest] | None
     left_out: tuple[str, ...] = ()
 
@@ -48,14 +48,16 @@ def _hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
 
 @contextmanager
 def _matlab(path: Path, channel: str | None) -> Iterator[Loaded]:
-    from mitsim.exchange.flatcam import flatcam_calibration, read_flatcam
-    from mitsim.exchange.matlab import COLOURED, ELECTRONS, names_in, read_matlab, read_matlab_lines
+    from mitsim.exchange.flatcam import flatcam_calibration, read_flatcam, read_flatcam_lines
+    from mitsim.exchange.matlab import COLOURED, ELECTRONS, FILTERED, names_in, read_matlab, read_matlab_lines
 
     if channel is not None:
         yield Loaded(None, flatcam_calibration(path, channel))
     else:
         names = names_in(path)
-        read: Any = read_flatcam if "meas" in names else read_matlab_lines if COLOURED in names else read_matlab
+        read: Any = read_matlab_lines if names & {COLOURED, FILTERED} else read_matlab
+        if "meas" in names:
+            read = read_flatcam_lines if COLOURED in names else read_flatcam
         run, calibration = read(path)
         yield Loaded(run, calibration, (ELECTRONS,))
 
@@ -106,9 +108,9 @@ def import_file(
             folders = [(stack.enter_context(whole_folder(place)), held) for place, held in wanted.values() if place]
             for folder, held in folders:
                 held.fill(folder)
-    from mitsim.exchange.coloured import parts_of
+    from mitsim.exchange.coloured import parts_of, run_parts
 
-    runs = {} if loaded.run is None else parts_of(loaded.run)
+    runs = {} if loaded.run is None else run_parts(loaded.run)
     calibrations = {} if loaded.calibration is None else parts_of(loaded.calibration)
     return {
         "frames": sum(len(part.manifest.patterns.captures) for part in runs.values()) if runs else None,

@@ -23,16 +23,14 @@ from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManife
 from mitsim.core.output import whole_file
 from mitsim.core.plainfile import check_plain
 from mitsim.core.recorders import TRUTH
-from mitsim.exchange.coloured import Coloured, line_of, unpacked_colours
+from mitsim.exchange.coloured import Coloured, Filtered, line_of, unpacked_colours, unpacked_filters
 from mitsim.exchange.packed import FACTORS, Packed, checked_channel, manifest_text, shots_of, unpacked, unpacked_run
 
 Variables = Mapping[str, Any]
 LARGEST_VARIABLE = (1 << 31) - 1
 """Bytes of an array in a file of version 5."""
-_TEXTS = {"run_manifest": "run", "calibration_manifest": "calibration"}
-"""Variables that hold manifests."""
-COLOURED, _CALIBRATED = "colour_run", "colour_calibration"
-"""Variables that hold the colour.json of a coloured run and calibration."""
+COLOURED, FILTERED, _CALIBRATED = "colour_run", "mosaic_run", "colour_calibration"
+"""Variables that hold the colour.json of a coloured run, of one behind colour filters, and of a calibration."""
 _LONGEST_LINE = 31
 """Letters of a line's name: a variable of MATLAB has 63 at most, truth_board_reflectance_ half of them."""
 ELECTRONS = "expected electrons of the frames"
@@ -60,16 +58,17 @@ def write_matlab(path: Path, run: Packed[RunManifest], calibration: Packed[Calib
 
 
 def write_matlab_lines(
-    path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest] | None
+    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
 ) -> None:
-    """Write a coloured run with the paper's variables of each line, their names ending in its: `phi_left_638nm`.
+    """Write a run of several lines with the paper's variables, those of a line ending in its name: `phi_left_638nm`.
 
     Parameters
     ----------
     path
         of the file.
     run
-        with lines called as `mitsim capture` calls them.
+        with lines called as `mitsim capture` calls them. Behind colour filters the frames are those of all lines, and
+        only the truths and factors of each line end in its name; `weights` is (4, lines) of what each filter passes.
     calibration
         of the same lines; without one `phi_left_638nm` and so on are left out.
 
@@ -78,11 +77,15 @@ def write_matlab_lines(
     MitsimError
         for lines whose names cannot end one of a variable, and as for :func:`write_matlab`.
     """
-    variables: dict[str, Any] = {COLOURED: run.text}
-    if calibration is not None:
-        variables[_CALIBRATED] = calibration.text
-    for name, end in _endings(run.colours.names, path).items():
-        held = _variables(run.lines[name], line_of(calibration, name))
+    ends, variables = endings(run.colours.names, path), colours_in(run, calibration)
+    if isinstance(run, Filtered):
+        variables.update({**_variables(run.shots, None), "weights": np.array(run.colours.weights)})
+    for name, end in ends.items():
+        if isinstance(run, Filtered):
+            held = truth_variables(*run.truths[name]) if name in run.truths else {}
+            held.update(calibration_variables(line_of(calibration, name), run.shots.manifest.digital))
+        else:
+            held = _variables(run.lines[name], line_of(calibration, name))
         variables.update({f"{key}{end}": values for key, values in held.items()})
     write_variables(path, variables)
 
@@ -95,31 +98,100 @@ def read_matlab(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationMani
     return _folders_in(read_variables(path), path)
 
 
-def read_matlab_lines(path: Path) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
-    """Coloured run and calibration in the file ``path`` of :func:`write_matlab_lines`.
+def read_matlab_lines(path: Path) -> tuple[Coloured[RunManifest] | Filtered, Coloured[CalibrationManifest] | None]:
+    """Run and calibration in the file ``path`` of :func:`write_matlab_lines`.
 
     MitsimError for a file that is none, or is damaged.
     """
     variables = read_variables(path)
+    if FILTERED in variables:
+        return _filtered_in(variables, path)
+    return lines_in(variables, lambda name, own: _folders_in(own, path), path)
+
+
+def lines_in(
+    variables: Variables,
+    folders_in: Callable[[str, Variables], tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]],
+    path: Path,
+) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
+    """Coloured run and calibration in a file.
+
+    Parameters
+    ----------
+    variables
+        of the file.
+    folders_in
+        from a line's name and the variables that end in it, without that ending, to its run and calibration.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for a line that is missing, and as ``folders_in``.
+    """
     text = text_in(variables, COLOURED, path)
     colours = unpacked_colours(text, RUN, path)
-    runs, calibrations = {}, {}
-    for name, end in _endings(colours.names, path).items():
-        own = {key.removesuffix(end): values for key, values in variables.items() if key.endswith(end)}
-        runs[name], calibrations[name] = _folders_in(own, path)
-    run = Coloured(colours, text, runs)
+    held = {name: folders_in(name, own) for name, own in _by_line(variables, colours.names, path).items()}
+    run = Coloured(colours, text, {name: shots for name, (shots, _) in held.items()})
+    return run, _calibrations_in(variables, {name: calibration for name, (_, calibration) in held.items()}, path)
+
+
+def _filtered_in(variables: Variables, path: Path) -> tuple[Filtered, Coloured[CalibrationManifest] | None]:
+    text, (shots, _) = text_in(variables, FILTERED, path), _folders_in(variables, path)
+    colours = unpacked_filters(text, shots, path)
+    lines = _by_line(variables, colours.names, path)
+    truths = {name: truth_in(own, path) for name, own in lines.items() if "truth" in own}
+    digital = shots.manifest.digital
+    calibrations = {name: calibration_in(own, digital, path) for name, own in lines.items()}
+    return Filtered(colours, text, shots, truths), _calibrations_in(variables, calibrations, path)
+
+
+def _calibrations_in(
+    variables: Variables, held: Mapping[str, Packed[CalibrationManifest] | None], path: Path
+) -> Coloured[CalibrationManifest] | None:
+    """The coloured calibration in a file; ``held`` is what is there of each line."""
     if _CALIBRATED not in variables:
-        return run, None
+        return None
     text = text_in(variables, _CALIBRATED, path)
     colours = unpacked_colours(text, CALIBRATION, path)
-    lines = {name: held for name, held in calibrations.items() if held is not None}
+    lines = {name: calibration for name, calibration in held.items() if calibration is not None}
     if {*lines} != {*colours.names}:
         raise MitsimError(f"{path}: has calibrations of {', '.join(lines)}, not of {', '.join(colours.names)}")
-    return run, Coloured(colours, text, lines)
+    return Coloured(colours, text, lines)
 
 
-def _endings(names: Sequence[str], path: Path) -> dict[str, str]:
-    """What variables of each line end in, by the line's name: of letters, digits and _, as MATLAB wants it."""
+def _by_line(variables: Variables, names: Sequence[str], path: Path) -> dict[str, dict[str, Any]]:
+    """Variables of each line by its name, without their ending."""
+    return {
+        name: {key.removesuffix(end): values for key, values in variables.items() if key.endswith(end)}
+        for name, end in endings(names, path).items()
+    }
+
+
+def colours_in(
+    run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
+) -> dict[str, Any]:
+    """Variables that say of which lines a file is: the colour.json of ``run`` and ``calibration``."""
+    variables = {FILTERED if isinstance(run, Filtered) else COLOURED: run.text}
+    return variables if calibration is None else {**variables, _CALIBRATED: calibration.text}
+
+
+def endings(names: Sequence[str], path: Path) -> dict[str, str]:
+    """What variables of each line end in, by the line's name: of letters, digits and _, as MATLAB wants it.
+
+    Parameters
+    ----------
+    names
+        of the lines.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for a name that no variable can end in, or two that are the same to MATLAB.
+    """
     ends = {name: "_" + re.sub(r"[^0-9A-Za-z_]", "_", name) for name in names}
     for name in names:
         # Beginning with a digit, they are no end of another variable: truth_standard_error is not of a line `error`.
@@ -132,11 +204,6 @@ def _endings(names: Sequence[str], path: Path) -> dict[str, str]:
 
 def _variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
     variables = _frames(run)
-    variables["PL"], variables["PR"] = run.manifest.patterns.matrices
-    if calibration is not None:
-        scale = dn_per_rate(run.manifest.digital)
-        for side, factor in factors_in_dn(calibration, scale).items():
-            variables[f"phi_{side}"] = factor
     return {**variables, **of_folders(run, calibration)}
 
 
@@ -146,7 +213,7 @@ def _folders_in(variables: Variables, path: Path) -> tuple[Packed[RunManifest], 
 
 
 def of_folders(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
-    """Variables of every MATLAB file: manifests, truth and ambient frame.
+    """Variables of every MATLAB file: manifests, patterns, factors, truth and ambient frame.
 
     Parameters
     ----------
@@ -154,17 +221,58 @@ def of_folders(run: Packed[RunManifest], calibration: Packed[CalibrationManifest
         that are exported.
     """
     variables: dict[str, Any] = {"run_manifest": manifest_text(run.manifest, run.text)}
-    if calibration is not None:
-        variables["calibration_manifest"] = manifest_text(calibration.manifest, calibration.text)
+    variables["PL"], variables["PR"] = run.manifest.patterns.matrices
+    variables.update(calibration_variables(calibration, run.manifest.digital))
     ambient = run.manifest.ambient_frame
     if ambient is not None:
         variables["ambient"] = run.read(ambient.file)[0]["DN"]
-    if TRUTH in run.names:
-        variables["truth"] = run.read(TRUTH)[0]["reflectance"]
-        variables["truth_board_reflectance"] = float(run.read(TRUTH)[1].get("board_reflectance", math.nan))
-        if "standard_error" in run.read(TRUTH)[0]:
-            variables["truth_standard_error"] = run.read(TRUTH)[0]["standard_error"]
+    return {**variables, **truth_variables(*run.read(TRUTH))} if TRUTH in run.names else variables
+
+
+def calibration_variables(calibration: Packed[CalibrationManifest] | None, digital: Digital) -> dict[str, Any]:
+    """Factors (pixels, n) [sqrt(DN)] and manifest of a ``calibration``, for frames that are read as ``digital`` says;
+    none without one."""
+    if calibration is None:
+        return {}
+    factors = factors_in_dn(calibration, dn_per_rate(digital))
+    variables: dict[str, Any] = {f"phi_{side}": factor for side, factor in factors.items()}
+    return {**variables, "calibration_manifest": manifest_text(calibration.manifest, calibration.text)}
+
+
+def truth_variables(channels: Channels, metadata: Metadata) -> dict[str, Any]:
+    """A truth, of the ``channels`` (n, n') and ``metadata`` of its file."""
+    variables: dict[str, Any] = {"truth": channels["reflectance"]}
+    variables["truth_board_reflectance"] = float(metadata.get("board_reflectance", math.nan))
+    if "standard_error" in channels:
+        variables["truth_standard_error"] = channels["standard_error"]
     return variables
+
+
+def truth_in(variables: Variables, path: Path) -> tuple[Channels, Metadata]:
+    """Channels (n, n') and metadata of the truth in a file.
+
+    Parameters
+    ----------
+    variables
+        of the file, a truth among them.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        where it is no image.
+    """
+    channels = {"reflectance": _image_in(variables, "truth", path)}
+    if "truth_standard_error" in variables:
+        channels["standard_error"] = _image_in(variables, "truth_standard_error", path)
+    board = float(np.asarray(variables.get("truth_board_reflectance", math.nan)).item())
+    return channels, {} if math.isnan(board) else {"board_reflectance": board}
+
+
+def _image_in(variables: Variables, name: str, path: Path) -> Channel:
+    """The image called ``name``, (rows, columns) float32."""
+    return checked_channel(matrix_in(variables, name, path).astype(np.float32), name, path)
 
 
 def dn_per_rate(digital: Digital) -> float:
@@ -416,10 +524,6 @@ def run_in(variables: Variables, manifest: RunManifest, frame: Any, path: Path) 
     shots = {shot.file: shot for shot in captures}
     kind = np.float32 if text_in(variables, "dn_class", path) == "float32" else np.uint32
 
-    def single(variable: str) -> Channel:
-        """The image called ``variable``, (rows, columns) float32."""
-        return checked_channel(matrix_in(variables, variable, path).astype(np.float32), variable, path)
-
     def read(name: str) -> tuple[Channels, Metadata]:
         if name in shots:
             shot = shots[name]
@@ -431,12 +535,8 @@ def run_in(variables: Variables, manifest: RunManifest, frame: Any, path: Path) 
             }
         if ambient is not None and name == ambient.file:
             known: Metadata = {"shots": ambient.shots, "exposure_s": manifest.digital.exposure_s}
-            return {"DN": single("ambient")}, known
-        channels = {"reflectance": single("truth")}
-        if "truth_standard_error" in variables:
-            channels["standard_error"] = single("truth_standard_error")
-        board = float(np.asarray(variables.get("truth_board_reflectance", math.nan)).item())
-        return channels, {} if math.isnan(board) else {"board_reflectance": board}
+            return {"DN": _image_in(variables, "ambient", path)}, known
+        return truth_in(variables, path)
 
     names = (*shots, *([ambient.file] if ambient else ()), *((TRUTH,) if "truth" in variables else ()))
     return Packed(manifest, text_in(variables, "run_manifest", path), names, read, path)

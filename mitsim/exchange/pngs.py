@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from mitsim.core.colours import COLOUR
 from mitsim.core.errors import MitsimError
 from mitsim.core.jsonfile import write_json
 from mitsim.core.manifests import RunManifest
 from mitsim.core.output import whole_folder
+from mitsim.exchange.coloured import Coloured
 from mitsim.exchange.drawn import (
     PATTERNS,
     Raster,
@@ -49,32 +52,70 @@ def write_pngs(folder: Path, run: Packed[RunManifest], projector: str | None = N
         for numbers that PNG cannot hold, patterns that are not of 0, 1 and -1, or a projector of unknown or too few
         pixels.
     """
-    manifest = run.manifest
     raster = _raster(run, projector)
-    light = pictures_of(manifest.patterns, str(run.place))
     with whole_folder(folder) as place:
-        where = draw(place, light, raster, str(run.place))
-        (place / "frames").mkdir()
-        names = []
-        for index, (shot, channels, _) in enumerate(shots_of(run)):
-            dn = channels["DN"]
-            if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
-                raise MitsimError(
-                    f"{run.place / shot.file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones "
-                    f"up to {_LARGEST}; use the format hdf5"
-                )
-            names.append(frame_name(index))
-            write_png(place / "frames" / names[-1], dn.astype(np.uint16))
-        if manifest.ambient_frame is not None:
-            np.save(place / "ambient.npy", run.read(manifest.ambient_frame.file)[0]["DN"])
-        write_json(place / PATTERNS, described(manifest.patterns, names, where))
+        where = _fill(place, run, raster)
+    return _read_again(folder, "RUN", "CAL", run.manifest), f"Patterns in cells of {cells_told(where)}"
+
+
+def write_pngs_lines(folder: Path, run: Coloured[RunManifest], projector: str | None = None) -> tuple[str, ...]:
+    """Write a coloured run as pictures to a new folder, whole or not at all: a folder of each line, as
+    :func:`write_pngs` writes it, and colour.json.
+
+    Parameters
+    ----------
+    folder
+        to make.
+    run, projector
+        as for :func:`write_pngs`.
+
+    Returns
+    -------
+    tuple of str
+        as of :func:`write_pngs`.
+
+    Raises
+    ------
+    MitsimError
+        as for :func:`write_pngs`.
+    """
+    with whole_folder(folder) as place:
+        for name, shots in run.lines.items():
+            (place / name).mkdir()
+            where = _fill(place / name, shots, _raster(shots, projector))
+        (place / COLOUR).write_text(run.text, encoding="utf-8")
+    again = (_read_again(folder / name, f"RUN/{name}", f"CAL/{name}", run.lines[name].manifest) for name in run.lines)
+    return f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN", *again, f"Patterns in cells of {cells_told(where)}"
+
+
+def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, Any]:
+    """Write a run's pictures to a folder that this process holds; returns the grid's place as :func:`draw` does."""
+    manifest = run.manifest
+    where = draw(place, pictures_of(manifest.patterns, str(run.place)), raster, str(run.place))
+    (place / "frames").mkdir()
+    names = []
+    for index, (shot, channels, _) in enumerate(shots_of(run)):
+        dn = channels["DN"]
+        if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
+            raise MitsimError(
+                f"{run.place / shot.file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up to "
+                f"{_LARGEST}; use the format hdf5"
+            )
+        names.append(frame_name(index))
+        write_png(place / "frames" / names[-1], dn.astype(np.uint16))
+    if manifest.ambient_frame is not None:
+        np.save(place / "ambient.npy", run.read(manifest.ambient_frame.file)[0]["DN"])
+    write_json(place / PATTERNS, described(manifest.patterns, names, where))
+    return where
+
+
+def _read_again(folder: Path, run: str, calibration: str, manifest: RunManifest) -> str:
+    """How the frames in a ``folder`` become the RUN folder ``run`` again."""
     again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
     if manifest.ambient_frame is not None:
         again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {manifest.ambient_frame.shots}"
-    return (
-        f"Read again by: mitsim import {folder / 'frames'} {again} --camera NAME --calibration CAL -o RUN",
-        f"Patterns in cells of {cells_told(where)}",
-    )
+    frames = folder / "frames"
+    return f"Read again by: mitsim import {frames} {again} --camera NAME --calibration {calibration} -o {run}"
 
 
 def _raster(run: Packed[RunManifest], projector: str | None) -> Raster:

@@ -18,8 +18,9 @@ from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest
 from mitsim.core.output import whole_file
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture, load_run
-from mitsim.exchange.coloured import Coloured, line_of
+from mitsim.exchange.coloured import Coloured, Filtered, line_of
 from mitsim.exchange.packed import FACTORS, Packed
+from mitsim.reconstruct.mosaic import behind
 
 if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
@@ -60,16 +61,17 @@ def write_tensors(path: Path, run: Packed[RunManifest], calibration: Packed[Cali
 
 
 def write_tensors_lines(
-    path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest] | None
+    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
 ) -> None:
-    """Write a coloured run as tensors with an axis of lines before the others, whole or not at all.
+    """Write a run of several lines as tensors with an axis of lines before the others, whole or not at all.
 
     Parameters
     ----------
     path
         of the file.
     run
-        whose lines were captured under the same patterns.
+        whose lines were captured under the same patterns. Behind colour filters `y` has no axis of lines, and
+        `weights` (4, lines) is what each filter passes.
     calibration
         of the same lines.
 
@@ -79,6 +81,9 @@ def write_tensors_lines(
         as for :func:`write_tensors`, and for lines that differ in their patterns or in the shape of a tensor.
     """
     extra("torch")
+    if isinstance(run, Filtered):
+        _save(path, {**_filtered(run, calibration), "wavelengths_nm": np.array(run.colours.wavelengths_nm)})
+        return
     lines = {name: _arrays(run.lines[name], line_of(calibration, name)) for name in run.colours.names}
     first, *others = lines.values()
     for arrays in others:
@@ -98,9 +103,24 @@ def _arrays(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] |
     arrays = {"y": measured(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
     if shots.truth is not None:
         arrays["x"] = shots.truth[None]
+    return arrays if calibration is None else {**arrays, **_sides(calibration)}
+
+
+def _sides(calibration: Packed[CalibrationManifest]) -> dict[str, FloatArray]:
+    factors = {side: calibration.read(name)[0]["factor"] for side, name in zip(SIDES, FACTORS, strict=True)}
+    return {side: np.asarray(factor, np.float64) for side, factor in factors.items()}
+
+
+def _filtered(run: Filtered, calibration: Coloured[CalibrationManifest] | None) -> dict[str, FloatArray]:
+    names = run.colours.names
+    # The truth of the frames is a mixture of the lines', which are given themselves.
+    arrays = {key: values for key, values in _arrays(run.shots, None).items() if key != "x"}
+    arrays["weights"] = np.array(run.colours.weights)
+    if run.truths.keys() >= {*names}:
+        arrays["x"] = np.stack([run.truths[name][0]["reflectance"] for name in names]).astype(np.float64)
     if calibration is not None:
-        factors = {side: calibration.read(name)[0]["factor"] for side, name in zip(SIDES, FACTORS, strict=True)}
-        arrays.update({side: np.asarray(factor, np.float64) for side, factor in factors.items()})
+        sides = [_sides(calibration.lines[name]) for name in names]
+        arrays.update({side: np.stack([each[side] for each in sides]) for side in SIDES})
     return arrays
 
 
@@ -157,7 +177,8 @@ def physics(factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> Any:
 def load_physics(path: Path | str) -> tuple[Any, Mapping[str, Tensor]]:
     """The physics in the file ``path`` of `mitsim export --format deepinv`, and its tensors: `y`, and `x` where the
     truth is known. Of a coloured run it takes x (batch, lines, n, n') to y (batch, lines, K K', rows, columns), every
-    line by its own factors. MitsimError where deepinv is not installed, or the file is none."""
+    line by its own factors; of one behind colour filters to y (batch, K K', rows, columns) of all lines. MitsimError
+    where deepinv is not installed, or the file is none."""
     torch = extra("torch")
     try:
         tensors = torch.load(path, weights_only=True)
@@ -167,14 +188,19 @@ def load_physics(path: Path | str) -> tuple[Any, Mapping[str, Tensor]]:
     if left.ndim == 2:
         return _physics(left, right, *patterns), tensors
     lines = [_physics(*sides, *patterns) for sides in zip(left, right, strict=True)]
+    passed = None
+    if "weights" in tensors:
+        passed = torch.from_numpy(behind(tensors["weights"].numpy(), (left.shape[1], right.shape[1])))
 
     def forward(x: Tensor, **_: Any) -> Tensor:
         """A x."""
-        return torch.stack([line.A(x[:, i : i + 1]) for i, line in enumerate(lines)], 1)
+        seen = torch.stack([line.A(x[:, i : i + 1]) for i, line in enumerate(lines)], 1)
+        return seen if passed is None else (passed.to(x)[:, None] * seen).sum(1)
 
     def adjoint(y: Tensor, **_: Any) -> Tensor:
         """A^T y."""
-        return torch.cat([line.A_adjoint(y[:, i]) for i, line in enumerate(lines)], 1)
+        each = y if passed is None else passed.to(y)[:, None] * y[:, None]
+        return torch.cat([line.A_adjoint(each[:, i]) for i, line in enumerate(lines)], 1)
 
     size = len(lines), left.shape[2], right.shape[2]
     return extra("deepinv").physics.LinearPhysics(A=forward, A_adjoint=adjoint, img_size=size), tensors

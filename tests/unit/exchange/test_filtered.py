@@ -1,0 +1,161 @@
+"""Runs behind colour filters exchanged: frames, lines and factors come back to the bit, and mean what the page says."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+
+import mitsim as ms
+from mitsim.core.errors import MitsimError
+from mitsim.exchange import tensors
+from mitsim.exchange.export import export_run
+from mitsim.exchange.hdf5 import open_hdf5
+from mitsim.exchange.load import import_file
+from mitsim.reconstruct.mosaic import behind
+from tests.coloured import WEIGHTS, mosaic_folders
+from tests.unit.exchange.test_coloured import octave, whole
+
+LINES = "638nm", "520nm", "445nm"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return mosaic_folders(tmp_path_factory.mktemp("filters"), "dots:2")
+
+
+def same_folders(again: Path, first: Path) -> None:
+    """To the bit; the frames' numbers at least, where a file keeps no metadata of them."""
+    found, expected = whole(again), whole(first)
+    assert np.array_equal(ms.load_run(again).dn, ms.load_run(first).dn)
+    assert found[""]["colour.json"] == expected[""].pop("colour.json") and found[""].keys() >= expected[""].keys()
+    assert {name: found[name] for name in found if name} == {name: expected[name] for name in expected if name}
+
+
+@pytest.mark.parametrize(("format", "name"), [("hdf5", "all.h5"), ("mat", "all.mat")])
+def test_folders_come_back(format: str, name: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """Frames, every line's truth and factors, and colour.json. (Planted: the first line's truth for all, the frames'
+    own manifest of a line.)"""
+    run, calibration = folders
+    payload = export_run(run, format, tmp_path / name, calibration)
+    result = import_file(tmp_path / name, tmp_path / "run", tmp_path / "cal")
+    same_folders(tmp_path / "run", run)
+    assert whole(tmp_path / "cal") == whole(calibration)
+    assert payload["frames"] == result["frames"] == 4 and result["holds"] == ["run", "calibration"]
+
+
+@pytest.mark.parametrize(("format", "name"), [("hdf5", "all.h5"), ("mat", "all.mat")])
+def test_a_run_without_truths_and_calibration(format: str, name: str, tmp_path: Path) -> None:
+    """As of a real camera."""
+    run, _ = mosaic_folders(tmp_path, "dots:2", truths=False)
+    export_run(run, format, tmp_path / name)
+    import_file(tmp_path / name, tmp_path / "run 2")
+    same_folders(tmp_path / "run 2", run)
+    with pytest.raises(MitsimError, match="holds no calibration"):
+        import_file(tmp_path / name, tmp_path / "run 3", tmp_path / "cal 3")
+
+
+def expected_of(held: dict[str, np.ndarray], i: int, j: int) -> np.ndarray:
+    """What the page says that `data_coded` less `measBg` is, of the file's own variables."""
+    light = np.outer(held["PL"][:, i], held["PR"][:, j])
+    seen = [held[f"phi_left_{name}"] @ (light * held[f"truth_{name}"]) @ held[f"phi_right_{name}"].T for name in LINES]
+    return np.einsum("lij,lij->ij", behind(held["weights"], seen[0].shape), seen)
+
+
+def test_the_variables_are_the_papers_model_behind_filters(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """(Planted: rows and columns of the filters changed places.)"""
+    export_run(folders[0], "mat", tmp_path / "all.mat", folders[1])
+    held = loadmat(tmp_path / "all.mat")
+    assert np.array_equal(held["weights"], WEIGHTS)
+    found = held["data_coded"][:, :, 1, 0] - held["measBg"]
+    # Shot noise of 3e4 electrons is 0.6 %.
+    assert np.abs(found - expected_of(held, 1, 0)).mean() < 0.01 * found.mean()
+
+
+@octave
+def test_octave_reads_and_writes_every_line(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    export_run(folders[0], "mat", tmp_path / "all.mat", folders[1])
+    script = """
+a = load('all.mat');
+seen = 0;
+names = {'638nm', '520nm', '445nm'};
+for l = 1:3
+  lit = (a.PL(:,2) * a.PR(:,1)') .* double(a.(['truth_' names{l}]));
+  filters = repmat(reshape(a.weights(:,l), 2, 2)', size(a.measBg) / 2);
+  seen = seen + filters .* (a.(['phi_left_' names{l}]) * lit * a.(['phi_right_' names{l}])');
+end
+printf('%.17g', sum(seen(:)));
+save('-v7', 'again.mat', '-struct', 'a');
+"""
+    call = ["octave-cli", "--quiet", "--norc", "--eval", script]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == pytest.approx(expected_of(loadmat(tmp_path / "all.mat"), 1, 0).sum(), rel=1e-9)
+    import_file(tmp_path / "again.mat", tmp_path / "run", tmp_path / "cal")
+    same_folders(tmp_path / "run", folders[0])
+    assert whole(tmp_path / "cal") == whole(folders[1])
+
+
+def test_frames_and_factors_are_read_where_they_lie(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    export_run(folders[0], "hdf5", tmp_path / "all.h5", folders[1])
+    with open_hdf5(tmp_path / "all.h5") as file:
+        assert np.array_equal(file.shots.dn, ms.load_run(folders[0]).dn) and file.factors is None
+    with open_hdf5(tmp_path / "all.h5", "520nm") as file:
+        assert np.array_equal(file.shots.dn, ms.load_run(folders[0]).dn) and file.factors is not None
+        assert np.array_equal(file.factors.left, ms.load_calibration(folders[1] / "520nm").left)
+    with pytest.raises(MitsimError, match="has 638nm, 520nm, 445nm; give one"), open_hdf5(tmp_path / "all.h5", "521nm"):
+        pass
+
+
+def test_tensors_are_of_all_lines(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """<A x, y> = <x, A^T y> in double precision, and A of the truths is what was measured, but for noise."""
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("deepinv")
+    export_run(folders[0], "deepinv", tmp_path / "run.pt", folders[1])
+    physics, held = tensors.load_physics(tmp_path / "run.pt")
+    assert np.array_equal(held["y"].numpy(), tensors.measured(ms.load_run(folders[0])))
+    seen = physics.A(held["x"][None])[0]
+    assert (seen - held["y"]).abs().mean() < 0.01 * held["y"].mean()
+    generator = torch.Generator().manual_seed(1)
+    x = torch.randn(2, *held["x"].shape, dtype=torch.float64, generator=generator)
+    y = torch.randn(2, *held["y"].shape, dtype=torch.float64, generator=generator)
+    forward = physics.A(x)
+    assert abs((forward * y).sum() - (x * physics.A_adjoint(y)).sum()) <= 1e-12 * forward.norm() * y.norm()
+
+
+@pytest.mark.parametrize("format", ["flatcam", "png"])
+def test_formats_that_know_no_filters_say_so(format: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    calibration = folders[1] if format == "flatcam" else None
+    with pytest.raises(MitsimError, match=rf"is behind colour filters, of which {format} .*; use hdf5, mat, deepinv"):
+        export_run(folders[0], format, tmp_path / "out", calibration)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_does_not_fit_is_refused_and_no_folder_is_left(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    other = shutil.copytree(folders[1], tmp_path / "other")
+    (other / "colour.json").write_text((other / "colour.json").read_text().replace("520", "521"))
+    with pytest.raises(MitsimError, match="calibrate each line of this projector"):
+        export_run(folders[0], "hdf5", tmp_path / "all.h5", other)
+    export_run(folders[0], "mat", tmp_path / "all.mat", folders[1])
+    held = {key: value for key, value in loadmat(tmp_path / "all.mat").items() if not key.startswith("__")}
+    colours = json.loads(held["mosaic_run"].item())
+    wrong = [{**line, "name": "frame_00000.exr"} for line in colours["channels"]]
+    cases = {
+        "RGGB": {**held, "mosaic_run": json.dumps({**colours, "mosaic": "RGB"})},
+        "give each of the four": {**held, "mosaic_run": json.dumps({**colours, "weights": [[1.0]] * 4})},
+        "a line is called frame_00000.exr": {
+            **held,
+            "mosaic_run": json.dumps({**colours, "channels": [wrong[0], *colours["channels"][1:]]}),
+        },
+        "has calibrations of 638nm, 445nm": {key: held[key] for key in held if key != "calibration_manifest_520nm"},
+    }
+    for words, variables in cases.items():
+        savemat(tmp_path / "bad.mat", variables, long_field_names=True)
+        with pytest.raises(MitsimError, match=words):
+            import_file(tmp_path / "bad.mat", tmp_path / "run", tmp_path / "cal")
+        assert not (tmp_path / "run").exists() and not (tmp_path / "cal").exists()
