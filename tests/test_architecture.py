@@ -180,7 +180,7 @@ def test_what_checks_a_request_imports_no_numpy() -> None:
 
 def test_a_refusal_imports_no_numpy(tmp_path: Path) -> None:
     """Of a missing folder, a bad manifest, and words that are not known. (Planted: the name of the patterns read by
-    `parse_patterns`; the manifest of export read by `packed_run`.)"""
+    `parse_patterns`; the manifest of export read by `packed_run`; the scene of a sweep opened by its points.)"""
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "manifest.json").write_text("{}")
     (tmp_path / "bad" / "session.toml").write_text("n = 4")
@@ -201,6 +201,16 @@ def test_a_refusal_imports_no_numpy(tmp_path: Path) -> None:
         "calibrate photograph --model wave --frames bad -o c",
         "reconstruct bad --calibration bad",
         "patterns dotz:3 -o p",
+        "study sweep photograph -o s --over x=1:2:3",
+        "study sweep photograph -o s --over patterns=dots:3,dotz:3",
+        "study sweep photograph -o s --over sheet_z=1:2:3 --measure speed",
+        "study sweep -o s",
+        "study drift -o s --over x=1",
+        "study all photograph -o s -D x=1",
+        "study all photograph -o s --shard 2/1",
+        "study patterns -o s --camera none",
+        "study accuracy photograph -o s -D x=1",
+        "study merge bad -o s",
     )
     program = f"""
 import sys

@@ -667,6 +667,35 @@ class Bench:
         return replace(self, loaded=alone)
 
 
+def check_scene(scene: Path | str, defines: Mapping[str, str], outside: bool = False) -> Path:
+    """Where a scene lies, which is refused without the renderer where that is possible.
+
+    Parameters
+    ----------
+    scene
+        as of :func:`open_bench`.
+    defines
+        values of its parameters by name.
+    outside
+        as ``allow_outside_files`` there.
+
+    Raises
+    ------
+    MitsimError
+        for a scene that there is not, a parameter that it does not have, and XML that is not well-formed.
+    """
+    path = locate(scene, "scenes", "scene.xml")
+    Outline(path, defines, SceneFiles(path, outside))
+    return path
+
+
+def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
+    """Files of a ``camera`` and a ``projector``, as of :func:`open_bench`; MitsimError for one that there is not."""
+    found = ((camera, DEFAULT_CAMERA), (projector, "mp_cl1"))
+    first, second = (locate(default if name is None else name, "calibration", ".toml") for name, default in found)
+    return first, second
+
+
 def open_bench(
     scene: Path | str,
     variant: str = DEFAULT_VARIANT,
@@ -700,11 +729,9 @@ def open_bench(
         for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
         scene's where the camera file has one.
     """
-    path = locate(scene, "scenes", "scene.xml")
     defines = {name: _text(value) for name, value in parameters.items()}
-    Outline(path, defines, SceneFiles(path, allow_outside_files))  # what it refuses needs no renderer
-    sensor_path = locate(DEFAULT_CAMERA if camera is None else camera, "calibration", ".toml")
-    projector_path = locate(projector if projector is not None else "mp_cl1", "calibration", ".toml")
+    path = check_scene(scene, defines, allow_outside_files)
+    sensor_path, projector_path = check_devices(camera, projector)
     from mitsim.rig.profile import load_mask
     from mitsim.rig.projector import ProjectorModel
     from mitsim.rig.rig import Rig

@@ -132,17 +132,34 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
     MitsimError
         for options that the study does not have, or that cannot be read.
     """
-    from mitsim.study.paper.sweep import measures_of, values_of
+    from mitsim.rig.families import read_name
+    from mitsim.study.asked import check_drifts, check_sweep, measures_of, values_of
 
+    varied = tuple(values_of(text) for text in over)
     if name == "sweep":
-        varied = tuple(values_of(text) for text in over)
+        check_sweep(varied, len(scope.pictures))
+        read_name(patterns, None)
         return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
     if name == "drift" and measure == _MAIN_MEASURE:
-        return replace(scope, sweep=tuple(values_of(text) for text in over), patterns=patterns)
+        check_drifts(varied)
+        read_name(patterns, None)
+        return replace(scope, sweep=varied, patterns=patterns)
     if over or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
         others = "--measure is for sweep, --over and --patterns for drift and sweep"
         raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
+
+
+def check_setup(scope: Scope, scene: str | None) -> None:
+    """MitsimError where the files that a ``scope`` names cannot be, before the renderer is imported; a study without a
+    ``scene`` of its own may take others."""
+    from mitsim.capture.bench import check_devices, check_scene
+    from mitsim.study.asked import NO_SCENE
+
+    check_devices(scope.setup.camera, scope.setup.projector)
+    if scene or scope.measures:
+        varied = {name: values[0] for name, values in scope.sweep if scope.measures and name not in NO_SCENE}
+        check_scene(scope.setup.scene, {**dict(scope.setup.parameters), **varied}, scope.setup.outside)
 
 
 def recipe_for(name: str, recipe: Path | None) -> SessionRecipe | None:

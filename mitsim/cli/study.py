@@ -20,6 +20,7 @@ from mitsim.cli.options import (
     Seed,
     Variant,
     bench_of,
+    check_setup,
     job_of,
     recipe_for,
     scope_of,
@@ -81,7 +82,9 @@ def study(
             scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
             scope = swept(name, replace(scope, seeds=(seed,)), patterns, over or (), measure)
             scope = replace(scope, recipe=str(recipe) if recipe else None)
-            result = run_experiment(name, scope, output, job, Where(Shard.of(shard), jobs, scheduler))
+            where = Where(Shard.of(shard), jobs, scheduler)
+            check_setup(scope, _only(scenes))
+            result = run_experiment(name, scope, output, job, where)
         else:
             run_study = find_study(name, **({"recipe": session} if session else {}))
             request = mitsim.Request.of(patterns=patterns, seed=seed)

@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING
 from mitsim.core.errors import MitsimError
 
 if TYPE_CHECKING:
+    from mitsim.capture.bench import Bench
+    from mitsim.capture.request import Request
+    from mitsim.core.job import Job
     from mitsim.study.experiment import Experiment
-    from mitsim.study.runner import Study
+    from mitsim.study.runner import Findings, Study
 
 STUDIES: Mapping[str, str] = MappingProxyType(
     {
@@ -51,7 +54,7 @@ ALL = "all"
 
 def find_study(name: str, **settings: object) -> Study:
     """The study ``name``, to be called with (bench, output, request, job); nothing heavy is imported before the name is
-    known to be one.
+    known to be one, and its folder to be free.
 
     Parameters
     ----------
@@ -69,9 +72,15 @@ def find_study(name: str, **settings: object) -> Study:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
     from mitsim.study.runner import run_study
 
-    module, function = STUDIES[name].split(":")
-    measure = getattr(importlib.import_module(f"mitsim.study.{module}"), function)
-    return partial(run_study, name, partial(measure, **settings))
+    def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
+        """What the study finds."""
+        module, function = STUDIES[name].split(":")
+        found: Findings = getattr(importlib.import_module(f"mitsim.study.{module}"), function)(
+            bench, request, job, **settings
+        )
+        return found
+
+    return partial(run_study, name, measure)
 
 
 def find_experiment(name: str) -> Experiment:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -21,10 +21,13 @@ from mitsim.core.resources import workers
 from mitsim.core.versions import versions
 from mitsim.study import ALL, PAPER, find_experiment
 from mitsim.study.experiment import HEADS, Claim, Experiment, Found, Point, Scope
-from mitsim.study.page import Section, build_page
 from mitsim.study.points import FOLDER, Shard, Store, batches
 from mitsim.study.runner import DPI, study_folder
 from mitsim.study.workers import in_processes, on_cluster
+
+# What draws is imported where it is used: a study that cannot be is refused without it.
+if TYPE_CHECKING:
+    from mitsim.study.page import Section
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,8 @@ def merge(parts: Sequence[Path | str], output: Path | str) -> CampaignResult:
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], CampaignResult]) -> CampaignResult:
     """Every experiment of the paper, made by ``each`` in a folder of its own, and one page of all claims."""
+    from mitsim.study.page import build_page
+
     with study_folder(output, ALL, (*PAPER, "*.html")) as folder:
         head = {"kind": ALL, "study": ALL, "scope": asdict(scope), "versions": versions()}
         write_json(folder / f"{ALL}.json", {**head, "status": "incomplete"})
@@ -206,6 +211,8 @@ class _Campaign:
 
     def finished(self, folder: Path, store: Store, seconds: float) -> CampaignResult:
         """Table, claims, figures and page, where all points are there; measuring them took so many ``seconds``."""
+        from mitsim.study.page import Section, build_page
+
         there, experiment = sum(store.has(point) for point in self.points), self.experiment
         if missing := len(self.points) - there:
             return CampaignResult(self.study, str(folder), there, missing, seconds)

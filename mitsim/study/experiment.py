@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.study.table import Table, Value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from mitsim.core.arrays import FloatArray
     from mitsim.study.studio import Studio
+    from mitsim.study.table import Table, Value
 
 IMAGE = "image"
 """The (n, n) reflectance that a point came to, where it is kept."""

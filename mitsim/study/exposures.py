@@ -32,10 +32,11 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.rig.patterns import PatternFamily
 from mitsim.sensor.specimen import response_variance
+from mitsim.study.asked import CONVENTIONS as CONVENTIONS
 from mitsim.study.ideal import IdealCamera, Plane
 from mitsim.study.metrics import Quality, psnr
 
-EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
+EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS
 NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
 """Sources of noise beside those of :mod:`mitsim.capture.session`."""
 DIM_E = 5600

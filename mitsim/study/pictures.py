@@ -5,11 +5,15 @@ They come with scikit-image, which states their licences: the paper does not nam
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+from typing import TYPE_CHECKING
 
-from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from mitsim.core.arrays import FloatArray
 
 TEST_IMAGES = ("astronaut", "camera", "chelsea", "coffee", "coins", "rocket", "page", "brick")
 """Portraits, an animal, things, a page of text and a texture."""
@@ -31,6 +35,7 @@ def picture(name: str) -> npt.NDArray[np.uint8]:
     Besides, ``bars 0.26`` are bars of so many line pairs a mm of the print, upright on the left, lying on the right,
     and ``edge`` is one edge 5 degrees off the upright. MitsimError for another name.
     """
+    import numpy as np
     from skimage import data
     from skimage.transform import resize
 
@@ -51,11 +56,15 @@ def picture(name: str) -> npt.NDArray[np.uint8]:
 
 def _printed(grey: FloatArray) -> npt.NDArray[np.uint8]:
     """Eight-bit reflectance of ``grey``, 0 black to 1 white."""
+    import numpy as np
+
     return np.asarray(np.rint(255 * (_INK + (_PAPER - _INK) * grey)), dtype=np.uint8)
 
 
 def _bars(frequency: float) -> FloatArray:
     """(512, 512) bars of so many pairs a mm, each texel the mean of the bars over it."""
+    import numpy as np
+
     edges = np.arange(SIDE + 1) * PRINT_MM / SIDE * frequency
     white = np.floor(edges) / 2 + np.minimum(edges % 1, 0.5)  # integral of the bars, in periods
     profile = np.diff(white) / np.diff(edges)
@@ -65,6 +74,8 @@ def _bars(frequency: float) -> FloatArray:
 
 def _edge() -> FloatArray:
     """(512, 512) black to white, each texel the part of it that is right of the edge, by 8 points a row of it."""
+    import numpy as np
+
     rows, columns = ((np.arange(8 * SIDE) + 0.5) / 8, np.arange(SIDE))
     place = SIDE / 2 + (rows - SIDE / 2) * np.tan(np.radians(EDGE_DEGREES))
     return np.asarray(np.clip(columns + 1 - place[:, None], 0, 1).reshape(SIDE, 8, SIDE).mean(axis=1))

@@ -10,12 +10,9 @@ from itertools import groupby
 from pathlib import Path
 from zipfile import BadZipFile
 
-import numpy as np
-
 from mitsim.core.errors import MitsimError
 from mitsim.core.output import sweep, whole_file
 from mitsim.study.experiment import Found, Point, Results
-from mitsim.study.table import Table
 
 FOLDER = "points"
 _ROWS = "rows"
@@ -33,12 +30,16 @@ class Store:
 
     def save(self, point: Point, found: Found) -> None:
         """Keep what was ``found`` at a ``point``; MitsimError when it cannot be written."""
+        import numpy as np
+
         rows = np.frombuffer(json.dumps([dict(row) for row in found.rows]).encode(), dtype=np.uint8)
         with whole_file(self._file(point)) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **{_ROWS: rows, **found.arrays})  # type: ignore[arg-type]
 
     def load(self, point: Point) -> Found:
         """What was found at a ``point``; MitsimError when the file is damaged."""
+        import numpy as np
+
         try:
             with np.load(self._file(point), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files if name != _ROWS}
@@ -57,6 +58,8 @@ class Store:
 
     def results(self, points: Iterable[Point]) -> Results:
         """Everything found at ``points``, in their order."""
+        from mitsim.study.table import Table
+
         found = {point.key: self.load(point) for point in points}
         rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
         arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}

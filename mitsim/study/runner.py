@@ -7,9 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.request import Request
@@ -17,8 +15,12 @@ from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, sweep, whole_file
 from mitsim.core.versions import versions
-from mitsim.study.page import Part, build_findings
-from mitsim.study.table import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from mitsim.study.page import Part
+    from mitsim.study.table import Table
 
 DPI = 150
 """Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
@@ -111,6 +113,8 @@ def run_study(
             with whole_file(folder / file) as part:
                 figure.savefig(part, dpi=DPI, format="png")
         if isinstance(findings, Paged):
+            from mitsim.study.page import build_findings
+
             where = f"{scene}, patterns {patterns}, seed {request.seed}"
             page = build_findings(name, findings.title, where, findings.parts(), figures)
             with whole_file(folder / f"{name}.html") as part:

@@ -22,6 +22,7 @@ from mitsim.rig.drift import UNITS, WORDS, Drift
 from mitsim.rig.families import check_patterns
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.rig.sensor import load_sensor
+from mitsim.study.asked import number_of
 from mitsim.study.charts import curves, paired
 from mitsim.study.drift import DriftStand
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope, Setup, grouped
@@ -68,15 +69,8 @@ def _amounts(scope: Scope, drift: Drift) -> Mapping[str, Sequence[float]]:
     if not scope.sweep:
         return {kind: (getattr(drift, kind),) for kind in drift.kinds}
     return {
-        kind: [getattr(drift.alone(kind, _number(kind, text)), kind) for text in texts] for kind, texts in scope.sweep
+        kind: [getattr(drift.alone(kind, number_of(kind, text)), kind) for text in texts] for kind, texts in scope.sweep
     }
-
-
-def _number(kind: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise MitsimError(f"--over {kind}={text}: give numbers") from None
 
 
 def _setup(scope: Scope, kind: str) -> Setup:

@@ -9,10 +9,10 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.study import EXPERIMENTS, PAPER, find_experiment
+from mitsim.study.asked import measures_of, values_of
 from mitsim.study.campaign import Where, run_experiment
 from mitsim.study.experiment import IMAGE, Results, Scope, Setup
 from mitsim.study.paper.measure import judged, pictured, stated
-from mitsim.study.paper.sweep import measures_of, values_of
 from mitsim.study.points import batches
 from mitsim.study.table import Table
 
