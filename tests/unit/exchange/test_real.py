@@ -17,9 +17,12 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.imagelist import Raw
+from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange.export import export_run
 from mitsim.exchange.known import RealCapture
 from mitsim.exchange.real import LEFT_OUT, import_frames
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.status import Status, Verdict
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made
 
 ELECTRONICS = f"""
@@ -199,3 +202,24 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
     refused("they were scaled", tmp_path, tmp_path / "scaled", scaled)
     written(tmp_path / "eight", "npy", (dn >> 8).astype(np.uint8))
     refused("holds numbers of 8 bits, but camera bench 3 counts to 4095", tmp_path, tmp_path / "eight", scaled)
+
+
+def test_pictures_as_large_as_flatcams_give_their_scene(tmp_path: Path) -> None:
+    """500 x 256 pixels, of a plane and of a whole frame: a factor for each side, and the image is the scene. (Planted:
+    sides of the calibration changed places.)"""
+    rng = np.random.default_rng(8)
+    sides, scene = [rng.random((pixels, 8)) * 100 for pixels in (500, 256)], rng.random((8, 8))
+    manifest = CalibrationManifest(camera={"name": "bench 3"}, digital=DIGITAL)
+    left, right = (side.astype(np.float32).astype(np.float64) for side in sides)
+    Factors(left, right, manifest, Status(Verdict.CALIBRATED, "Fit")).save(tmp_path / "cal")
+    light = left @ scene @ right.T + DIGITAL.dark_current_e_per_s
+    dn = np.rint(light * DIGITAL.exposure_s * DIGITAL.gain_dn_per_e + DIGITAL.black_level_dn)
+    written(tmp_path / "whole", "png", dn[None])
+    written(tmp_path / "planes", "png", np.kron(dn, [[1, 1], [1, 0]])[None])
+    bench = Made(tmp_path / "run", tmp_path / "cal", scene)
+    for folder, channel in (("whole", None), ("planes", "gr")):
+        about = known(bench, "uniform", channel=channel)
+        result = import_frames(tmp_path / folder, tmp_path / f"run {folder}", about)
+        assert result["shape"] == [500, 256]
+        image = ms.reconstruct(ms.load_run(tmp_path / f"run {folder}"), ms.load_calibration(tmp_path / "cal")).image
+        assert np.abs(image - scene).max() < 1e-3
