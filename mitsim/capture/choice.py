@@ -146,9 +146,9 @@ class Candidates:
             rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
         given = _given(switches)
         self._tables = [
-            _Table(math.nan, evidence, (effects, raster), rows, given, sure)
+            _Table(math.nan, evidence, (effects, cells), rows, given, sure)
             for effects in _subsets(evidence, switches)
-            for raster in evidence.forms(_in_waves(effects))
+            for cells in evidence.forms(_in_waves(effects))
         ]
 
     def best(self, accuracy: float) -> tuple[_Table, int]:
@@ -183,8 +183,9 @@ def _table_of(
 ) -> _Table:
     """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
     row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
-    raster = settings.raster or evidence.raster[_in_waves(settings.effects)].needed
-    return _Table(accuracy, evidence, (settings.effects, raster), row, _given(switches), sure)
+    drawn = evidence.raster[_in_waves(settings.effects)]
+    cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
+    return _Table(accuracy, evidence, (settings.effects, cells), row, _given(switches), sure)
 
 
 def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
@@ -212,7 +213,7 @@ class _Table:
     accuracy, evidence, sure
         as for :func:`cheapest`.
     form
-        effects that are on, and whether frames are formed of a raster.
+        effects that are on, and cells along a pixel of the raster that frames are formed of; 0: a sum of terms.
     rows
         (m, 8) anchors, layers, cells, anchors of followed light and of occluded pixels, width of cells of the former,
         coarse cells, and whether coarse light has all layers.
@@ -224,12 +225,12 @@ class _Table:
         self,
         accuracy: float,
         evidence: Evidence,
-        form: tuple[frozenset[str], bool],
+        form: tuple[frozenset[str], int],
         rows: FloatArray,
         given: frozenset[Part],
         sure: float,
     ) -> None:
-        effects, self.raster = form
+        effects, self.raster_cells = form
         self.effects = effects
         self.accuracy, self.evidence, self.rows = accuracy, evidence, rows
         self.given, self.sure = given, sure
@@ -251,7 +252,7 @@ class _Table:
             mixed=float(MIXING in effects),
             occluded=float(len(evidence.occluded)),
             occluded_anchors=self.occluded_anchors,
-            raster=float(self.raster),
+            raster_cells=float(self.raster_cells),
         )
         self._follows = bool(effects & names(lambda effect: effect.followed))
 
@@ -301,7 +302,8 @@ class _Table:
             sharp=self.evidence.sharp,
             occluded=self.evidence.occluded,
             occluded_anchors=occluded,
-            raster=self.raster,
+            raster=self.raster_cells > 0,
+            raster_cells=self.raster_cells,
         )
         samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.samples.items()}
         return replace(settings, **samples)
@@ -346,7 +348,8 @@ class _Table:
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
         drawn += [self.evidence.sharp.left**2] if self.evidence.sharp else []
-        of_raster = self.evidence.raster[_in_waves(self.effects)].error if self.raster else None
+        cells = self.raster_cells
+        of_raster = self.evidence.raster[_in_waves(self.effects)].left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
         squared, spread = changes.squared(chosen)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))

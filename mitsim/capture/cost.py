@@ -105,7 +105,10 @@ def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
     terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
     factors = _TERM_BYTES * terms * max(geometry.frame_shape) * cells * len(settings.depths)
     if settings.raster or geometry.drawn(geometry.diffracts):
-        factors = max(0.0 if settings.raster else factors, raster_bytes(geometry))
+        factors = max(
+            0.0 if settings.raster else factors,
+            raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells})),
+        )
     return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES
 
 

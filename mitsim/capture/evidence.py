@@ -33,6 +33,8 @@ LOOKS = 4
 """Independent looks of the pilot, the fewest whose spread tells a standard error worth its name."""
 SURE = 2.35
 """Standard errors from an estimate to its 95 % bound: Student's distribution with ``LOOKS`` - 1 degrees of freedom."""
+RASTER_RATE = 1.5
+"""Power of a raster's cells along a pixel that its error falls with at least (benchmarks/masks.py errors)."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,8 @@ class Settings:
         pixels whose direct light is traced apart, and samples that each group is predicted to need of it.
     raster
         whether frames are correlations with a mask's shadow on a raster, by FFT, and not sums of separable terms.
+    raster_cells
+        cells of that raster along a pixel; 0: as few as a raster has.
     occluded, occluded_anchors, occluded_samples
         projector pixels whose light is hidden from part of the sensor, increasing, points a side from which what the
         sensor sees of them beyond the mean is evaluated, and samples of it that each group is predicted to need. With
@@ -125,6 +129,7 @@ class Settings:
     occluded_anchors: int = 1
     occluded_samples: float = 1.0
     raster: bool = False
+    raster_cells: int = 0
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -269,9 +274,9 @@ class Forming:
         whether frames without diffraction, and with it, are always correlations with a shadow on a raster, and never
         sums of separable terms.
     phases
-        raster cells that a pixel has, where a shadow is drawn on one.
+        raster cells that a pixel has at least, where a shadow is drawn on one.
     drawing
-        seconds of drawing a shadow, without diffraction and with it, for each layer.
+        seconds of drawing a shadow on as few, without diffraction and with it, for each layer.
     """
 
     pixels: float
@@ -290,11 +295,17 @@ class Forming:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A mask's shadow on a raster: what that leaves of the frames, None where it is none to choose, and whether there
-    is no other way."""
+    """A mask's shadow on a raster: what that leaves of the frames, None where it is none to choose, whether there is no
+    other way, and numbers of raster cells along a pixel, of which the first leaves that."""
 
     error: Estimate | None = None
     needed: bool = False
+    cells: tuple[int, ...] = (6,)
+
+    def left(self, cells: int) -> Estimate | None:
+        """What a raster of so many ``cells`` a pixel leaves; 0: the fewest."""
+        finer = (cells or self.cells[0]) / self.cells[0]
+        return self.error and Estimate(*(error * finer**-RASTER_RATE for error in self.error))
 
 
 @dataclass(frozen=True)
@@ -356,10 +367,12 @@ class Evidence:
     occluded_light: Effort = field(default_factory=lambda: Effort.none())
     raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
 
-    def forms(self, waves: bool) -> tuple[bool, ...]:
-        """Whether frames may be formed of a raster: by a sum, by FFT, or by what is cheaper; with ``waves`` or not."""
+    def forms(self, waves: bool) -> tuple[int, ...]:
+        """Raster cells along a pixel that frames may be formed of, 0 for a sum of terms; with ``waves`` or not."""
         drawn = self.raster[waves]
-        return (drawn.needed,) if drawn.needed or drawn.error is None else (False, True)
+        if drawn.error is None:
+            return (drawn.cells[0] if drawn.needed else 0,)
+        return drawn.cells if drawn.needed else (0, *drawn.cells)
 
     def error(self, *parts: Part) -> Estimate:
         """Relative change of the frames by all ``parts`` together."""

@@ -171,7 +171,7 @@ class Trays:
         self.bench, self.settings, self.places = bench, settings, places
         self.physics = Physics.simulated(bench, settings.effects)
         if settings.raster:
-            by_fft = self.physics.geometry.model_copy(update={"mask_fft": True})
+            by_fft = self.physics.geometry.model_copy(update={"mask_fft": True, "mask_cells": settings.raster_cells})
             self.physics = replace(self.physics, geometry=by_fft)
         if one_line and self.physics.spectrum:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)

@@ -405,7 +405,7 @@ class _Words:
 
     def _left(self) -> dict[str, float]:
         """By what leaves it, the bound on each part of the systematic error."""
-        evidence, settings = self.evidence, self.chosen.settings
+        evidence, settings, of_raster = self.evidence, self.chosen.settings, self._of_raster
         anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
         sharp = settings.sharp
         followed, occluded, width = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
@@ -415,7 +415,7 @@ class _Words:
             f"cells ({cells}x{cells})": self._number("cells", cells).bound,
             f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
             f"cells of their light ({width} pixels)": self._number("followed_width", width).bound,
-            **({"the mask's raster": self._of_raster.bound} if self._of_raster and settings.raster else {}),
+            **({"the mask's raster": of_raster.bound} if of_raster and settings.raster else {}),
             **({f"anchors of sharp light ({sharp.anchors}x{sharp.anchors})": sharp.left} if sharp else {}),
             f"occluded anchors ({occluded}x{occluded})": self._number("occluded_anchors", occluded).bound,
             **self.chosen.lacking,
@@ -503,28 +503,37 @@ class _Words:
 
     @property
     def _of_raster(self) -> Estimate | None:
-        """What a raster leaves, where the mask may be drawn on one."""
-        return self.evidence.raster[self._waves].error
+        """What the raster leaves that is chosen, or one of the fewest cells where the mask may be drawn on one."""
+        return self.evidence.raster[self._waves].left(self.chosen.settings.raster_cells)
 
     def _shadow(self) -> tuple[PlanRow, ...]:
         """How frames behind a mask of more than two terms are formed."""
         left, settings, forming = self._of_raster, self.chosen.settings, self.evidence.forming
         if left is None:
             return ()
-        if self.evidence.raster[self._waves].needed:
-            reason = f"the mask's shadow is drawn on a raster, and frames are formed by FFT: that leaves {_said(left)}"
-            return (PlanRow("mask-shadow", "approximate", reason, None, 0.0),)
-        paces = paces_of(self.evidence)
-        sums, by_fft = (
-            _stages(self.evidence, replace(settings, raster=raster), paces)["optics"] for raster in (False, True)
-        )
+        drawn, paces = self.evidence.raster[self._waves], paces_of(self.evidence)
+
+        def seconds(cells: int) -> float:
+            formed = replace(settings, raster=cells > 0, raster_cells=cells)
+            return _stages(self.evidence, formed, paces)["optics"]
+
+        fewest = drawn.cells[0]
+        cells = settings.raster_cells or fewest
+        on_raster, by_fft = f"on a raster of {cells} cells a pixel", seconds(cells)
+        if drawn.needed:
+            reason = f"the mask's shadow is drawn {on_raster}, and frames are formed by FFT: that leaves {_said(left)}"
+            if cells == fewest or drawn.error is None:
+                return (PlanRow("mask-shadow", "approximate", reason, None, 0.0),)
+            reason += f", {fewest} {_said(drawn.error)}"
+            return (PlanRow("mask-shadow", "approximate", reason, None, max(by_fft - seconds(fewest), 0.0)),)
+        sums = seconds(0)
         terms = f"{forming.geometric_terms:.0f} separable terms"
         if settings.raster:
             reason = (
-                f"{terms}: by FFT on a raster, {by_fft:.2g} s, which leaves {_said(left)}; their sum takes {sums:.2g} s"
+                f"{terms}: by FFT {on_raster}, {by_fft:.2g} s, which leaves {_said(left)}; their sum takes {sums:.2g} s"
             )
             return (PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0)),)
-        reason = f"{terms} are summed, {sums:.2g} s; by FFT on a raster, {by_fft:.2g} s, {_said(left)} would be left"
+        reason = f"{terms} are summed, {sums:.2g} s; by FFT {on_raster}, {by_fft:.2g} s, {_said(left)} would be left"
         return (PlanRow("mask-shadow", "exact", reason, left.value, sums),)
 
     def _effect(self, effect: Effect) -> PlanRow:

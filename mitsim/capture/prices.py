@@ -124,8 +124,8 @@ class Numbers:
     occluded: Number = 0.0
     """Pixels of their own anchors."""
     occluded_anchors: Number = 1.0
-    raster: float = 0.0
-    """Whether frames are correlations by choice."""
+    raster_cells: float = 0.0
+    """Along a pixel, where frames are correlations by choice; 0: sums, or as few cells as a raster has."""
 
     @property
     def of_followed(self) -> tuple[FloatArray, FloatArray]:
@@ -155,7 +155,7 @@ class Numbers:
             mixed=float(MIXING in settings.effects),
             occluded=float(len(settings.with_own_anchors)),
             occluded_anchors=float(settings.occluded_anchors),
-            raster=float(settings.raster),
+            raster_cells=float(settings.raster_cells),
         )
 
 
@@ -219,7 +219,12 @@ def connections(name: str, numbers: Numbers) -> Number:
 
 def _by_fft(forming: Forming, numbers: Numbers) -> bool:
     """Whether frames are correlations, as they must be or as was chosen."""
-    return bool(numbers.raster) or forming.correlated[bool(numbers.waves)]
+    return bool(numbers.raster_cells) or forming.correlated[bool(numbers.waves)]
+
+
+def _phases(forming: Forming, numbers: Numbers) -> float:
+    """Raster cells that a pixel has, where frames are correlations."""
+    return numbers.raster_cells**2 or forming.phases
 
 
 def _products(
@@ -237,9 +242,8 @@ def _products(
     rows = lit * forming.cells * cells * anchors
     pixels = forming.pixels
     if _by_fft(forming, numbers):
-        return cast(
-            Number, _CORRELATION * forming.phases * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows
-        )
+        phases = _phases(forming, numbers)
+        return cast(Number, _CORRELATION * phases * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows)
     probes = GROUPS * (PROBES + 1) * (np.minimum(rows, pixels) + pixels) * rows
     terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
     return cast(Number, terms * layers * (pixels * rows**2 + pixels**2 * rows + probes))
@@ -304,6 +308,8 @@ def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
     shadows = paces.entry * _entries(forming, numbers)
     if _by_fft(forming, numbers):
         drawing = forming.drawing[bool(numbers.waves)] * paces.product / FIXED.product
+        if not numbers.waves:  # Waves are squared at as many points whatever the cells.
+            drawing *= _phases(forming, numbers) / forming.phases
         # Coarse light of several layers is seen at a depth of its own.
         shadows = cast(Number, shadows + drawing * (numbers.layers + (np.asarray(numbers.layers) > 1)))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)

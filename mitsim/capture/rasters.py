@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from mitsim.optics.raster import cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.plate import Plate
@@ -17,6 +19,18 @@ _AROUND = 2.0
 _HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8
 """Numbers of 8 bytes that are held for each cell, of the 8 shadows that are kept and of their spectra; that are worked
 on while another is made or a frame formed; and what points that are asked for at a time take."""
+_FINER = (4 / 3, 2)
+"""Times the fewest cells: each leaves about half of what the one before does."""
+_MOST_BYTES = 2.0**32
+"""Memory that more cells than the fewest are chosen for: twice as many of 320 pixels a side, 4 / 3 of 512."""
+
+
+def cells_to_choose(geometry: CameraGeometry) -> tuple[int, ...]:
+    """Raster cells along a pixel, fewest first, that a plan may choose for a camera ``geometry`` whose mask is drawn."""
+    fewest = cells_per_pixel(geometry)
+    more = [math.ceil(by * fewest) for by in _FINER]
+    held = [cells for cells in more if raster_bytes(geometry.model_copy(update={"mask_cells": cells})) <= _MOST_BYTES]
+    return fewest, *held
 
 
 def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.correlation import Correlation
-from mitsim.optics.raster import raster
+from mitsim.optics.raster import cells_per_pixel, raster
 from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
@@ -315,8 +315,9 @@ def raster_error(
     row, column = (np.arange(len(each.centres)) for each in (rows, columns))
 
     def frame(finer: int) -> FloatArray:
-        shadow = replace(ShadowGeometry.of(few, depth), mask=raster(few, depth, spectrum, finer))
-        return Correlation(shadow, rows, columns, few.pixel_fill_factor).image(light, row, column)
+        drawn = few.model_copy(update={"mask_cells": finer * cells_per_pixel(few)})
+        shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
+        return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
 
     known = not few.drawn(spectrum is not None)
     coarse = frame(1)

@@ -49,6 +49,8 @@ closed form, at 65 up to 1.7e-3 (tests/physics/test_raster.py): fringes of far e
 add up where the code's lattice meets that of the points."""
 _LEAST_WAVE_POINTS = 2
 """Points along a cell at least."""
+_GRID_CELLS = 3
+"""Cells of the field's grid from point to point at least."""
 _AROUND = 8
 """Cells that a raster is wider than its turned one, for the splines' ends."""
 _AT_ONCE = 2**20
@@ -56,7 +58,7 @@ _AT_ONCE = 2**20
 
 
 @lru_cache(maxsize=2)
-def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None, finer: int = 1) -> Plate:
+def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
     """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
 
     Parameters
@@ -67,8 +69,6 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
         of the point [mm].
     spectrum
         lines of its light; None: geometric.
-    finer
-        so many times as many cells a side.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
     if not isinstance(mask, Plate):
         raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
     pixel = geometry.pixel_pitch * shadow.shrink
-    step = pixel / (finer * cells_per_pixel(geometry))
+    step = pixel / cells_per_pixel(geometry)
     count = _cells(geometry, mask, step)
     if count > _LARGEST:
         raise MitsimError(
@@ -123,8 +123,10 @@ def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) ->
 
 
 def cells_per_pixel(geometry: CameraGeometry) -> int:
-    """Raster cells along a pixel of ``geometry``."""
-    return max(_CELLS_PER_PIXEL, int(np.ceil(_CELLS_PER_FEATURE * geometry.pixel_pitch / geometry.mask_feature)))
+    """Raster cells along a pixel of ``geometry``: as many as were chosen, else the fewest."""
+    return geometry.mask_cells or max(
+        _CELLS_PER_PIXEL, int(np.ceil(_CELLS_PER_FEATURE * geometry.pixel_pitch / geometry.mask_feature))
+    )
 
 
 def sharpened(values: FloatArray) -> FloatArray:
@@ -198,19 +200,29 @@ def _fields(
     cell."""
     distance = shadow.distance_mm * shadow.shrink
     points = points_per_cell(wavelength_nm, distance, step)
-    # An odd number of the grid's cells between two points, so that these lie in the middle of one.
-    between = int(np.ceil(step / points / grid_step(shadow, wavelength_nm))) | 1
+    between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2
     span = half + shadow.mask.extent_mm / 2 + step
     waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span)
     terms, lines = shadow.mask.terms, shadow.mask.lines
 
     def field(profile: FloatArray) -> npt.NDArray[np.complex64]:
-        seen = waves.field(Steps.between(profile, lines), -half)
-        return seen[between // 2 :: between].astype(np.complex64)
+        return _at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
 
     rows = np.stack([np.complex64(weight) * field(row) for weight, row, _ in terms], axis=1)
     return rows, np.stack([field(column) for *_, column in terms]), points
+
+
+def _at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
+    """(n,) of a ``field`` (n * between,): its means from point to point, their blur taken back to second order.
+
+    Fringes of far edges are finer than points are apart. Met at points, they add up wherever the code's lattice meets
+    that of the points; their means are none, and the light in them is given back evenly.
+    """
+    means = field.reshape(-1, between).mean(axis=1)
+    means[1:-1] -= np.diff(means, 2) / 24
+    power = float(np.square(np.abs(means)).mean())
+    return means * (np.square(np.abs(field)).mean() / power) ** 0.5 if power else means
 
 
 def _intensity(rows: npt.NDArray[np.complex64], columns: npt.NDArray[np.complex64], points: int) -> FloatArray:

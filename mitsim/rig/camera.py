@@ -31,6 +31,7 @@ _NOT_KNOWN_BEFORE = (
     "mask_motion",
     "mask_lean",
     "mask_fft",
+    "mask_cells",
     "rows",
     "columns",
     "row_pitch",
@@ -101,6 +102,7 @@ class CameraGeometry(BaseModel):
     )
     """Beside the tilt of a camera file's mask: along rows and along columns, which no scene states."""
     mask_fft: SkipJsonSchema[bool] = Field(False, exclude=True, description="frames by FFT where that is a choice")
+    mask_cells: SkipJsonSchema[int] = Field(0, exclude=True, description="raster cells along a pixel; 0: the fewest")
     """What a plan chooses, which no scene states."""
 
     @model_validator(mode="after")

@@ -173,7 +173,8 @@ def judged(camera: CameraGeometry, at: Directions, light: np.ndarray) -> tuple[f
     places = np.flatnonzero(light)
     coarse = FrameOptics(by_fft, at, at, (400.0,), 1).frame(places, light.ravel()[places])
     if camera.drawn(waves=False):
-        drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(camera, 400.0, None, 3))
+        third = camera.model_copy(update={"mask_cells": 3 * rasters.cells_per_pixel(camera)})
+        drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(third, 400.0))
         fine = Correlation(drawn, at, at).image(light, row, row)
     else:
         assert by_fft.correlated(waves=False) and not camera.correlated(waves=False)

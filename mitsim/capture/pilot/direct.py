@@ -15,7 +15,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Drawn, Effort, Estimate, Forming, Noise, Part, Settings
 from mitsim.capture.filing import Tray
 from mitsim.capture.pilot.looks import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, known, ladder, noise, norm
-from mitsim.capture.rasters import drawing_seconds
+from mitsim.capture.rasters import cells_to_choose, drawing_seconds
 from mitsim.capture.simulation import Simulation, emitted
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
@@ -199,7 +199,7 @@ class FineLight:
             seen = light[0, :, 0]
             error, known = raster_error(geometry, bundle.rows, bundle.columns, self.base.depth, spectrum, seen)
             found = Estimate(error, _SURE_OF_RASTER * error) if known else Estimate(*(error * by for by in _OF_FINER))
-            return Drawn(found, geometry.drawn(waves))
+            return Drawn(found, geometry.drawn(waves), cells_to_choose(geometry))
 
         without = drawn(None)
         return without, drawn(self.bench.spectrum) if geometry.diffracts else without

@@ -190,7 +190,13 @@ def test_impossible_plates_are_refused_in_one_line(values: np.ndarray) -> None:
 def test_a_camera_wears_a_profile_and_cameras_without_stay_what_they_were() -> None:
     """(Planted: the plate in every identity.)"""
     bare = CameraGeometry(mask_offset_row=0.5)
-    known = {*CameraGeometry.model_fields} - {"mask_offset_column", "mask_plate", "mask_motion", "mask_fft"}
+    known = {*CameraGeometry.model_fields} - {
+        "mask_offset_column",
+        "mask_plate",
+        "mask_motion",
+        "mask_fft",
+        "mask_cells",
+    }
     known -= {"rows", "columns", "row_pitch", "roi"}
     assert set(bare.identity) == known and bare.mask_terms == 1 and bare.diffracts and not bare.centred
     flatcam = MaskProfile(kind="flatcam", feature_mm=0.05, order=5).worn(bare, Path())
