@@ -88,7 +88,7 @@ def costs() -> None:
 
 
 def errors() -> None:
-    """What a raster leaves as a plan predicts it: against sums, or rasters of half the cells."""
+    """What a raster leaves as a plan predicts it: against sums, or rasters of half the cells. By cells along a pixel."""
     masks = {
         "random": camera(kind="random", features=511),
         "dusty": camera(kind="separable", dust_per_mm2=1.0, dust_radius_um=25.0),
@@ -99,8 +99,10 @@ def errors() -> None:
             cells, places, _ = light(1, period)
             shown = np.zeros((N, N))
             shown.ravel()[places] = 1
-            error, known = raster_error(geometry, cells, cells, DEPTH_MM, None, shown)
-            told(mask=name, patterns=patterns, left=error, by="sums" if known else "half the cells")
+            for count in (6, 8, 12):
+                finer = geometry.model_copy(update={"mask_cells": count})
+                error, known = raster_error(finer, cells, cells, DEPTH_MM, None, shown)
+                told(mask=name, patterns=patterns, cells=count, left=error, by="sums" if known else "half the cells")
 
 
 def mounted() -> None:

@@ -34,7 +34,8 @@ LOOKS = 4
 SURE = 2.35
 """Standard errors from an estimate to its 95 % bound: Student's distribution with ``LOOKS`` - 1 degrees of freedom."""
 RASTER_RATE = 1.5
-"""Power of a raster's cells along a pixel that its error falls with at least (benchmarks/masks.py errors)."""
+"""Power of a raster's cells along a pixel that its error falls with: from 6 to 12 cells, in frames of dots, 1.4 (a
+picture of light) to 2.9 (a mask turned by 0.3 degrees)."""
 
 
 @dataclass(frozen=True)

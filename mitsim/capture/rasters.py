@@ -20,7 +20,7 @@ _HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8
 """Numbers of 8 bytes that are held for each cell, of the 8 shadows that are kept and of their spectra; that are worked
 on while another is made or a frame formed; and what points that are asked for at a time take."""
 _FINER = (4 / 3, 2)
-"""Times the fewest cells: each leaves about half of what the one before does."""
+"""Times the fewest cells: 8 and 12 for 6."""
 _MOST_BYTES = 2.0**32
 """Memory that more cells than the fewest are chosen for: twice as many of 320 pixels a side, 4 / 3 of 512."""
 

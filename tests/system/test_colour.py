@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.core.configuration import shipped
 from mitsim.core.framefile import read_frame
 from tests.system.conftest import tree
 from tests.unit.transport.test_neighbours import WALL
@@ -21,6 +22,9 @@ SHEET, BOARD = {638: 0.9, 520: 0.3, 445: 0.5}, {638: 0.2, 520: 0.8, 445: 0.6}
 PROJECTOR = 'name = "lines"\neffective_wavelength_nm = {mean}\nwavelengths_nm = {lines}\nradiant_shares = {shares}\n'
 POWER = 111000.0
 ACCURACY = 1e-2
+RANDOM = 'kind = "random"\nfeature_mm = 0.06\nfeatures = 63\n'
+TURNED = 'kind = "separable"\nfeature_mm = 0.06\norder = 6\nrotation_deg = 0.3\n'
+"""Masks whose shadows are drawn on a raster, for each line of its own."""
 LAMP = '<emitter type="constant"><spectrum name="radiance" value="0.1"/></emitter>'
 
 
@@ -57,23 +61,46 @@ def coloured(shared_scene: Callable[..., Path]) -> Callable[[str], Path]:
     return write
 
 
+def worn(folder: Path, mask: str) -> tuple[str, ...]:
+    """The options of a camera with that table ``mask``, kept in a ``folder``; none for the scene's own."""
+    if not mask:
+        return ()
+    text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    (folder / "camera.toml").write_text(f"{text}\n[mask]\n{mask}", encoding="utf-8")
+    return "--camera", str(folder / "camera.toml")
+
+
 def electrons(run: Path) -> np.ndarray:
     """(shots, rows, columns) expected electrons of a ``run``."""
     return np.stack([read_frame(path)[0]["electrons"].astype(float) for path in sorted(run.glob("frame_*.exr"))])
 
 
-@pytest.mark.parametrize("name", ["sheet", pytest.param("corner", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "mask"),
+    [
+        ("sheet", ""),
+        pytest.param("corner", "", marks=pytest.mark.slow),
+        pytest.param("sheet", RANDOM, marks=pytest.mark.slow),
+        pytest.param("sheet", TURNED, marks=pytest.mark.slow),
+    ],
+)
 def test_each_line_is_what_a_mono_capture_of_it_gives(
-    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, name: str
+    call: Callable[..., Any],
+    shell: Callable[..., Any],
+    coloured: Callable[[str], Path],
+    tmp_path: Path,
+    name: str,
+    mask: str,
 ) -> None:
-    """Reflectances, power, diffraction and photons of each line alone: frames differ by their Monte Carlo errors.
+    """Reflectances, power, diffraction and photons of each line alone: frames differ by their Monte Carlo errors, also
+    behind masks that are drawn on a raster for each line.
 
     In mono, light has other random numbers (seed 1), so that the two differ as independent estimates do; twice the
     error that both state for themselves, of thousands of pixels and 4 shots, is far beyond chance. A line's own
     brightness is off by half or more where a share, a spectrum or the photons' energy is wrong.
     """
     scene = coloured(name)
-    common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.1, "--json"
+    common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.1, "--json", *worn(tmp_path, mask)
     whole = projector(tmp_path / "all.toml", LINES)
     outcome = shell("capture", scene, "-o", tmp_path / "run", "--colour", "lines", "--projector", whole, *common)
     assert outcome.err == "" and outcome.code == 0
@@ -114,12 +141,13 @@ def test_a_capture_in_colour_goes_on_where_it_stopped(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("mask", ["", TURNED])
 def test_each_line_is_calibrated_for_itself(
-    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
+    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, mask: str
 ) -> None:
     """Factors of a line are those of a mono session whose projector shows it alone, noise apart."""
     whole = projector(tmp_path / "all.toml", LINES)
-    scene, common = coloured("sheet"), ("--accuracy", ACCURACY, "--json", "-o")
+    scene, common = coloured("sheet"), (*worn(tmp_path, mask), "--accuracy", ACCURACY, "--json", "-o")
     payload = shell("calibrate", scene, "--colour", "lines", "--projector", whole, *common, tmp_path / "cal").payload
     assert payload["kind"] == "colour-calibration"
     for channel, nm in zip(payload["channels"], LINES, strict=True):
