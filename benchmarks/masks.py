@@ -88,7 +88,7 @@ def costs() -> None:
 
 
 def errors() -> None:
-    """What a raster leaves as a plan predicts it: against sums, or rasters of half the cells. By cells along a pixel."""
+    """What a raster leaves as a plan predicts it: against sums, or rasters of half the cells; by cells a pixel."""
     masks = {
         "random": camera(kind="random", features=511),
         "dusty": camera(kind="separable", dust_per_mm2=1.0, dust_radius_um=25.0),

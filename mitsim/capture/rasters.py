@@ -26,7 +26,7 @@ _MOST_BYTES = 2.0**32
 
 
 def cells_to_choose(geometry: CameraGeometry) -> tuple[int, ...]:
-    """Raster cells along a pixel, fewest first, that a plan may choose for a camera ``geometry`` whose mask is drawn."""
+    """Raster cells a pixel, fewest first, that a plan may choose for a camera ``geometry`` whose mask is drawn."""
     fewest = cells_per_pixel(geometry)
     more = [math.ceil(by * fewest) for by in _FINER]
     held = [cells for cells in more if raster_bytes(geometry.model_copy(update={"mask_cells": cells})) <= _MOST_BYTES]

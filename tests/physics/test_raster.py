@@ -75,7 +75,7 @@ def test_waves_behind_a_random_mask_are_fresnels_integrals(degrees: float) -> No
 
 @pytest.mark.parametrize(("kind", "order"), [("separable", 7), ("flatcam", 7), ("separable", 9)])
 def test_the_raster_gives_the_closed_forms_frame(kind: str, order: int) -> None:
-    """Of 40 x 40 cells of light, to 1e-3 of its mean; edges are up to 2, and 15 mm away. (Planted: a point's place in its
+    """Of 40 x 40 cells of light, to 1e-3 of its mean; edges are 2 or 15 mm away. (Planted: a point's place in its
     cell; the field at points, not its means from one to the next, for order 9.)"""
     camera = made(kind=kind, order=order, over_etch_um=1e-9)
     edges = np.linspace(-0.15, 0.15, 41)
