@@ -301,7 +301,7 @@ class Drawn:
 
     error: Estimate | None = None
     needed: bool = False
-    cells: tuple[int, ...] = (6,)
+    cells: tuple[int, ...] = (4,)
 
     def left(self, cells: int) -> Estimate | None:
         """What a raster of so many ``cells`` a pixel leaves; 0: the fewest."""

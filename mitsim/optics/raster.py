@@ -221,7 +221,7 @@ def _at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[n
     means = field.reshape(-1, between).mean(axis=1)
     means[1:-1] -= np.diff(means, 2) / 24
     power = float(np.square(np.abs(means)).mean())
-    return means * (np.square(np.abs(field)).mean() / power) ** 0.5 if power else means
+    return np.asarray(means * (np.square(np.abs(field)).mean() / power) ** 0.5) if power else means
 
 
 def _intensity(rows: npt.NDArray[np.complex64], columns: npt.NDArray[np.complex64], points: int) -> FloatArray:
