@@ -18,6 +18,7 @@ from scipy.special import fresnel
 from mitsim.capture.bench import open_bench
 from mitsim.capture.effects import EFFECTS, Physics
 from mitsim.capture.plan import SceneFacts
+from mitsim.capture.rasters import cells_to_choose
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.optics import raster as rasters
@@ -219,3 +220,17 @@ def test_each_line_of_a_raster_has_its_own_shadow() -> None:
     blue, red = (frame(line) for line in lines)
     np.testing.assert_allclose(frame(LINES), 0.4 * blue + 0.6 * red, rtol=0, atol=1e-6 * blue.mean())
     assert np.linalg.norm(blue - red) > 0.01 * np.linalg.norm(red)
+
+
+def test_a_plan_may_choose_cells_that_memory_holds() -> None:
+    """4/3 of 6 and twice as many a pixel, of 512 pixels a side not the latter; frames are drawn with what is chosen.
+    (Planted: no bound; the fewest drawn whatever is chosen.)"""
+
+    def turned_by_a_degree(pixels: int) -> CameraGeometry:
+        profile = MaskProfile(kind="separable", feature_mm=0.06, rotation_deg=1.0)
+        return profile.worn(CameraGeometry(pixels=pixels), Path())
+
+    assert [cells_to_choose(turned_by_a_degree(pixels)) for pixels in (40, 512)] == [(6, 8, 12), (6, 8)]
+    camera = turned_by_a_degree(40)
+    six, twelve = (raster(camera.model_copy(update={"mask_cells": cells}), 400.0).feature_mm for cells in (0, 12))
+    assert six == pytest.approx(2 * twelve)
