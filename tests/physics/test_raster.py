@@ -74,11 +74,10 @@ def test_waves_behind_a_random_mask_are_fresnels_integrals(degrees: float) -> No
     assert np.sqrt(np.mean(np.square(geometric[2::8, 2::8] - expected))) > 0.15 * expected.mean()
 
 
-@pytest.mark.parametrize(("kind", "order"), [("separable", 7), ("flatcam", 7), ("separable", 9)])
-def test_the_raster_gives_the_closed_forms_frame(kind: str, order: int) -> None:
-    """Of 40 x 40 cells of light, to 1e-3 of its mean; edges are 2 or 15 mm away. (Planted: a point's place in its
-    cell; the field at points, not its means from one to the next, for order 9.)"""
-    camera = made(kind=kind, order=order, over_etch_um=1e-9)
+@pytest.mark.parametrize("kind", ["separable", "flatcam"])
+def test_the_raster_gives_the_closed_forms_frame(kind: str) -> None:
+    """Of 40 x 40 cells of light, to 1e-3 of its mean. (Planted: a point's place in its cell.)"""
+    camera = made(kind=kind, order=7, over_etch_um=1e-9)
     edges = np.linspace(-0.15, 0.15, 41)
     at, light = Directions.cells(edges), np.random.default_rng(0).random((40, 40))
     expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, LINES))
@@ -87,6 +86,18 @@ def test_the_raster_gives_the_closed_forms_frame(kind: str, order: int) -> None:
     assert np.sqrt(np.mean(np.square(frame - expected))) < 1e-3 * expected.mean()
     geometric = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0))
     assert np.sqrt(np.mean(np.square(geometric - expected))) > 3e-3 * expected.mean()
+
+
+def test_fringes_of_far_edges_do_not_add_up() -> None:
+    """Uniform light behind 511 features a side, of which the farthest are 15 mm away: to 5e-4 of its closed form.
+    (Planted: the field at points, not its means from one to the next: 2.5e-3.)"""
+    profile = MaskProfile(kind="separable", feature_mm=0.06, over_etch_um=1e-9)
+    camera, line = profile.worn(CameraGeometry(pixels=64), Path()), Spectrum(np.array([562.0]), np.ones(1))
+    at, light, row = Directions.cells(np.linspace(-0.15, 0.15, 65)), np.ones((64, 64)), np.arange(64)
+    expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, line))
+    drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(camera, 400.0, line))
+    frame = Correlation(drawn, at, at).image(light, row, row)
+    assert np.linalg.norm(frame - expected) < 5e-4 * np.linalg.norm(expected)
 
 
 def test_sharpened_cells_are_read_half_as_blurred() -> None:

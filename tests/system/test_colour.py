@@ -100,7 +100,7 @@ def test_each_line_is_what_a_mono_capture_of_it_gives(
     brightness is off by half or more where a share, a spectrum or the photons' energy is wrong.
     """
     scene = coloured(name)
-    common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.1, "--json", *worn(tmp_path, mask)
+    common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.05, "--json", *worn(tmp_path, mask)
     whole = projector(tmp_path / "all.toml", LINES)
     outcome = shell("capture", scene, "-o", tmp_path / "run", "--colour", "lines", "--projector", whole, *common)
     assert outcome.err == "" and outcome.code == 0
