@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
     from mitsim.rig.board import BoardShape
     from mitsim.rig.camera import CameraGeometry
+    from mitsim.rig.lamplight import Lamplight
     from mitsim.rig.patterns import PatternFamily
     from mitsim.rig.projector import Lines, ProjectorModel, Spectrum
     from mitsim.rig.recipe import SessionRecipe
@@ -59,6 +60,8 @@ class Bench:
         parameters that the scene was loaded with.
     lines
         lines of the projector's light that spectral variants trace; None: wavelengths drawn from all.
+    lamplight
+        how the camera counts lamps' light of all wavelengths; None: as light of the projector's effective wavelength.
     """
 
     loaded: LoadedScene
@@ -66,6 +69,7 @@ class Bench:
     variant: str
     defines: dict[str, str]
     lines: Lines | None = None
+    lamplight: Lamplight | None = None
 
     def __repr__(self) -> str:
         path, (rows, columns) = self.loaded.path, self.geometry.frame_shape
@@ -634,6 +638,7 @@ class Bench:
             "defines": self.defines,
             "variant": self.variant,
             **({} if self.lines is None else {"lines": asdict(self.lines)}),
+            **({} if self.lamplight is None else {"lamps_nm": list(self.lamplight.response.range_nm)}),
             "projector_model": {
                 **self.projector.model_dump(mode="json", exclude={"contrast_ratio"}),
                 "black_level": self.projector.black_level,

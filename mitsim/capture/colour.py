@@ -7,7 +7,7 @@ its own, with the line's power, diffraction and photons, and what is made of it 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,6 +18,7 @@ import numpy as np
 
 from mitsim.capture.calibrate import calibrate_session, of_one_depth
 from mitsim.capture.evidence import Settings
+from mitsim.capture.lamplight import lit_by_lamps
 from mitsim.capture.light import Light, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
@@ -30,8 +31,10 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.output import output_folder
 from mitsim.core.seeds import integer
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Lines
 from mitsim.rig.recipe import SessionRecipe, load_recipe
+from mitsim.transport.histogram import Deposits
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
@@ -40,7 +43,8 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 _RAYS, _ALIKE = 4, 0.9
-"""Rays of each pixel that tell how rough a line's light is, a tenth of a second; and the part of the roughest line's
+"""Rays of each pixel that tell how rough a line's light is, and paths of each cell that tell lamps' light, a tenth of a
+second; and the part of the roughest line's
 differences from which a line counts as rough: what a plan leaves follows their root, of which this is a twentieth."""
 
 
@@ -84,22 +88,51 @@ class ColourBench:
         assert self.whole.lines is not None, "of the projector"
         return tuple(line_alone(self.whole, line) for line in self.whole.lines.single)
 
-    def roughest(self, seed: int) -> Bench:
-        """The line that is planned for: that whose light differs most between neighbouring pixels of the projector.
+    def lit_by_lamps(self, effects: Mapping[str, bool], seed: int) -> ColourBench:
+        """The same with lamps that shine at wavelengths of their own.
+
+        Parameters
+        ----------
+        effects, seed
+            as :func:`mitsim.capture.lamplight.lit_by_lamps` takes them.
+
+        Raises
+        ------
+        MitsimError
+            as there.
+        """
+        return replace(self, whole=lit_by_lamps(self.whole, effects, seed))
+
+    def roughest(self, seed: int, lit: float = 1.0) -> Bench:
+        """The line that is planned for: that whose light differs most between neighbouring pixels of the projector,
+        as a part of all light.
 
         What a plan makes coarse leaves most of such light. Of lines that are alike the longest, whose shadow has the
-        widest fringes, is the worst. ``seed``: of a few rays for each pixel.
+        widest fringes, is the worst.
+
+        Parameters
+        ----------
+        seed
+            of a few rays for each pixel.
+        lit
+            part of the pixels that a shot lights, beside which lamps shine.
         """
         bench = self.whole
-        direct = Simulation(bench, Settings(bench.geometry.scene_distance)).direct
-        deposits = direct.trace(integer(seed, "colour"), 0, _RAYS)
+        simulation = Simulation(bench, Settings(bench.geometry.scene_distance, effects=frozenset({"ambient"})))
+        stream = integer(seed, "colour")
+        deposits, lamps = simulation.direct.trace(stream, 0, _RAYS), Deposits.none()
+        if bench.lamplight is not None and simulation.from_camera is not None:
+            lamps = simulation.from_camera.trace(stream, 0, _RAYS)
         wavelengths = [line.wavelength_nm for line in self.manifest.channels]
         steps = []
-        for light in deposits.by_line(len(wavelengths)):
+        pairs = zip(deposits.by_line(len(wavelengths)), lamps.by_line(len(wavelengths)), strict=True)
+        for light, ambient in pairs:
             flux = np.bincount(light.pixel, light.value, bench.n**2).reshape(bench.n, bench.n)
             differences = sum(float(np.square(np.diff(flux, axis=axis)).sum()) for axis in (0, 1))
             energy = float(np.square(flux).sum())
-            steps.append(differences / energy if energy else 0.0)
+            own = lit * float(flux.sum())
+            part = own / (own + float(ambient.value.sum())) if own else 0.0
+            steps.append(differences / energy * part**2 if energy else 0.0)
         alike = [line for line, step in enumerate(steps) if step >= _ALIKE * max(steps)]
         return self.benches[max(alike, key=lambda line: wavelengths[line])]
 
@@ -133,7 +166,8 @@ def capture_lines(
     """
     job = job or Job()
     colours = ColourBench.of(bench, RUN)
-    refuse(colours.whole, request)
+    refuse(request)
+    colours = colours.lit_by_lamps(request.effects, request.seed)
     with _claimed(output, colours.manifest, resume) as places:
         for each, place in zip(colours.benches, places, strict=True):
             check_run(each, request, place, resume)
@@ -151,8 +185,13 @@ def line_alone(bench: Bench, line: Lines) -> Bench:
 def plan_lines(colours: ColourBench, request: Request) -> Plan:
     """The plan of all lines of ``colours`` together, which is that of the roughest, for a ``request``. MitsimError for
     what is not simulated in colour."""
-    refuse(colours.whole, request)
-    return plan_request(colours.roughest(request.seed), request)
+    refuse(request)
+    roughest = colours.roughest(request.seed, _lit(colours.whole.family(request.patterns, request.seed).lighting))
+    plan = plan_request(roughest, request)
+    if roughest.lamplight is not None and "ambient" not in plan.settings.effects:
+        # Beside a weaker line lamps may count.
+        plan = plan_request(roughest, request.changed(effects={**request.effects, "ambient": True}))
+    return plan
 
 
 def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | None = None) -> list[Light]:
@@ -172,11 +211,11 @@ def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | 
     MitsimError
         for what is not simulated in colour, and work beyond the limits.
     """
+    lighting = colours.whole.family(request.patterns, request.seed).lighting
     with job.clock.stage("plan"):
         plan = plan or plan_lines(colours, request)
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
-    lighting = colours.whole.family(request.patterns, request.seed).lighting
     with job.clock.stage("transport"):
         sampling = sampling_of(colours.whole, request)
         lights = trace_lines(colours.whole, colours.benches, plan, lighting, request.seed, sampling, job.progress)
@@ -184,6 +223,11 @@ def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | 
         errors = np.stack([light.flux_error for light in lights])
         truths = trace_truths(colours.whole, plan.settings, request.seed, errors)
     return [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
+
+
+def _lit(lighting: Lighting) -> float:
+    """Part of the projector's pixels that a shot of a ``lighting`` lights, in the mean."""
+    return float(np.mean(lighting.weights.mean(axis=0)[lighting.labels]))
 
 
 def calibrate_lines(
@@ -307,13 +351,8 @@ class _LineSession(Session):
         return self.shared.light(self.line, plan, job)
 
 
-def refuse(bench: Bench, request: Request) -> None:
-    """MitsimError where a ``request`` on a ``bench`` asks for what is not simulated in colour."""
-    if bench.loaded.lamps and request.effects.get("ambient", True):
-        raise MitsimError(
-            f"{bench.loaded.path}: colour: ambient light is not simulated in colour; switch it off with "
-            "effects -ambient, or leave colour out"
-        )
+def refuse(request: Request) -> None:
+    """MitsimError where a ``request`` asks for what is not simulated in colour."""
     if request.seconds is not None:
         raise ArgumentError("seconds", f"{request.seconds:g}: runs in colour are not planned by time; give an accuracy")
 

@@ -181,6 +181,11 @@ def _diffraction(bench: Bench) -> str:
     )
 
 
+def _lamps(bench: Bench) -> str:
+    counted = ", counted from {:g} to {:g} nm".format(*bench.lamplight.response.range_nm) if bench.lamplight else ""
+    return f"{len(bench.loaded.lamps)} emitter(s) beside the projector{counted}"
+
+
 def _lens(bench: Bench) -> str:
     lens, far = bench.projector_optics, bench.geometry.scene_distance
     spot = 2 * lens.aperture * abs(far - lens.focus) / lens.focus  # similar triangles
@@ -210,7 +215,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
         "ambient",
         {"lamps": ()},
         absent="the projector is the only emitter",
-        note=lambda bench: f"{len(bench.loaded.lamps)} emitter(s) beside the projector",
+        note=_lamps,
         kind="ambient",
         followed=True,
         in_reference=True,

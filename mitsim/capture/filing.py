@@ -38,7 +38,8 @@ _MOST_ROWS = 2**12
 
 @dataclass(frozen=True, eq=False)
 class FiledLight:
-    """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2].
+    """One estimate of the light of a scene, (classes + 1, places) each, the last row ambient light [W m^-2], or one of
+    the last for each band of its wavelengths.
 
     ``fine`` is what the sensor sees on average, in fine cells and layers; ``coarse`` is what each anchor sees of direct
     light beyond that, ``occluded`` the same of occluded pixels, which have more anchors; ``smooth`` is indirect light,
@@ -64,7 +65,7 @@ class FiledLight:
 
     @property
     def totals(self) -> FloatArray:
-        """(classes + 1,) light of each row, a mean over the sensor, but for pixels that are traced apart [W m^-2]."""
+        """(rows,) light of each row, a mean over the sensor, but for pixels that are traced apart [W m^-2]."""
         return np.asarray(self.fine.sum(axis=1) + self.smooth.sum(axis=1), dtype=np.float64)
 
     @property
@@ -122,7 +123,7 @@ class Tray:
         return FrameOptics(self._geometry, *parts, self._spectrum, self._places)
 
     def file(self, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        """(classes + 1, places) light per sample.
+        """(rows, places) light per sample: classes, and lamps.
 
         Parameters
         ----------
@@ -156,8 +157,10 @@ class Trays:
     physics
         what is simulated of the bench.
     fine, coarse, occluded, smooth, followed, sharp
-        trays for the parts of an :class:`FiledLight`; ``ambient`` and ``followed_ambient`` for lamps' light in the
-        cells of ``fine`` and of ``followed``.
+        trays for the parts of an :class:`FiledLight`; ``ambient`` and ``followed_ambient`` for all light of lamps in
+        the cells of ``fine`` and of ``followed``.
+    by_band
+        of each row of lamps' light, such a pair of trays.
     """
 
     def __init__(
@@ -176,22 +179,33 @@ class Trays:
         if one_line and self.physics.spectrum:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
         pixels = pixels or bench.n
+        lamplight = bench.lamplight if self.physics.lamps else None
+        self._lamp_rows = len(lamplight.bands) if lamplight else 1
         # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
         self.aim = self._grid(pixels, 1, None)
-        fine = Bundle(self._grid(pixels, settings.subdivision, settings.reach), 1, settings.depths)
+        fine = self._bundle(self._grid(pixels, settings.subdivision, settings.reach), 1, settings.depths)
         depths = settings.depths if settings.coarse_layers else (settings.depth,)
         coarse = self._grid(pixels, settings.coarse_cells, settings.reach)
         self.fine = self._tray(fine)
-        self.coarse = self._tray(Bundle(coarse, settings.anchors, depths))
-        self.occluded = self._tray(Bundle(coarse, settings.occluded_anchors, depths))
-        self.smooth = self._tray(Bundle(coarse, 1, depths))
+        self.coarse = self._tray(self._bundle(coarse, settings.anchors, depths))
+        self.occluded = self._tray(self._bundle(coarse, settings.occluded_anchors, depths))
+        self.smooth = self._tray(self._bundle(coarse, 1, depths))
         wide = self._grid(-(-pixels // settings.followed_width), 1, settings.reach)
         broad = (wide, (settings.depth,)) if settings.followed_width > 1 else (coarse, depths)
-        several = Bundle(broad[0], settings.followed_anchors, broad[1])
+        several = self._bundle(broad[0], settings.followed_anchors, broad[1])
         self.followed = self._tray(several)
         self.sharp = self._tray(self._apart(pixels))
-        lamps = _bands(*_AMBIENT_NM, _AMBIENT_BANDS)
-        self.ambient, self.followed_ambient = self._tray(fine, lamps), self._tray(several, lamps)
+        whole = lamplight.whole if lamplight else _bands(*_AMBIENT_NM, _AMBIENT_BANDS)
+
+        def of_lamps(spectrum: Spectrum) -> tuple[Tray, Tray]:
+            return self._tray(fine, spectrum), self._tray(several, spectrum)
+
+        self.ambient, self.followed_ambient = of_lamps(whole)
+        bands = lamplight.spectra if lamplight else ()
+        self.by_band = tuple(map(of_lamps, bands)) or ((self.ambient, self.followed_ambient),)
+
+    def _bundle(self, grid: CellGrid, anchors: int, depths: tuple[float, ...]) -> Bundle:
+        return Bundle(grid, anchors, depths, lamps=self._lamp_rows)
 
     def _tray(self, bundle: Bundle, light: Spectrum | None = None) -> Tray:
         """``light`` None: the projector's. All light diffracts or none."""
@@ -215,14 +229,15 @@ class Trays:
         """Cells of the sharp pixels' light: their part of the fine ones, or coarser where the anchors are too many."""
         settings, sharp = self.settings, self.settings.sharp
         if sharp is None:
-            return Bundle(self._grid(pixels, 1, None), 1, (settings.depth,))
+            return self._bundle(self._grid(pixels, 1, None), 1, (settings.depth,))
 
         def part(subdivision: int) -> CellGrid:
             whole, window = self._grid(pixels, subdivision, settings.reach), sharp.window
             return CellGrid(whole.rows.part(*window[:2]), whole.columns.part(*window[2:]))
 
         most = max(1, _MOST_ROWS // (sharp.anchors * max(part(1).shape)))
-        return Bundle(part(min(settings.subdivision, most)), sharp.anchors, settings.depths, between=True)
+        fewer = self._bundle(part(min(settings.subdivision, most)), sharp.anchors, settings.depths)
+        return replace(fewer, between=True)
 
     @cached_property
     def sharp_weights(self) -> FloatArray:
@@ -345,7 +360,7 @@ class Trays:
         Parameters
         ----------
         groups, first
-            independent estimates of the light, and the row of ambient light in them, the last.
+            independent estimates of the light, and the first row of ambient light in them.
         """
         lights, ambient = [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))], []
         if self.settings.anchors > 1:
@@ -359,10 +374,10 @@ class Trays:
         if self.physics.interreflection:
             lights.append(Filed(self.smooth.optics, tuple(_rows(group.smooth, 0, first) for group in groups)))
         if self.physics.lamps:
-            ambient.append(Filed(self.ambient.optics, tuple(_rows(group.fine, first, first + 1) for group in groups)))
-            if self.settings.followed_anchors > 1:
-                beyond = tuple(_rows(group.followed, first, first + 1) for group in groups)
-                ambient.append(Filed(self.followed_ambient.optics, beyond))
+            for row, (tray, beyond) in enumerate(self.by_band, first):
+                ambient.append(Filed(tray.optics, tuple(_rows(group.fine, row, row + 1) for group in groups)))
+                if self.settings.followed_anchors > 1:
+                    ambient.append(Filed(beyond.optics, tuple(_rows(group.followed, row, row + 1) for group in groups)))
         return lights, ambient
 
 

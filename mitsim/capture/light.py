@@ -488,7 +488,9 @@ def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> tuple[flo
     """
     rows = np.zeros(int(light.labels.max()) + 1, dtype=np.int64)
     rows[light.labels] = lighting.labels
-    totals = np.array([np.bincount(rows, group.totals[:-1], lighting.weights.shape[1]) for group in light.groups])
+    totals = np.array(
+        [np.bincount(rows, group.totals[: len(rows)], lighting.weights.shape[1]) for group in light.groups]
+    )
     totals -= totals.mean(axis=0)
     every, some = (np.square(totals @ shots.weights.T).mean(axis=1) for shots in (lighting, checked))
     if not some.any():

@@ -221,7 +221,8 @@ def capture_mosaic(
     job, whole = job or Job(), MosaicBench.of(bench)
     colours = ColourBench.of(whole, MOSAIC)
     manifest = _manifest(whole, colours)
-    refuse(whole, request)
+    refuse(request)
+    _refuse_lamps(whole, request)
     _refuse_speckle(whole, request)
     place = None if output is None else Path(output)
     all_lines = colours.whole
@@ -301,6 +302,15 @@ def _manifest(whole: MosaicBench, colours: ColourBench) -> MosaicManifest:
     assert whole.mosaic.mosaic is not None, "checked before"
     lines = colours.manifest.channels
     return MosaicManifest(kind="mosaic-run", channels=lines, mosaic=whole.mosaic.mosaic, weights=weights)
+
+
+def _refuse_lamps(bench: Bench, request: Request) -> None:
+    """MitsimError for lamps, whose light each filter would count for itself."""
+    if bench.loaded.lamps and request.effects.get("ambient", True):
+        raise MitsimError(
+            f"{bench.loaded.path}: colour mosaic: ambient light is not simulated behind colour filters; switch it off "
+            "with effects -ambient, or use colour lines"
+        )
 
 
 def _refuse_speckle(bench: Bench, request: Request) -> None:

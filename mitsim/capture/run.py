@@ -296,6 +296,7 @@ def _warnings(light: Light, totals: Totals, shooting: Shooting, request: Request
     yield from camera_warnings(light.bench.sensor, shooting.always.shape)
     if shooting.always.any():
         yield from _of_ambient_light(shooting, accuracy, total.bound * shooting.dilution)
+        yield from _of_unknown_light(light, shooting)
     if shooting.saturated:
         yield f"saturation: {shooting.saturated} frames have pixels at the full well or the ADC's end; expose for less"
 
@@ -309,6 +310,16 @@ def _foreign(light: Light, totals: Totals, request: Request) -> str:
         f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
         f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for {request.patterns}"
     )
+
+
+def _of_unknown_light(light: Light, shooting: Shooting) -> Iterator[str]:
+    lamplight, accuracy = light.bench.lamplight, light.plan.accuracy
+    if lamplight is not None and lamplight.unknown * shooting.ambient_part > accuracy:
+        first, last = lamplight.response.range_nm
+        yield (
+            f"{lamplight.unknown:.1%} of the lamps' light is in no frame: what a camera would count beyond {first:g} to "
+            f"{last:g} nm if its quantum efficiency went on as it is there; let its curve end at 0, as a filter's does"
+        )
 
 
 def _of_ambient_light(shooting: Shooting, accuracy: float, of_projector: float) -> Iterator[str]:

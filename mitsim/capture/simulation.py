@@ -18,16 +18,20 @@ from mitsim.capture.effects import Physics
 from mitsim.capture.filing import FiledLight, Trays
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
+from mitsim.rig.lamplight import line_units
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.aimed import AimedTracer
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.lamps import Counted, LampTracer, Together
 from mitsim.transport.ledger import Ledger
 from mitsim.transport.neighbours import NeighbourTracer
 from mitsim.transport.receiver import SensorPoints
 
+FromCamera = FromCameraTracer | Together
+"""What follows light from the camera's side."""
 AT_ANCHORS = ("indirect at anchors", "from camera at anchors")
 """Names of the stages that follow light to every anchor."""
 
@@ -41,7 +45,7 @@ class Stage:
     its sums on the host; none for other light.
     """
 
-    tracer: DirectTracer | IndirectTracer | FromCameraTracer
+    tracer: DirectTracer | IndirectTracer | FromCamera
     predicted: float
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
@@ -115,12 +119,12 @@ class Simulation(Trays):
         return tracer.repeating(repeats) if tracer and repeats else tracer
 
     @cached_property
-    def from_camera(self) -> FromCameraTracer | None:
+    def from_camera(self) -> FromCamera | None:
         """Follows all other light, from the same points; none where there is none."""
         return self._from_camera(self._mean_points)
 
     @property
-    def at_anchors(self) -> tuple[IndirectTracer | None, FromCameraTracer | None]:
+    def at_anchors(self) -> tuple[IndirectTracer | None, FromCamera | None]:
         """Both, to every anchor of followed light."""
         points = self._points(self.settings.followed_anchors)
         return self._indirect(points), self._from_camera(points)
@@ -140,13 +144,25 @@ class Simulation(Trays):
         parts = loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points
         return NeighbourTracer(*parts) if shared else IndirectTracer(*parts)
 
-    def _from_camera(self, points: SensorPoints) -> FromCameraTracer | None:
-        loaded, physics = self.bench.loaded, self.physics
-        if not (physics.lamps or physics.mirrors or (physics.interreflection and loaded.glossy)):
+    def _from_camera(self, points: SensorPoints) -> FromCamera | None:
+        loaded, physics, lamplight = self.bench.loaded, self.physics, self.bench.lamplight
+        of_projector = physics.mirrors or (physics.interreflection and loaded.glossy)
+        if not (physics.lamps or of_projector):
             return None
         paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
         parts = loaded.scene, loaded.camera, physics.projector
-        return FromCameraTracer(*parts, self.aim, paths, physics.geometry, points)
+        tracer = FromCameraTracer(*parts, self.aim, paths, physics.geometry, points)
+        if lamplight is None or not physics.lamps:
+            return tracer
+        # Lamps have wavelengths of their own.
+        counted = Counted(
+            lamplight.response, lamplight.bands, line_units(self.bench.sensor, self.bench.projector.lines)
+        )
+        lamps = LampTracer(tracer, counted)
+        if not of_projector:
+            return lamps
+        alone = FromCameraTracer(*parts, self.aim, replace(paths, emitters=()), physics.geometry, points)
+        return Together(alone, lamps)
 
     def follow(self, seed: int, samples: int) -> Deposits:
         """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``, to be filed."""

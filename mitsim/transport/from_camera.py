@@ -56,7 +56,15 @@ class Paths:
 
 
 class FromCameraTracer(FollowingTracer):
-    """From-camera light of a scene, at points of the sensor."""
+    """From-camera light of a scene, at points of the sensor.
+
+    Attributes
+    ----------
+    of_projector
+        whether the projector's light is looked for, beside that of lamps.
+    """
+
+    of_projector: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -93,6 +101,23 @@ class FromCameraTracer(FollowingTracer):
         """Paths in one sample: one per cell and anchor."""
         return self.grid.shape[0] * self.grid.shape[1] * self.points.count
 
+    @property
+    def by_line(self) -> bool:
+        """Whether light is told apart by the wavelengths of its paths."""
+        return self.projector.by_line
+
+    def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
+        """Wavelengths of each path, and weights as :func:`mitsim.transport.receiver.sampled_wavelengths` has them.
+
+        Parameters
+        ----------
+        rng
+            of each path.
+        sample, shared
+            number of each path's sample, and the numbers that all samples of its cell share.
+        """
+        return sampled_wavelengths(self.camera, rng, self.projector.lines)
+
     def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         further = self.paths.mirrors or self.paths.interreflection or self.passage.open
         return CameraWalk(self, seed, sample, lane).deposits(further)
@@ -117,7 +142,7 @@ class CameraWalk(Walk):
             of the random numbers, and of every path.
         """
         super().__init__(
-            tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection, tracer.orders, tracer.projector.by_line
+            tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection, tracer.orders, tracer.by_line
         )
         cell, row, column = tracer.points.of(lane, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
@@ -131,12 +156,20 @@ class CameraWalk(Walk):
         self.by_delta, self.mirrored, self.in_mirror = mi.Bool(True), mi.Bool(True), mi.Bool(False)
         self.came_from, self.came_pdf = dr.zeros(mi.Point3f), mi.Float(0)
         self.since, self.behind_glass = mi.Float(0), mi.Bool(False)
-        self._aim(cell, jitter)
+        self._aim(cell, jitter, sample, shared)
 
     # ---- the camera's side ------------------------------------------------------------------------------------------
 
-    def _aim(self, cell: mi.UInt32, jitter: mi.Point2f) -> None:
-        """Rays from the sensor through the cells, and the weight of each."""
+    def _aim(self, cell: mi.UInt32, jitter: mi.Point2f, sample: mi.UInt32, shared: mi.PCG32) -> None:
+        """Rays from the sensor through the cells, and the weight of each.
+
+        Parameters
+        ----------
+        cell, jitter
+            where each ray goes through.
+        sample, shared
+            number of each path's sample, and the numbers that all samples of its cell share.
+        """
         tracer, grid = self.tracer, self.tracer.grid
         columns = dr.opaque(mi.UInt32, grid.shape[1])
         sensor = tracer.points.at(*self.anchor, self.rng)
@@ -145,7 +178,7 @@ class CameraWalk(Walk):
         self.column = _place(grid.columns, cell % columns, jitter.y) - self.start[1] * nearness
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
-        wavelengths, spectral = sampled_wavelengths(tracer.camera, self.rng, tracer.projector.lines)
+        wavelengths, spectral = tracer.wavelengths(self.rng, sample, shared)
         to_world = tracer.camera.world_transform()
         direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
         self.ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
@@ -170,13 +203,13 @@ class CameraWalk(Walk):
             )
         if first:
             self.active &= self.inverse_depth < 1 / dr.opaque(mi.Float, self.geometry.mask_distance)
-        elif self.tracer.projector.aperture > 0:
+        elif self.tracer.of_projector and self.tracer.projector.aperture > 0:
             self._projector_hit(si)
         if self.paths.emitters:
             self._emitter_hit(si)
         self.active &= si.is_valid()
         bsdf = si.bsdf()
-        if not first:
+        if not first and self.tracer.of_projector:
             self._connect(si, bsdf)
         for emitter in self.paths.emitters:
             self._light(si, bsdf, emitter)

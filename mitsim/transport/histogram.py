@@ -1,8 +1,8 @@
 """From paths to light per cell: deposits in, a sparse matrix out, light[row, layer x (anchor, cell) x (anchor, cell)].
 
 A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the
-last row. A path's light is filed in the cell that holds its direction, over which it is then taken as even, and split
-between the two layers (in 1/z) that enclose its depth.
+last row, or one of the last for each band of its wavelengths. A path's light is filed in the cell that holds its
+direction, over which it is then taken as even, and split between the two layers (in 1/z) that enclose its depth.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Deposits:
     Attributes
     ----------
     pixel
-        (m,) projector pixel 0..n^2-1 (row-major), or n^2 for ambient light.
+        (m,) projector pixel 0..n^2-1 (row-major), or n^2 for ambient light, or n^2 and the number of its band.
     anchor_row, anchor_column
         (m,) anchor that the path started from.
     row, column
@@ -230,12 +230,15 @@ class Bundle:
     between
         whether light is split between the two nearest cell centres along each axis, and taken to come from there. Light
         that an anchor sees over a sharp lobe comes from a small part of a cell, and where that lies counts.
+    lamps
+        rows of ambient light: one, or one for each band of its wavelengths.
     """
 
     grid: CellGrid
     anchors: int
     depths: tuple[float, ...]
     between: bool = False
+    lamps: int = 1
 
     @property
     def rows(self) -> Directions:
@@ -262,7 +265,7 @@ class Bundle:
         return len(self.depths) * self.anchors**2 * self.cells[0] * self.cells[1]
 
     def file(self, deposits: Deposits, labels: IntArray, samples: int = 1) -> sparse.csr_array:
-        """(C + 1, size) light of C classes of pixels and of lamps, per sample, but for what is :meth:`outside`.
+        """(C + lamps, size) light of C classes of pixels and of lamps, per sample, but for what is :meth:`outside`.
 
         Parameters
         ----------
@@ -275,9 +278,9 @@ class Bundle:
         """
         flat, values, pixel = self.entries(deposits, samples)
         count = int(labels.max()) + 1
-        shape = (count + 1, self.size)
+        shape = (count + self.lamps, self.size)
         index = _index_type(*shape)
-        row = np.append(labels, count)[pixel]
+        row = np.append(labels, count + np.arange(self.lamps))[pixel]
         light = sparse.coo_array((values, (row.astype(index), flat.astype(index))), shape=shape)
         # By way of columns, for two passes of counting take half the time of sorting; but a count takes a word a place.
         light = light.tocsc().tocsr() if self.size < _COUNTED else light.tocsr()

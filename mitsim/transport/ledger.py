@@ -125,8 +125,8 @@ class Ledger:
         return np.array(self.sums)
 
     def filed(self, counted: npt.NDArray[np.uint64] | None = None) -> tuple[sparse.csr_array, float, float]:
-        """(rows + 1, places) light of sums that were ``counted``, the last row empty; all that was received, and what
-        lay outside [W m^-2].
+        """(rows + lamps, places) light of sums that were ``counted``, the last rows empty; all that was received, and
+        what lay outside [W m^-2].
 
         MitsimError where light is NaN, infinite, or four million times ``one``.
         """
@@ -140,7 +140,7 @@ class Ledger:
         light = by_row[row, places] * self._unit
         inside = places < self._bundle.size
         outside = float(light[~inside].sum())
-        starts = np.append(0, np.cumsum(np.bincount(row[inside], minlength=self._rows)))
-        shape = self._rows + 1, self._bundle.size
-        entries = light[inside], places[inside].astype(np.int32), np.append(starts, starts[-1])
-        return sparse.csr_array(entries, shape=shape), float(light.sum()), outside
+        rows = self._rows + self._bundle.lamps
+        starts = np.append(0, np.cumsum(np.bincount(row[inside], minlength=rows)))
+        entries = light[inside], places[inside].astype(np.int32), starts
+        return sparse.csr_array(entries, shape=(rows, self._bundle.size)), float(light.sum()), outside

@@ -17,6 +17,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.transport.histogram import Deposits
+from mitsim.transport.lamps import Together
 from mitsim.transport.paths import Tracer
 
 FOLLOWED_LADDER = (1, 2, 3, 5, 8, 12)
@@ -141,7 +142,7 @@ class FollowedLight:
         return self.sample.simulation(self.bench, replace(self.everything, **numbers), one_line=True)
 
     @staticmethod
-    def _tracers(simulation: Simulation) -> list[Tracer]:
+    def _tracers(simulation: Simulation) -> list[Tracer | Together]:
         return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
     def _formed(self, trays: tuple[Tray, Tray], looks: list[Deposits]) -> FloatArray:

@@ -216,7 +216,8 @@ class Sample:
         light = tray.key, *map(id, looks)
         keys = [(*light, np.round(row, _DIGITS).tobytes()) for row in patterns]
         missing = [place for place, key in enumerate(keys) if key not in known]
-        classes_of, size = np.append(self.lighting.labels, classes), tray.bundle.size
+        classes_of = np.append(self.lighting.labels, [classes] * tray.bundle.lamps)
+        size = tray.bundle.size
         entries = [tray.bundle.entries(look) for look in looks] if missing else []
         optics = tray.optics if any(len(place) for place, *_ in entries) else None
 

@@ -1,0 +1,103 @@
+"""A first look at a scene's lamps: a bench in; which part of their light has which wavelength, as its camera counts it,
+out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.effects import present
+from mitsim.capture.evidence import Settings
+from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray
+from mitsim.core.seeds import integer
+from mitsim.rig.lamplight import SPECTRA_NM, Band, Lamplight, Response
+from mitsim.rig.projector import Spectrum
+from mitsim.transport.from_camera import FromCameraTracer
+from mitsim.transport.lamps import CARRIED, Counted, LampTracer
+
+_STEP_NM = 24.0
+"""Widest part of a band whose light diffracts as that of its middle: a shadow's fringes hardly move over it, as for
+ambient light without colours."""
+_CELLS, _SAMPLES = 32, 16
+"""Cells a side, and paths of each: a part of 5 % of the light is told to some percent, in a tenth of a second."""
+_END_NM = 10.0
+"""Of spectra, what tells how much light there is beyond their end."""
+
+
+def lit_by_lamps(bench: Bench, effects: Mapping[str, bool], seed: int) -> Bench:
+    """The same bench, whose lamps shine at wavelengths of their own; as it is without lamps.
+
+    Parameters
+    ----------
+    bench
+        of a spectral variant.
+    effects
+        switched on or off by the user.
+    seed
+        root of the random streams.
+
+    Raises
+    ------
+    MitsimError
+        for a camera whose efficiency is not known where lamps' spectra are.
+    """
+    if not bench.loaded.lamps or not effects.get("ambient", True):
+        return bench
+    response = Response.of(bench.sensor)
+    found = frozenset(name for name in present(bench) if effects.get(name, True))
+    settings = Settings(bench.geometry.scene_distance, effects=found)
+    tracer = Simulation(bench, settings, pixels=min(bench.n, _CELLS)).from_camera
+    assert isinstance(tracer, FromCameraTracer), "lamps are followed, not yet apart"
+    first, last = response.range_nm
+    parts = math.ceil((last - first) / CARRIED / _STEP_NM)
+    stream = integer(seed, "lamplight")
+
+    def seen(*bands: Band) -> FloatArray:
+        """(bands,) light of each."""
+        light = LampTracer(tracer, Counted(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
+        return np.asarray(np.bincount(light.pixel - bench.n**2, light.value, CARRIED) / _SAMPLES)
+
+    # (bands, parts)
+    light = np.stack([seen(*response.bands(CARRIED, part, parts)) for part in range(parts)], axis=1)
+    middles = [[(low + high) / 2 for low, high in response.bands(CARRIED, part, parts)] for part in range(parts)]
+    lamplight = Lamplight(
+        response,
+        response.bands(CARRIED),
+        tuple(map(_spectrum, np.array(middles).T, light)),
+        light.sum(axis=1) / light.sum() if light.any() else np.full(CARRIED, 1 / CARRIED),
+        _unknown(response, seen((SPECTRA_NM[0], first), (last, SPECTRA_NM[1]), *_ends()), float(light.sum())),
+    )
+    return replace(bench, lamplight=lamplight)
+
+
+def _spectrum(wavelengths: FloatArray, light: FloatArray) -> Spectrum:
+    """Of a band whose ``light`` is (parts,) at ``wavelengths`` [nm]; where there is none, even."""
+    lit = light > 0 if light.any() else np.ones(len(light), dtype=bool)
+    weights = light[lit] if light.any() else np.ones(len(light))
+    return Spectrum(wavelengths[lit], weights / weights.sum())
+
+
+def _ends() -> tuple[Band, Band]:
+    """Last wavelengths of spectra, and none."""
+    return (SPECTRA_NM[1] - _END_NM, SPECTRA_NM[1]), (SPECTRA_NM[1], SPECTRA_NM[1])
+
+
+def _unknown(response: Response, light: FloatArray, counted: float) -> float:
+    """Part of the light that is not counted but would be, if efficiency and spectra went on as they end.
+
+    Parameters
+    ----------
+    response
+        of the camera.
+    light
+        (bands,) before its range, after it, and at the spectra's end.
+    counted
+        light that is.
+    """
+    missing = float(light[0] + light[1] + light[2] / _END_NM * response.beyond_nm)
+    return missing / (missing + counted) if missing else 0.0
