@@ -182,7 +182,8 @@ class Bench:
         Raises
         ------
         MitsimError
-            as :meth:`capture`; for another variant, a projector of more than four lines, and scenes with lamps.
+            as :meth:`capture`; for another variant, a projector of more than four lines, and lamps where the camera's
+            efficiency is not known.
         """
         from mitsim.core.job import Job
 
@@ -289,7 +290,8 @@ class Bench:
         ------
         MitsimError
             as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
-            odd number of pixels, and a projector with speckle, which is not simulated behind filters.
+            odd number of pixels, and a projector with speckle or a scene with lamps, which are not simulated behind
+            filters.
         """
         from mitsim.core.job import Job
 

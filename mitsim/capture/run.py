@@ -317,8 +317,8 @@ def _of_unknown_light(light: Light, shooting: Shooting) -> Iterator[str]:
     if lamplight is not None and lamplight.unknown * shooting.ambient_part > accuracy:
         first, last = lamplight.response.range_nm
         yield (
-            f"{lamplight.unknown:.1%} of the lamps' light is in no frame: what a camera would count beyond {first:g} to "
-            f"{last:g} nm if its quantum efficiency went on as it is there; let its curve end at 0, as a filter's does"
+            f"{lamplight.unknown:.1%} of the lamps' light is in no frame: what would be counted beyond {first:g} to "
+            f"{last:g} nm if the quantum efficiency went on as its curve ends; let it end at 0, as a filter's does"
         )
 
 

@@ -71,7 +71,7 @@ class Response(ByValue):
                 f"lamps' spectra are of {SPECTRA_NM[0]:g} to {SPECTRA_NM[1]:g} nm; switch lamps off with -ambient"
             )
         counts = np.interp(wavelengths, known, efficiency) * wavelengths
-        farther = np.union1d(known[known > SPECTRA_NM[1]], SPECTRA_NM[1])
+        farther = np.linspace(SPECTRA_NM[1], max(SPECTRA_NM[1], known[-1]), _PLACES)
         unseen = np.interp(farther, known, efficiency) * farther
         beyond = float(np.trapezoid(unseen, farther) / unseen[0]) if unseen[0] > 0 else 0.0
         return cls(counts, (float(first), float(last)), beyond)

@@ -12,7 +12,7 @@ import pytest
 
 from mitsim.core.configuration import shipped
 from mitsim.core.framefile import read_frame
-from tests.system.conftest import tree
+from tests.system.conftest import CAMERA, tree
 from tests.unit.transport.test_neighbours import WALL
 
 LINES = {638: 0.5, 520: 0.3, 445: 0.2}
@@ -123,6 +123,33 @@ def test_each_line_is_what_a_mono_capture_of_it_gives(
 
 
 @pytest.mark.slow
+def test_a_grey_lamp_is_in_every_line_what_a_mono_capture_has(
+    call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """A flat spectrum has as many photons as its power has at 595 nm, the middle of 360 to 830 nm.
+
+    Frames of lamps alone, in electrons: within twice the errors that both state, but for fringes of other wavelengths,
+    so of the means of 8 x 8 pixels. A line that took its own photons for the lamp's would be off by 7 % and more.
+    """
+    whole, middle = projector(tmp_path / "all.toml", LINES), projector(tmp_path / "middle.toml", {595: 1.0})
+    common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.02, "-D", "albedo=0.5", "--json"
+    scene, run = coloured("lamp"), tmp_path / "run"
+    told = shell("capture", scene, "-o", run, "--colour", "lines", "--projector", whole, *common).payload
+    mono = call("capture", scene, "-o", tmp_path / "mono", "--projector", middle, *common, "--seed", 1).payload
+
+    def lamp(folder: Path) -> np.ndarray:
+        return read_frame(folder / "ambient.exr")[0]["electrons"].astype(float).reshape(8, 8, 8, 8).mean(axis=(1, 3))
+
+    expected, frames = lamp(tmp_path / "mono"), electrons(tmp_path / "mono").mean()
+    for channel in told["channels"]:
+        assert channel["ambient_frame"]["shots"] == 16 and 0.05 < channel["ambient_frame"]["part"] < 0.95
+        error = np.hypot(channel["mc_error"], mono["mc_error"]) * max(frames, electrons(run / channel["name"]).mean())
+        assert np.sqrt(np.square(lamp(run / channel["name"]) - expected).mean()) < 2 * error
+    manifest = json.loads((run / "638nm" / "manifest.json").read_text())
+    assert manifest["configuration"]["lamps_nm"] == [360, 830] and "lamps_nm" not in json.dumps(mono)
+
+
+@pytest.mark.slow
 def test_a_capture_in_colour_goes_on_where_it_stopped(
     shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path
 ) -> None:
@@ -166,7 +193,11 @@ def test_each_line_is_calibrated_for_itself(
         ("sheet", ("--colour", "bands"), "--colour 'bands': use no, lines, bands:K, mosaic or auto"),
         ("sheet", ("--colour", "bands:5"), "--colour 'bands:5': give bands:1 to bands:4"),
         ("sheet", ("--colour", "lines", "--seconds", "5"), "not planned by time"),
-        ("lamp", ("--colour", "lines"), "ambient light is not simulated in colour; switch it off"),
+        (
+            "lamp",
+            ("--colour", "mosaic", "--camera", "$filters"),
+            "ambient light is not simulated behind colour filters",
+        ),
     ],
 )
 def test_what_colour_cannot_do_is_refused(
@@ -178,8 +209,13 @@ def test_what_colour_cannot_do_is_refused(
     words: str,
 ) -> None:
     """(Planted: lamps let through, whose light would have the projector's lines.)"""
-    scene = coloured(name)
-    assert words in shell("capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", *options).refusal
+    scene, camera = coloured(name), tmp_path / "filters.toml"
+    table = "wavelengths_nm = [400.0, 700.0]\nefficiency = [0.5, 0.5]\n"
+    single = CAMERA.replace("5.86", "11.72").replace("binning = 2\n", "").replace("quantum_efficiency = 0.75\n", "")
+    tables = "".join(f"[mosaic_curves.{filters}]\n{table}" for filters in "RGB")
+    camera.write_text(f'{single}mosaic = "RGGB"\n{tables}')
+    given = [str(camera) if option == "$filters" else option for option in options]
+    assert words in shell("capture", scene, "-o", tmp_path / "run", "--patterns", "dots:2", *given).refusal
     assert not (tmp_path / "run").exists()
 
 

@@ -1,0 +1,251 @@
+"""Lamps of known spectra over a matt sheet, as a camera of known efficiency counts them, against integrals.
+
+The geometry is that of ``test_lamps``: a point lamp, a sheet at 400 mm, an open mask. What a line's run sees is
+
+    integral I(lambda) rho(lambda) eta(lambda) lambda dlambda / (470 nm eta_l lambda_l)
+
+times what it sees of a lamp of intensity 1 over a sheet of reflectance 1; I / 470 nm is the lamp's spectral intensity.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import open_bench
+from mitsim.capture.colour import ColourBench
+from mitsim.capture.evidence import Settings
+from mitsim.capture.filing import Tray
+from mitsim.capture.run import _of_unknown_light
+from mitsim.capture.simulation import Simulation
+from mitsim.core.colours import RUN
+from mitsim.core.errors import MitsimError
+from mitsim.rig.lamplight import SPECTRA_NM, Lamplight, Response, line_units
+from mitsim.rig.patterns import Lighting
+from mitsim.rig.projector import Lines, Spectrum
+from mitsim.transport.histogram import Deposits
+from tests.conftest import write_small_scene
+from tests.invented import sensor
+from tests.system.conftest import CAMERA
+from tests.unit.capture.test_lamps import ALBEDO, POSITION, seen
+
+LAMPS = {
+    "flat": '<spectrum name="intensity" value="3e4"/>',
+    "coloured": '<spectrum name="intensity" value="400:1e4, 500:6e4, 505:2e5, 510:6e4, 650:2e4, 800:5e4"/>',
+    "cie_a": '<spectrum name="intensity" type="blackbody"><float name="temperature" value="2856"/></spectrum>',
+    "d65": '<spectrum name="intensity" type="d65"><float name="scale" value="3e4"/></spectrum>',
+}
+SHEETS = {"grey": "0.5", "coloured": "350:0.2, 550:0.8, 850:0.4"}
+CURVE = {420.0: 0.2, 530.0: 0.8, 700.0: 0.3}
+"""A camera's electrons per photon."""
+LINES = [638.0, 520.0, 445.0]
+SEEDS, SAMPLES = 8, 64
+CASES = [("flat", "grey", False), ("coloured", "coloured", True), ("cie_a", "grey", False), ("d65", "coloured", True)]
+
+
+def spectral(lamp: str, wavelengths: np.ndarray) -> np.ndarray:
+    """Intensity of a ``lamp``, as Mitsuba's plugins have it."""
+    if lamp == "flat":
+        return np.full(wavelengths.shape, 3e4)
+    if lamp == "coloured":
+        known = {400: 1e4, 500: 6e4, 505: 2e5, 510: 6e4, 650: 2e4, 800: 5e4}
+        return np.interp(wavelengths, list(known), list(known.values()), 0, 0)
+    if lamp == "cie_a":  # Planck's law [W m^-2 sr^-1 nm^-1]
+        metres, h, c, k = wavelengths * 1e-9, 6.62607015e-34, 299792458.0, 1.380649e-23
+        return 1e-9 * 2 * h * c**2 / metres**5 / np.expm1(h * c / (metres * k * 2856.0))
+    import colour
+
+    daylight = colour.SDS_ILLUMINANTS["D65"]
+    return 3e4 * np.interp(wavelengths, daylight.wavelengths, daylight.values) / D65_UNIT
+
+
+D65_UNIT = 98.99741751876255
+"""Mitsuba's D65 has a luminance of 1: MI_CIE_D65_NORMALIZATION."""
+
+
+def counted(lamp: str, sheet: str, curve: bool, low: float = SPECTRA_NM[0], high: float = SPECTRA_NM[1]) -> float:
+    """Integral from ``low`` to ``high`` [nm] of what the camera counts."""
+    at = np.linspace(low, high, 2 + int((high - low) * 20))
+    pairs = dict(map(float, pair.split(":")) for pair in SHEETS[sheet].split(", ")) if sheet == "coloured" else {}
+    albedo = np.interp(at, list(pairs), list(pairs.values())) if pairs else ALBEDO
+    efficiency = np.interp(at, list(CURVE), list(CURVE.values())) if curve else 0.75
+    return float(np.trapezoid(spectral(lamp, at) * albedo * efficiency * at, at) / (SPECTRA_NM[1] - SPECTRA_NM[0]))
+
+
+def traced(folder: str) -> list[dict[str, Any]]:
+    """Light of each case in this process, whose variant is spectral from then on."""
+    place, found = Path(folder), []
+    (place / "number.toml").write_text(CAMERA)
+    table = f"[quantum_efficiency_curve]\nwavelengths_nm = {list(CURVE)}\nefficiency = {list(CURVE.values())}\n"
+    (place / "curve.toml").write_text(CAMERA.replace("quantum_efficiency = 0.75\n", "") + table)
+    (place / "lines.toml").write_text(
+        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {LINES}\nradiant_shares = [0.5, 0.3, 0.2]\n'
+    )
+    for lamp, sheet, curve in CASES:
+        emitter = f'<emitter type="point">{POSITION}{LAMPS[lamp]}</emitter>'
+        path = write_small_scene(place, lamp, mask="open", extra=emitter)
+        camera = place / ("curve.toml" if curve else "number.toml")
+        bench = open_bench(path, "llvm_ad_spectral", camera, place / "lines.toml", albedo=SHEETS[sheet])
+        whole = ColourBench.of(bench, RUN).lit_by_lamps({}, 0).whole
+        assert whole.lamplight is not None
+        simulation = Simulation(whole, Settings(depth=400.0, effects=frozenset({"ambient"})))
+        assert simulation.from_camera is not None
+        looks = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
+        lines = [[light.value.sum() / SAMPLES for light in look.by_line(len(LINES))] for look in looks]
+        bands = [np.bincount(look.pixel - whole.n**2, look.value) / SAMPLES for look in looks]
+        labels = np.zeros(whole.n**2, dtype=np.int64)
+        filed = [simulation.file_followed(look.by_line(3)[2], labels, SAMPLES).fine for look in looks[:1]]
+        found.append(
+            {
+                "lines": np.array(lines).tolist(),
+                "bands": np.array(bands).tolist(),
+                "filed": np.asarray(filed[0].sum(axis=1)).tolist(),
+                "shares": whole.lamplight.shares.tolist() if whole.lamplight.shares is not None else [],
+                "edges": list(whole.lamplight.bands),
+                "spectra": [list(each.wavelengths_nm) for each in whole.lamplight.spectra],
+                "weights": [list(each.weights) for each in whole.lamplight.spectra],
+                "unknown": whole.lamplight.unknown,
+            }
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def light(tmp_path_factory: pytest.TempPathFactory) -> Mapping[tuple[str, str, bool], dict[str, Any]]:
+    """Light of each case, from one child process: this one has another variant."""
+    program = (
+        "import json, sys; from tests.unit.capture.test_lamplight import traced; print(json.dumps(traced(sys.argv[1])))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path_factory.mktemp("lamps"))]
+    root = Path(__file__).parents[3]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
+    assert done.returncode == 0, done.stderr
+    return dict(zip(CASES, json.loads(done.stdout.splitlines()[-1]), strict=True))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_line_sees_the_lamp_as_its_closed_form(light: Mapping[Any, dict[str, Any]], case: Any) -> None:
+    """Seven standard errors of eight seeds, 1 % at most, and 2e-4 of rounding and of the geometry's judge."""
+    *_, curve = case
+    ends = (min(CURVE), max(CURVE)) if curve else SPECTRA_NM
+    geometry = seen("point") / (ALBEDO * 3e4)
+    runs, found = np.array(light[case]["lines"]), light[case]
+    for line, wavelength in enumerate(LINES):
+        efficiency = np.interp(wavelength, list(CURVE), list(CURVE.values())) if curve else 0.75
+        expected = geometry * counted(*case, *ends) / (efficiency * wavelength)
+        error = runs[:, line].std(ddof=1) / np.sqrt(SEEDS)
+        assert 7 * error < 0.01 * expected
+        assert abs(runs[:, line].mean() - expected) < 7 * error + 2e-4 * expected, (case, wavelength)
+    assert sum(found["filed"]) == pytest.approx(runs[0, 2], rel=1e-6) and found["filed"][0] == 0
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_band_has_its_light(light: Mapping[Any, dict[str, Any]], case: Any) -> None:
+    """In rows of its own, and as the first look says to some percent; in the look, so many parts of a band."""
+    found = light[case]
+    expected = np.array([counted(*case, *edges) for edges in found["edges"]])
+    bands = np.array(found["bands"])
+    assert bands.mean(axis=0) / bands.mean() / 4 == pytest.approx(expected / expected.sum(), abs=2e-3)
+    assert found["shares"] == pytest.approx(expected / expected.sum(), abs=0.01)
+    for edges, spectrum, weights in zip(found["edges"], found["spectra"], found["weights"], strict=True):
+        assert edges[0] < min(spectrum) and max(spectrum) < edges[1]
+        mean = counted_mean(case, edges)
+        assert np.dot(spectrum, weights) == pytest.approx(mean, abs=3)
+
+
+def counted_mean(case: tuple[str, str, bool], edges: tuple[float, float]) -> float:
+    """Mean wavelength [nm] of what is counted in a band, in steps of a nanometre."""
+    middles = np.arange(edges[0], edges[1], 1.0) + 0.5
+    light = np.array([counted(*case, at - 0.5, at + 0.5) for at in middles])
+    return float((middles * light).sum() / light.sum())
+
+
+def test_light_beyond_a_curve_is_known_to_be_missing(light: Mapping[Any, dict[str, Any]]) -> None:
+    """As if the efficiency stayed what it is at the curve's ends. (Planted: none told.)"""
+    for case in CASES:
+        *_, curve = case
+        if not curve:
+            assert light[case]["unknown"] == 0
+            continue
+        ends = min(CURVE), max(CURVE)
+        inside, whole = counted(*case, *ends), counted(*case)
+        assert light[case]["unknown"] == pytest.approx((whole - inside) / whole, abs=0.01)
+
+
+def test_a_number_is_the_efficiency_at_every_wavelength() -> None:
+    response = Response.of(sensor(quantum_efficiency=0.5))
+    assert response.range_nm == SPECTRA_NM and response.beyond_nm == 0
+    assert response.counts == pytest.approx(0.5 * np.linspace(*SPECTRA_NM, len(response.counts)), rel=1e-14)
+    assert line_units(sensor(quantum_efficiency=0.5), Lines((600.0, 400.0), (0.5, 0.5))) == (1 / 300, 1 / 200)
+
+
+def test_bands_are_even_and_so_are_their_parts() -> None:
+    response = Response(np.ones(2), (400.0, 800.0))
+    assert response.bands(4) == ((400, 500), (500, 600), (600, 700), (700, 800))
+    assert response.bands(2, 1, 2) == ((500, 600), (700, 800))
+
+
+def test_a_curve_that_goes_on_beyond_spectra_says_how_far() -> None:
+    """Efficiency 0.5 at 830 nm, falling to 0 at 1030 nm: integral of eta lambda over eta lambda there."""
+    curve = {"wavelengths_nm": [400.0, 830.0, 1030.0], "efficiency": [0.5, 0.5, 0.0]}
+    response = Response.of(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))
+    at = np.linspace(830, 1030, 20001)
+    exact = np.trapezoid(0.5 * (1030 - at) / 200 * at, at) / (0.5 * 830)
+    assert response.range_nm == (400.0, 830.0) and response.beyond_nm == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_camera_that_sees_no_spectrum_is_refused() -> None:
+    curve = {"wavelengths_nm": [900.0, 1700.0], "efficiency": [0.5, 0.5]}
+    blind = sensor(quantum_efficiency=None, quantum_efficiency_curve=curve)
+    with pytest.raises(
+        MitsimError, match="of 900 to 1700 nm, and lamps' spectra are of 360 to 830 nm; switch lamps off"
+    ):
+        Response.of(blind)
+    half = {"wavelengths_nm": [400.0, 500.0, 700.0], "efficiency": [0.5, 0.0, 0.0]}
+    with pytest.raises(MitsimError, match="is blind at 600 nm, a line of the projector"):
+        line_units(sensor(quantum_efficiency=None, quantum_efficiency_curve=half), Lines((600.0,), (1.0,)))
+
+
+def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callable[..., Path], variant: str) -> None:
+    """A spot of each band alone makes the frame of a spot of its spectrum, beside a projector that is not lit.
+
+    (Planted: rows of bands taken from the end.)
+    """
+    nm = [(420.0,), (500.0, 540.0), (600.0,), (760.0,)]
+    spectra = tuple(Spectrum(np.array(at), np.full(len(at), 1 / len(at))) for at in nm)
+    lamp = '<emitter type="constant"/>'
+    bench = open_bench(small_scene(extra=lamp), variant, None, "mp_cl1")
+    response = Response.of(bench.sensor)
+    bench = replace(bench, lamplight=Lamplight(response, response.bands(4), spectra, np.full(4, 0.25)))
+    settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
+    simulation, labels = Simulation(bench, settings), np.zeros(bench.n**2, dtype=np.int64)
+    frames = []
+    for band, spectrum in enumerate(spectra):
+        none, place = np.zeros(1, np.int64), np.full(1, 0.02)
+        spot = Deposits(
+            none + bench.n**2 + band, none, none, place, place, place / 8, np.ones(1), none.astype(np.int16)
+        )
+        light = simulation.file_followed(spot, labels, 1)
+        expected = simulation.expected([light], labels[:1], Lighting.uniform(bench.n).shots([0]), 0)
+        alone = Tray(simulation.fine.bundle, bench.geometry, spectrum).optics
+        found = expected.projector_off.irradiance
+        row = light.fine[[1 + band]].tocsr()
+        assert np.allclose(found, alone.frame(row.indices, row.data), rtol=1e-12, atol=1e-15 * found.max())
+        frames.append(found)
+    assert np.linalg.norm(frames[0] - frames[3]) > 0.05 * np.linalg.norm(frames[0])
+
+
+@pytest.mark.parametrize(("part", "flagged"), [(0.5, True), (0.02, False)])
+def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool) -> None:
+    """Where it is more of all light than the accuracy."""
+    lamplight = Lamplight(Response(np.ones(2), (400.0, 700.0)), (), unknown=0.04)
+    light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), plan=SimpleNamespace(accuracy=1e-3))
+    said = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
+    assert bool(said) is flagged and all("4.0% of the lamps' light is in no frame" in sentence for sentence in said)
