@@ -77,7 +77,15 @@ class Response(ByValue):
         return cls(counts, (float(first), float(last)), beyond)
 
     def bands(self, count: int, part: int = 0, parts: int = 1) -> tuple[Band, ...]:
-        """``count`` equal bands of what is counted; of each only the ``part`` (0..) of so many ``parts``."""
+        """Equal bands of what is counted [nm].
+
+        Parameters
+        ----------
+        count
+            of them.
+        part, parts
+            number, from 0, of the only part of each band that is meant, and into how many it is cut.
+        """
         first, last = self.range_nm
         edges = first + (last - first) * np.arange(count * parts + 1) / (count * parts)
         return tuple((float(edges[place]), float(edges[place + 1])) for place in range(part, count * parts, parts))
