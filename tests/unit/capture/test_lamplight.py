@@ -30,7 +30,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.rig.lamplight import SPECTRA_NM, Lamplight, Response, line_units
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Lines, Spectrum
+from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import Deposits
+from mitsim.transport.lamps import LampTracer, Together
 from tests.conftest import write_small_scene
 from tests.invented import sensor
 from tests.system.conftest import CAMERA
@@ -96,16 +98,20 @@ def traced(folder: str) -> list[dict[str, Any]]:
         whole = ColourBench.of(bench, RUN).lit_by_lamps({}, 0).whole
         assert whole.lamplight is not None
         simulation = Simulation(whole, Settings(depth=400.0, effects=frozenset({"ambient"})))
-        assert simulation.from_camera is not None
+        assert isinstance(simulation.from_camera, LampTracer)
         looks = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
         lines = [[light.value.sum() / SAMPLES for light in look.by_line(len(LINES))] for look in looks]
         bands = [np.bincount(look.pixel - whole.n**2, look.value) / SAMPLES for look in looks]
+        parts = whole.loaded.scene, whole.loaded.camera, simulation.physics.projector, simulation.aim
+        mirrored = Together(FromCameraTracer(*parts, Paths(mirrors=True)), simulation.from_camera)
+        both = mirrored.trace(0, 0, SAMPLES).by_line(len(LINES)) if lamp == "flat" else []
         labels = np.zeros(whole.n**2, dtype=np.int64)
         filed = [simulation.file_followed(look.by_line(3)[2], labels, SAMPLES).fine for look in looks[:1]]
         found.append(
             {
                 "lines": np.array(lines).tolist(),
                 "bands": np.array(bands).tolist(),
+                "together": [float(light.value.sum()) / SAMPLES for light in both],
                 "filed": np.asarray(filed[0].sum(axis=1)).tolist(),
                 "shares": whole.lamplight.shares.tolist() if whole.lamplight.shares is not None else [],
                 "edges": list(whole.lamplight.bands),
@@ -143,6 +149,7 @@ def test_every_line_sees_the_lamp_as_its_closed_form(light: Mapping[Any, dict[st
         error = runs[:, line].std(ddof=1) / np.sqrt(SEEDS)
         assert 7 * error < 0.01 * expected
         assert abs(runs[:, line].mean() - expected) < 7 * error + 2e-4 * expected, (case, wavelength)
+    assert found["together"] in ([], pytest.approx(runs[0], rel=1e-12)), "beside paths over mirrors, which see none"
     assert sum(found["filed"]) == pytest.approx(runs[0, 2], rel=1e-6) and found["filed"][0] == 0
 
 
