@@ -259,7 +259,7 @@ class Bench:
 
         job = job or Job()
         with job.clock.stage("imports"):
-            from mitsim.capture.colour import calibrate_lines
+            from mitsim.capture.colour_session import calibrate_lines
 
         return calibrate_lines(self, seed, accuracy, recipe, output, resume, job)
 

@@ -1,46 +1,42 @@
-"""Sequential colour: a bench of several spectral lines in; a run, or a calibration, for each line alone out.
+"""Sequential colour: a bench of several spectral lines in; a run for each line alone out.
 
 A camera without colours sees one line of the projector at a time. Light of all lines is traced on the same paths
 (:func:`mitsim.capture.light.trace_lines`), which carry a wavelength for each; from there on every line is a bench of
-its own, with the line's power, diffraction and photons, and what is made of it is an ordinary run or calibration.
+its own, with the line's power, diffraction and photons, and what is made of it is an ordinary run. Calibrations are in
+:mod:`mitsim.capture.colour_session`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mitsim.capture.calibrate import calibrate_session, of_one_depth
 from mitsim.capture.evidence import Settings
 from mitsim.capture.lamplight import lit_by_lamps
 from mitsim.capture.light import Light, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
-from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import trace_truths
-from mitsim.core.arrays import FloatArray
-from mitsim.core.colours import CALIBRATION, MOST_LINES, RUN, ColourManifest, Line, spectral_of, write_colours
+from mitsim.core.colours import MOST_LINES, RUN, ColourManifest, Line, spectral_of, write_colours
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.output import output_folder
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Lines
-from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.transport.histogram import Deposits
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
     from mitsim.capture.request import Request
     from mitsim.core.runs import Capture
-    from mitsim.reconstruct.factors import Factors
 
 _RAYS, _ALIKE = 4, 0.9
 """Rays of each pixel that tell how rough a line's light is, and paths of each cell that tell lamps' light, a tenth of a
@@ -136,11 +132,6 @@ class ColourBench:
         alike = [line for line, step in enumerate(steps) if step >= _ALIKE * max(steps)]
         return self.benches[max(alike, key=lambda line: wavelengths[line])]
 
-    def boards(self, recipe: SessionRecipe) -> tuple[Bench, ...]:
-        """The same before one board of a ``recipe``."""
-        board = Session(self.whole, recipe).board
-        return tuple(replace(bench, loaded=board.loaded) for bench in self.benches)
-
 
 def capture_lines(
     bench: Bench,
@@ -168,7 +159,7 @@ def capture_lines(
     colours = ColourBench.of(bench, RUN)
     refuse(request)
     colours = colours.lit_by_lamps(request.effects, request.seed)
-    with _claimed(output, colours.manifest, resume) as places:
+    with claimed(output, colours.manifest, resume) as places:
         for each, place in zip(colours.benches, places, strict=True):
             check_run(each, request, place, resume)
         lights = traced_lines(colours, request, job, plan)
@@ -230,127 +221,6 @@ def _lit(lighting: Lighting) -> float:
     return float(np.mean(lighting.weights.mean(axis=0)[lighting.labels]))
 
 
-def calibrate_lines(
-    bench: Bench,
-    seed: int = 0,
-    accuracy: float = 1e-3,
-    recipe: SessionRecipe | None = None,
-    output: Path | str | None = None,
-    resume: bool = False,
-    job: Job | None = None,
-) -> dict[str, Factors]:
-    """Factors at each line, by its name; see :meth:`mitsim.capture.bench.Bench.calibrate_lines`.
-
-    Parameters
-    ----------
-    bench, seed, accuracy, recipe, output, resume, job
-        as there.
-
-    Raises
-    ------
-    MitsimError
-        as there.
-    """
-    colours = ColourBench.of(bench, CALIBRATION)
-    sessions = line_sessions(colours, of_one_depth(recipe or load_recipe()), seed)
-    return run_sessions(colours, sessions, accuracy, output, resume, job or Job())
-
-
-def line_sessions(
-    colours: ColourBench, recipe: SessionRecipe, seed: int, filters: Sequence[FloatArray] | None = None
-) -> list[Session]:
-    """The session of each line, whose light is traced with the others'.
-
-    Parameters
-    ----------
-    colours, recipe, seed
-        bench and lines, how they are run, and the root of their random streams.
-    filters
-        (pixels, pixels) part of each line's light that filters pass; None: all.
-    """
-    shared = _SharedLight(colours, Session(colours.whole, recipe, seed))
-    passed: Sequence[FloatArray | None] = filters or [None] * len(colours.benches)
-    return [
-        _LineSession(each, recipe, seed, filters=own, shared=shared, line=number)
-        for number, (each, own) in enumerate(zip(colours.benches, passed, strict=True))
-    ]
-
-
-def run_sessions(
-    colours: ColourBench,
-    sessions: Sequence[Session],
-    accuracy: float,
-    output: Path | str | None,
-    resume: bool,
-    job: Job,
-) -> dict[str, Factors]:
-    """Factors at each line, by its name.
-
-    Parameters
-    ----------
-    colours, sessions
-        bench and lines, and the session of each.
-    accuracy, output, resume, job
-        as for :meth:`mitsim.capture.bench.Bench.calibrate_lines`.
-    """
-    with _claimed(output, colours.manifest, resume) as places:
-        lines = zip(colours.manifest.names, sessions, places, strict=True)
-        return {name: calibrate_session(each, accuracy, place, resume, job) for name, each, place in lines}
-
-
-@dataclass(frozen=True, eq=False)
-class _SharedLight:
-    """Light of the board by line, traced when it is first asked for."""
-
-    colours: ColourBench
-    session: Session
-    _found: dict[str, Any] = field(default_factory=dict)
-
-    def plan(self, accuracy: float, job: Job) -> Plan:
-        """As :meth:`Session.plan`, of all lines together."""
-        if "plan" not in self._found:
-            self._found["plan"] = self.session.plan(accuracy, job)
-        plan: Plan = self._found["plan"]
-        return plan
-
-    def light(self, line: int, plan: Plan, job: Job) -> Light:
-        """As :meth:`Session.trace`.
-
-        Parameters
-        ----------
-        line
-            its number.
-        plan, job
-            as there.
-        """
-        if "lights" not in self._found:
-            boards = self.colours.boards(self.session.recipe)
-            self._found["lights"] = self.session.trace_lines(boards, plan, job)
-        light: Light = self._found["lights"][line]
-        return light
-
-
-@dataclass(frozen=True)
-class _LineSession(Session):
-    """A session whose light is traced with that of other lines."""
-
-    shared: _SharedLight | None = None
-    line: int = 0
-
-    @cached_property
-    def board(self) -> Bench:
-        assert self.shared is not None
-        return self.shared.colours.boards(self.recipe)[self.line]
-
-    def plan(self, accuracy: float, job: Job) -> Plan:
-        assert self.shared is not None
-        return self.shared.plan(accuracy, job)
-
-    def trace(self, plan: Plan, job: Job) -> Light:
-        assert self.shared is not None
-        return self.shared.light(self.line, plan, job)
-
-
 def refuse(request: Request) -> None:
     """MitsimError where a ``request`` asks for what is not simulated in colour."""
     if request.seconds is not None:
@@ -358,8 +228,21 @@ def refuse(request: Request) -> None:
 
 
 @contextmanager
-def _claimed(output: Path | str | None, manifest: ColourManifest, resume: bool) -> Iterator[Sequence[Path | None]]:
-    """Places for the lines' folders, None in memory; colour.json is written when all of them are finished."""
+def claimed(output: Path | str | None, manifest: ColourManifest, resume: bool) -> Iterator[Sequence[Path | None]]:
+    """Places for the lines' folders, None in memory; colour.json is written when all of them are finished.
+
+    Parameters
+    ----------
+    output, resume
+        as for :meth:`mitsim.capture.bench.Bench.capture_lines`.
+    manifest
+        of the lines.
+
+    Raises
+    ------
+    MitsimError
+        where the output cannot be written.
+    """
     if output is None:
         yield [None] * len(manifest.names)
         return

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.calibrate import of_one_depth
-from mitsim.capture.colour import ColourBench, line_sessions, refuse, run_sessions, traced_lines
+from mitsim.capture.colour import ColourBench, refuse, traced_lines
 from mitsim.capture.light import Light
 from mitsim.capture.run import capture, check_run
 from mitsim.capture.simulation import Simulation
@@ -276,6 +275,9 @@ def calibrate_mosaic(
         )
     passed = behind(weights, bench.geometry.frame_shape)
     recipe = recipe or load_recipe().model_copy(update={"repeats": _REPEATS})
+    from mitsim.capture.calibrate import of_one_depth  # captures need neither
+    from mitsim.capture.colour_session import line_sessions, run_sessions
+
     sessions = line_sessions(colours, of_one_depth(recipe), seed, list(passed))
     return run_sessions(colours, sessions, accuracy, output, resume, job or Job())
 
