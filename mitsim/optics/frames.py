@@ -195,6 +195,7 @@ class ExpectedFrames:
             indicator if self._mixed else sparse.csr_array(sparse.csr_array(self._weights - least) @ indicator)
         )
         self._formed: tuple[FloatArray, FloatArray] | None = None
+        self._held: Sequence[Frame] | None = None
         self._always: tuple[FloatArray, FloatArray] | None = None
         self._leaked: tuple[FloatArray, FloatArray] | None = None
         self._probed = probed if self._mixed else None
@@ -231,6 +232,13 @@ class ExpectedFrames:
             for start in range(0, len(self), step):
                 irradiance, probed = self._form(start, min(start + step, len(self)))
                 yield from self._frames(list(irradiance), list(probed))
+            return
+        if self._of_classes.one_each:
+            if self._held is None:
+                irradiance, probed = self._form(0, len(self))
+                shots = self._of_classes.in_place(irradiance)
+                self._held = self._frames(shots, self._of_classes.shots(probed, 0, len(self)), owned=True)
+            yield from self._held
             return
         if self._formed is None:
             self._formed = self._form(0, self._basis.shape[0])
@@ -327,8 +335,13 @@ class ExpectedFrames:
     def _shape(self) -> tuple[int, int]:
         return self._lights[0].optics.frame_shape
 
-    def _frames(self, irradiance: Sequence[FloatArray], probes: Sequence[FloatArray]) -> list[Frame]:
-        """Frames (m, m') of light with what is in all of them, and their variance by ``probes``."""
+    def _frames(
+        self, irradiance: Sequence[FloatArray], probes: Sequence[FloatArray], owned: bool = False
+    ) -> list[Frame]:
+        """Frames (m, m') of light with what is in all of them, and their variance by ``probes``.
+
+        Light that is ``owned`` by nobody else is changed in place.
+        """
         ambient = self._ambient_formed
         count = self._groups
         pairs = count * (count - 1)
@@ -336,7 +349,8 @@ class ExpectedFrames:
         def seen(row: int) -> Frame:
             frame, probed = irradiance[row], probes[row]
             if ambient is not None:
-                frame, probed = frame + ambient[0][0], probed + ambient[1][0]
+                frame = np.add(frame, ambient[0][0], out=frame if owned else None)
+                probed = probed + ambient[1][0]
             by_group = probed.reshape(self._shape[0], count, -1)
             squared = _squares(by_group - by_group.mean(axis=1, keepdims=True)) if pairs else np.zeros(1)
             spread = float(squared.sum())
@@ -346,9 +360,11 @@ class ExpectedFrames:
             if frame.min() >= 0:
                 frame.flags.writeable = False  # of those that are held, which nobody may change
                 return Frame(frame, variance, 0.0, heaviest, parts)
-            light = np.maximum(frame, 0)
+            whole = float(frame.sum())
+            light = np.maximum(frame, 0, out=frame if owned else None)
+            light.flags.writeable = False
             total = float(light.sum())
-            return Frame(light, variance, (total - float(frame.sum())) / total if total else 0.0, heaviest, parts)
+            return Frame(light, variance, (total - whole) / total if total else 0.0, heaviest, parts)
 
         return in_threads(seen, range(len(irradiance)))
 
@@ -431,6 +447,29 @@ class _Mixture:
     weights: FloatArray
     least: FloatArray
     own: sparse.csr_array
+
+    @cached_property
+    def one_each(self) -> bool:
+        """Whether every shot has one held frame, and every held frame one shot."""
+        shots, held = self.own.shape
+        alone = np.array_equal(np.diff(self.own.indptr), np.ones(shots))
+        return shots == held and alone and np.array_equal(np.sort(self.own.indices), np.arange(held))
+
+    def in_place(self, basis: FloatArray) -> Sequence[FloatArray]:
+        """All shots of which :attr:`one_each` holds, bit for bit as :meth:`shots` has them, where the frames of the
+        ``basis`` (b, ...) lay: those are overwritten, for no memory is as dear as new memory."""
+        common = _mix(self.least[None], basis)[0] if self.least.any() else None
+
+        def turned(shot: int) -> FloatArray:
+            (number,), (weight,) = _row(self.own, shot)
+            frame: FloatArray = basis[number]
+            if weight != 1:
+                frame *= weight
+            if common is not None:
+                frame += common
+            return frame
+
+        return in_threads(turned, range(len(self.weights)))
 
     def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
         """Those from ``start`` to ``stop``, of the held frames ``basis`` (b, ...); some may be of the basis itself."""

@@ -11,6 +11,7 @@ from mitsim.optics.frames import (
     ClassFrames,
     ExpectedFrames,
     Filed,
+    Frame,
     _paired,
     _product,
     at_once,
@@ -119,6 +120,32 @@ def test_frames_of_large_sensors_are_held_by_their_bytes() -> None:
     assert mixes(256, 256, 512) and not mixes(257, 300, 512) and not mixes(3, 2, 64)
     assert mixes(49, 49, 2048) and mixes(56, 56, 2048) and not mixes(57, 64, 2048)
     assert frames_in_memory(49, 49, 2048) == 61 and frames_in_memory(64, 64, 2048) == 12
+
+
+@pytest.mark.parametrize("lamps", [False, True])
+@pytest.mark.parametrize("black", [0.0, 0.02])
+@pytest.mark.parametrize("most", [1.0, 0.7])
+def test_shots_of_a_class_each_are_formed_where_the_classes_lay(
+    lamps: bool, black: float, most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit by bit as shots that are formed beside them, asked for once or twice; some pixels are below zero."""
+    weights = black + most * np.eye(4)[[2, 0, 3, 1]]
+    sides = np.where(np.arange(CELLS**2) % CELLS < CELLS // 2, -1.0, 1.5)
+    light = [sparse.csr_array(group.toarray() * sides) for group in random_groups(3, 7, 0.2)]
+    ambient = [Filed(small_optics(), ambient_groups(3))] if lamps else []
+
+    def formed() -> list[list[Frame]]:
+        expected = expected_frames(small_optics(), light, LABELS, weights, 5, ambient=ambient)
+        assert expected.sampling_error()[0] > 0  # its probes are held, and must stay what they are
+        return [list(expected), list(expected)]
+
+    once, twice = formed()
+    monkeypatch.setattr(frames_module._Mixture, "one_each", False)
+    plain, _ = formed()
+    assert any(frame.removed for frame in plain) and len({frame.variance for frame in plain}) == 4
+    for found, again, frame in zip(once, twice, plain, strict=True):
+        assert again is found and found.irradiance.tobytes() == frame.irradiance.tobytes()
+        assert all(getattr(found, name) == getattr(frame, name) for name in ("variance", "removed", "by_group"))
 
 
 @pytest.mark.parametrize("held", [True, False])
