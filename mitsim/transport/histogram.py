@@ -114,7 +114,7 @@ class Deposits:
     lane
         (m,) number of each path in its launch, increasing; None where that is not known.
     lines
-        (m, 4) ``value`` by line, then zeros; None where it is not told apart.
+        (4, m) ``value`` by line, then zeros, in single precision as it was traced; None where it is not told apart.
     """
 
     pixel: IntArray
@@ -126,14 +126,14 @@ class Deposits:
     value: FloatArray
     kind: npt.NDArray[np.int16]
     lane: IntArray | None = None
-    lines: FloatArray | None = None
+    lines: npt.NDArray[np.float32] | None = None
 
     @classmethod
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
         """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
         by_line = [part.lines for part in parts if part.lines is not None]
-        lines = np.concatenate(by_line) if by_line and len(by_line) == len(parts) else None
+        lines = np.concatenate(by_line, axis=1) if by_line and len(by_line) == len(parts) else None
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
         return cls(**arrays, lines=lines)
 
@@ -142,7 +142,7 @@ class Deposits:
         if lines == 1 or not len(self.value):
             return [self] * lines
         assert self.lines is not None, "traced by line"
-        return [replace(self, value=np.ascontiguousarray(self.lines[:, line]), lines=None) for line in range(lines)]
+        return [replace(self, value=self.lines[line].astype(np.float64), lines=None) for line in range(lines)]
 
     @classmethod
     def fetched(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> Deposits:
@@ -167,9 +167,11 @@ class Deposits:
         light = np.array(seen.value)
         check_finite(light)
         lit = np.flatnonzero(light)
+        whole = lit.size == light.size
 
         def lit_ones(values: mi.Float, dtype: type) -> npt.NDArray[Any]:
-            return np.array(values)[lit].astype(dtype)
+            found = np.asarray(values)
+            return (found if whole else found[..., lit]).astype(dtype)
 
         none = np.zeros(lit.size, np.int64)
         return cls(
@@ -182,7 +184,7 @@ class Deposits:
             value=lit_ones(light, np.float64),
             kind=np.full(lit.size, kind, dtype=np.int16),
             lane=lit,
-            lines=None if seen.lines is None else np.array(seen.lines).T[lit].astype(np.float64),
+            lines=None if seen.lines is None else lit_ones(seen.lines, np.float32),
         )
 
     @classmethod
@@ -207,7 +209,7 @@ class Deposits:
         return self._taken(slice(*np.searchsorted(self.lane, (first, last))))
 
     def _taken(self, which: slice | npt.NDArray[np.bool_]) -> Deposits:
-        lines = None if self.lines is None else self.lines[which]
+        lines = None if self.lines is None else self.lines[:, which]
         return Deposits(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
 
 
