@@ -195,7 +195,7 @@ def _pixels(channels: Channels) -> str:
     digest = hashlib.sha256()
     for name, values in sorted(channels.items()):
         digest.update(name.encode())
-        digest.update(np.ascontiguousarray(values).tobytes())
+        digest.update(np.ascontiguousarray(values).data)
     return digest.hexdigest()
 
 

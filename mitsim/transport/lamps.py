@@ -99,20 +99,21 @@ class LampTracer(FromCameraTracer):
     def _by_band(self, found: Deposits) -> Deposits:
         """An entry for each band of those that were ``found``, path by path."""
         assert found.lines is not None, "told apart by band"
+        light = found.lines.T.ravel().astype(np.float64)
         several = Deposits(
             **{
                 name: np.repeat(getattr(found, name), CARRIED)
                 for name in ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind")
             },
             pixel=(found.pixel[:, None] + np.arange(CARRIED)).ravel(),
-            value=found.lines.ravel() * self.counted.units[0],
+            value=light * self.counted.units[0],
             lane=None if found.lane is None else np.repeat(found.lane, CARRIED),
         )
         if not self.projector.by_line:
             return several
         units = np.zeros(CARRIED)
         units[: len(self.counted.units)] = self.counted.units
-        return replace(several, lines=found.lines.reshape(-1, 1) * units)
+        return replace(several, lines=(units[:, None] * light).astype(np.float32))
 
 
 class Together:
