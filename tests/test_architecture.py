@@ -180,7 +180,7 @@ def test_what_checks_a_request_imports_no_numpy() -> None:
 
 def test_a_refusal_imports_no_numpy(tmp_path: Path) -> None:
     """Of a missing folder, a bad manifest, and words that are not known. (Planted: the name of the patterns read by
-    `parse_patterns`; the manifest of export read by `packed_run`; the scene of a sweep opened by its points.)"""
+    `parse_patterns`; the manifest of export read by `packed_run`.)"""
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "manifest.json").write_text("{}")
     (tmp_path / "bad" / "session.toml").write_text("n = 4")

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from mitsim.transport.histogram import Deposits
 
 _RAYS, _SHOTS = 4, 4
-"""Rays of each pixel, a tenth of a second, and shots that are compared, as the pilot's: the error of colour_checker
-changes by a percent with 16 rays."""
+"""Rays of each pixel, a tenth of a second, and shots that are compared, as the pilot's."""
 _NONE = 1e-6
 """Difference that single precision may leave of none (photograph: 3e-8)."""
 _PART = 0.5

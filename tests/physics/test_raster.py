@@ -235,7 +235,7 @@ def test_each_line_of_a_raster_has_its_own_shadow() -> None:
 
 def test_a_plan_may_choose_cells_that_memory_holds() -> None:
     """4/3 of 6 and twice as many a pixel, of 512 pixels a side not the latter; frames are drawn with what is chosen.
-    (Planted: no bound; the fewest drawn whatever is chosen.)"""
+    (Planted: no bound.)"""
 
     def turned_by_a_degree(pixels: int) -> CameraGeometry:
         profile = MaskProfile(kind="separable", feature_mm=0.06, rotation_deg=1.0)

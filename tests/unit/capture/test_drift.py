@@ -170,8 +170,7 @@ def test_a_mask_moves_along_the_axis_that_its_drift_names() -> None:
 
 
 def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
-    """Of a camera file's mask with that tilt, and with a part of it in the file. (Planted: rows for columns; the file's
-    tilt forgotten; the tilt as if in degrees.)"""
+    """Of a camera file's mask with that tilt, and with a part of it in the file."""
 
     def made(rows: float, columns: float) -> CameraGeometry:
         table = {

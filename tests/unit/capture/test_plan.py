@@ -162,8 +162,8 @@ def test_what_a_masks_raster_leaves_is_in_the_budget() -> None:
 
 
 def test_a_raster_has_as_many_cells_as_the_accuracy_needs() -> None:
-    """Of 6, 8 and 12 a pixel, which leave up to 4e-3, 2.6e-3 and 1.4e-3. (Planted: always the fewest; always the most;
-    the error of the fewest for all.)"""
+    """Of 6, 8 and 12 a pixel, which leave up to 4e-3, 2.6e-3 and 1.4e-3. (Planted: the error of
+    the fewest for all.)"""
     drawn = replace(EVIDENCE, raster=(Drawn(), Drawn(Estimate(3e-3, 4e-3), needed=True, cells=(6, 8, 12))))
     found = {accuracy: plan(accuracy, drawn) for accuracy in (1e-2, 2e-3)}
     assert [each.settings.raster_cells for each in found.values()] == [6, 12]

@@ -178,7 +178,7 @@ PLANES = {"r": (1, 1, "638nm"), "gb": (0, 1, "520nm"), "gr": (1, 0, "520nm"), "b
 
 def test_a_plane_of_flatcam_is_the_whole_frame_of_a_line(coloured: Coloured, tmp_path: Path) -> None:
     """The longest wavelength is red; of each plane P1 X Q1' is the frame less its rows' and columns' means, but for
-    noise; folders come back. (Planted: red and blue changed places; the second line's factors for all.)"""
+    noise; folders come back. (Planted: red and blue changed places.)"""
     export_run(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
     held = loadmat(tmp_path / "all.mat")
     assert held["meas"].shape == (2 * ROWS, 2 * COLUMNS, 6) and held["cSize"].tolist() == [[ROWS, COLUMNS]]

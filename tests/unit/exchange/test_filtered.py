@@ -39,8 +39,7 @@ def same_folders(again: Path, first: Path) -> None:
 
 @pytest.mark.parametrize(("format", "name"), [("hdf5", "all.h5"), ("mat", "all.mat")])
 def test_folders_come_back(format: str, name: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """Frames, every line's truth and factors, and colour.json. (Planted: the first line's truth for all, the frames'
-    own manifest of a line.)"""
+    """Frames, every line's truth and factors, and colour.json. (Planted: the first line's truth for all.)"""
     run, calibration = folders
     payload = export_run(run, format, tmp_path / name, calibration)
     result = import_file(tmp_path / name, tmp_path / "run", tmp_path / "cal")

@@ -205,8 +205,7 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
 
 
 def test_pictures_as_large_as_flatcams_give_their_scene(tmp_path: Path) -> None:
-    """500 x 256 pixels, of a plane and of a whole frame: a factor for each side, and the image is the scene. (Planted:
-    sides of the calibration changed places.)"""
+    """500 x 256 pixels, of a plane and of a whole frame: a factor for each side, and the image is the scene."""
     rng = np.random.default_rng(8)
     sides, scene = [rng.random((pixels, 8)) * 100 for pixels in (500, 256)], rng.random((8, 8))
     manifest = CalibrationManifest(camera={"name": "bench 3"}, digital=DIGITAL)

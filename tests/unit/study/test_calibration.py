@@ -185,8 +185,7 @@ def test_all_sources_together_are_what_the_image_is_off(
     camera: dict[str, float], largest: str, small_scene: Callable[..., Path], tmp_path: Path, variant: str
 ) -> None:
     """An even print, of which the model leaves nothing out: to 0.5 dB of a loss that the nonuniformity is most of, its
-    rows' and columns' part of the response nothing of it. (Planted: rows' and columns' responses counted; offsets an
-    exposure time too large; each source twice.)"""
+    rows' and columns' part of the response nothing of it."""
     own = tmp_path / "camera.toml"
     stated = shipped("calibration", "imx249.toml").read_text().splitlines()
     kept = [line for line in stated if line.partition(" =")[0] not in camera]

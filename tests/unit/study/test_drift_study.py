@@ -68,8 +68,7 @@ def test_without_drift_the_image_is_the_same_bit_for_bit(stand: DriftStand) -> N
 )  # fmt: skip
 def test_closed_forms_say_what_a_drift_costs(stand: DriftStand, kind: str, amount: float) -> None:
     """To 0.5 dB of 3 or more: what detail leaves in this image, 14 dB above the model's error, shares in the drift's.
-    (Planted: rows and columns swapped; both terms of the rotation with one sign; a tilt of the
-    rows; a gain twice; black level of one
+    (Planted: rows and columns swapped; both terms of the rotation with one sign; a gain twice; black level of one
     pixel.)"""
     found = stand.outcome(Drift().alone(kind, amount))
     assert found.lost_db > 3
@@ -100,8 +99,7 @@ def test_closed_forms_say_what_a_ripple_costs(request: pytest.FixtureRequest, so
 def test_closed_forms_say_what_a_drift_costs_patterns_of_two_frames(
     stand: DriftStand, kind: str, amount: float
 ) -> None:
-    """To 0.5 dB, as of others; what both frames have alike costs nothing. (Planted: a ramp of the patterns, not of
-    their shots; a black level in the difference.)"""
+    """To 0.5 dB, as of others; what both frames have alike costs nothing."""
     signed = replace(stand, family=stand.lit.bench.family("hadamard:4"))
     found = signed.outcome(Drift().alone(kind, amount))
     assert found.predicted_lost_db == pytest.approx(found.lost_db, abs=0.5)
@@ -111,8 +109,7 @@ def test_closed_forms_say_what_a_drift_costs_patterns_of_two_frames(
 @pytest.mark.parametrize("drift", [Drift(mask_tilt_rows_mrad=40.0), Drift(mask_tilt_columns_mrad=-40.0)])
 def test_a_tilt_changes_the_image_as_it_is_predicted_to(stand: DriftStand, drift: Drift) -> None:
     """To 15 % of the change, without noise: the model has neither detail inside projector pixels nor falloff. What a
-    tilt of the rows costs this print hangs on that detail: its change has -0.4 of the error from before. (Planted:
-    rows and columns swapped in what is predicted; a tilt of the other sign in what is simulated.)"""
+    tilt of the rows costs this print hangs on that detail: its change has -0.4 of the error from before."""
     bench, images = stand.lit.bench, []
     for each in (Drift(), drift):
         sums = stand._model.accumulator()
