@@ -114,7 +114,7 @@ def choose_colour(bench: Bench, request: Request) -> Coloured:
     else:
         whole = spectral or bench.in_variant(spectral_of(bench.variant))
         own = whole if chosen == LINES else whole.in_bands(bands_of(chosen))
-        plan = plan_lines(ColourBench.of(own, RUN).lit_by_lamps(left.effects, left.seed), left)
+        plan = plan_lines(ColourBench.of(own, RUN), left)
     plan = plan.taking(plan=plan.predicted["plan"] + looked)
     candidates = tuple(
         ColourCandidate(name, error, _seconds(plan.predicted, runs[name])) for name, error in errors.items()

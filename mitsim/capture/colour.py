@@ -85,7 +85,7 @@ class ColourBench:
         return tuple(line_alone(self.whole, line) for line in self.whole.lines.single)
 
     def lit_by_lamps(self, effects: Mapping[str, bool], seed: int) -> ColourBench:
-        """The same with lamps that shine at wavelengths of their own.
+        """The same with lamps that shine at wavelengths of their own; itself where they do.
 
         Parameters
         ----------
@@ -97,6 +97,8 @@ class ColourBench:
         MitsimError
             as there.
         """
+        if self.whole.lamplight is not None:
+            return self
         return replace(self, whole=lit_by_lamps(self.whole, effects, seed))
 
     def roughest(self, seed: int, lit: float = 1.0) -> Bench:
@@ -177,7 +179,8 @@ def plan_lines(colours: ColourBench, request: Request) -> Plan:
     """The plan of all lines of ``colours`` together, which is that of the roughest, for a ``request``. MitsimError for
     what is not simulated in colour."""
     refuse(request)
-    roughest = colours.roughest(request.seed, _lit(colours.whole.family(request.patterns, request.seed).lighting))
+    lighting = colours.whole.family(request.patterns, request.seed).lighting
+    roughest = colours.lit_by_lamps(request.effects, request.seed).roughest(request.seed, _lit(lighting))
     plan = plan_request(roughest, request)
     if roughest.lamplight is not None and "ambient" not in plan.settings.effects:
         # Beside a weaker line lamps may count.

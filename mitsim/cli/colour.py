@@ -119,9 +119,7 @@ def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     from mitsim.capture.colour import ColourBench, plan_lines
     from mitsim.capture.request import Request
 
-    asked = Request.of(**request)
-    colours = ColourBench.of(in_colour(bench, colour), RUN)
-    return plan_lines(colours.lit_by_lamps(asked.effects, asked.seed), asked)
+    return plan_lines(ColourBench.of(in_colour(bench, colour), RUN), Request.of(**request))
 
 
 def chosen_of(bench: Bench, request: dict[str, Any], job: Job, output: Path, resume: bool) -> tuple[Bench, Plan, str]:

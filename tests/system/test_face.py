@@ -154,7 +154,9 @@ def untimed(folder: Path) -> dict[str, Any]:
     manifest = json.loads((folder / "manifest.json").read_text())
     plan = manifest["plan"]
     rows = [{**row, "seconds": 0} for row in plan["effects"]]
-    untimed_plan = {**plan, "effects": rows, "predicted_seconds": 0, "predicted": {}}
+    candidates = [{**each, "seconds": 0} for each in plan["colour"]["candidates"]]
+    own = {"effects": rows, "colour": {**plan["colour"], "candidates": candidates}}
+    untimed_plan = {**plan, **own, "predicted_seconds": 0, "predicted": {}}
     return {**manifest, "seconds": {}, "plan": untimed_plan}
 
 

@@ -197,7 +197,7 @@ def test_a_camera_wears_a_profile_and_cameras_without_stay_what_they_were() -> N
         "mask_fft",
         "mask_cells",
     }
-    known -= {"rows", "columns", "row_pitch", "roi"}
+    known -= {"mask_lean_mrad", "mask_cells", "rows", "columns", "row_pitch", "roi"}
     assert set(bare.identity) == known and bare.mask_terms == 1 and bare.diffracts and not bare.centred
     flatcam = MaskProfile(kind="flatcam", feature_mm=0.05, order=5).worn(bare, Path())
     assert flatcam == CameraGeometry(mask="flatcam", mask_feature=0.05, mask_order=5, mask_offset_row=0.5)
