@@ -145,7 +145,7 @@ def test_a_saved_capture_is_that_of_the_command_line(
     taken = told.pop("memory_bytes")
     assert 0 <= taken < told["predicted_memory_bytes"]
     summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": told["output"]}
-    timed = {"seconds": 0, "predicted_seconds": 0}
+    timed = {"seconds": 0, "predicted_seconds": 0, "colour": untimed(tmp_path / "told")["plan"]["colour"]}
     assert {**summary, **timed} == {**told, **timed}
 
 
