@@ -202,7 +202,7 @@ def judged(camera: CameraGeometry, at: Directions, light: np.ndarray) -> tuple[f
         {"kind": "random", "features": 63},
         {"kind": "random", "features": 63, "over_etch_um": 3.0, "edge_blur_um": 2.0},
         {"kind": "separable", "order": 6, "dust_per_mm2": 3.0},
-        {"kind": "separable", "order": 6, "rotation_deg": 0.3},
+        pytest.param({"kind": "separable", "order": 6, "rotation_deg": 0.3}, marks=pytest.mark.slow),
     ],
 )
 def test_what_a_raster_leaves_is_told_before(mask: dict[str, object]) -> None:

@@ -68,6 +68,7 @@ def test_capture_in_every_variant(
     assert np.sqrt(np.mean((truths[0] - truths[1]) ** 2)) < gate
 
 
+@pytest.mark.slow
 def test_sampled_wavelengths_leave_indirect_light(
     call: Callable[..., Any], shell: Callable[..., Any], shared_scene: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -29,7 +29,9 @@ def exposed(lit: LitSession) -> list[Estimate]:
     return [estimate(replace(lit, session=session), Job())[0] for session in sessions]
 
 
-@pytest.mark.parametrize(("mode", "n", "repeats"), [("pair", 7, 1), ("uniform", 8, 1), ("pair", 4, 3)])
+@pytest.mark.parametrize(
+    ("mode", "n", "repeats"), [("pair", 7, 1), ("uniform", 8, 1), pytest.param("pair", 4, 3, marks=pytest.mark.slow)]
+)
 def test_drawn_noise_is_that_of_exposed_frames_number_by_number(mode: str, n: int, repeats: int) -> None:
     """The mean squared error of a row of a factor, and of a column, by 120 sessions and by 480 draws.
 

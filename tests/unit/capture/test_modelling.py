@@ -28,6 +28,7 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Any:
     return ms.open_bench(shared_scene("modelled", n=16), variant)
 
 
+@pytest.mark.slow
 def test_a_mask_that_is_off_is_found_in_frames_that_were_traced(bench: Any, kept_plans: None) -> None:
     """37 and -21 um off the axis and 50 um too far, by 8 frames: within three standard errors and the light's own
     error, a thousandth, of the 60 um of a feature. Signs and axes are those of the camera's own offsets."""

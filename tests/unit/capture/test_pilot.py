@@ -149,6 +149,7 @@ def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
     assert promised(evidence.ladders["anchors"][1].value, actual)
 
 
+@pytest.mark.slow
 def test_anchors_of_followed_light_come_true(bench: Bench, evidence: Evidence) -> None:
     """Light between the ball, the wall and the sheet differs over the sensor of 24 mm. (Planted: paths from the camera
     that are filed as seen from their start.)"""
@@ -164,7 +165,7 @@ def test_anchors_of_followed_light_come_true(bench: Bench, evidence: Evidence) -
     assert few < actual / 2
 
 
-@pytest.mark.parametrize("width", [2, 4])
+@pytest.mark.parametrize("width", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_wide_cells_of_followed_light_come_true(bench: Bench, evidence: Evidence, width: int) -> None:
     """What anchors see beyond their mean, in cells of several pixels and one layer, against cells of half a pixel and
     two layers. (Planted: the mean filed in the cells of indirect light; cells twice as wide.)"""

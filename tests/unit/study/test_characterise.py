@@ -55,6 +55,7 @@ def test_shipped_cameras_have_sources_and_are_found_as_their_files_say(name: str
     assert not characterise(model, SMALL).warnings
 
 
+@pytest.mark.slow
 def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> None:
     """Twelve sessions of a nonuniform camera: each figure's deviations, as a chi-square of 12 (significance 1e-4 each).
 

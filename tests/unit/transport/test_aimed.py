@@ -156,6 +156,7 @@ def test_the_width_of_a_lobe_is_not_that_of_its_share(lit: Callable[..., tuple[B
     assert widths[1] == pytest.approx(widths[0], rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_faint_highlight_that_few_turns_meet_is_found(lit: Callable[..., tuple[Bench, np.ndarray]]) -> None:
     """Varnish on a ball sends one of 1e7 of the projector's rays to the sensor; connections meet its lobe.
 

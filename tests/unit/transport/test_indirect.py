@@ -103,6 +103,7 @@ CORNER = f"""<shape type="rectangle"><transform name="to_world"><scale x="60" y=
     <translate x="-30" z="360"/></transform>{SHINY.replace("0.05", "0.2")}</shape>"""
 
 
+@pytest.mark.slow
 def test_both_sides_find_the_same_light_at_every_anchor(
     shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
