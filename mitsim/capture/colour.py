@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 _RAYS, _ALIKE = 4, 0.9
 """Rays of each pixel that tell how rough a line's light is, and paths of each cell that tell lamps' light, a tenth of a
-second; and the part of the roughest line's
-differences from which a line counts as rough: what a plan leaves follows their root, of which this is a twentieth."""
+second; and the part of the roughest line's differences from which a line counts as rough: what a plan leaves follows
+their root, of which this is a twentieth."""
 
 
 @dataclass(frozen=True)

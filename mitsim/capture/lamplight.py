@@ -14,11 +14,12 @@ from mitsim.capture.effects import present
 from mitsim.capture.evidence import Settings
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
+from mitsim.core.colours import MOST_LINES
 from mitsim.core.seeds import integer
 from mitsim.rig.lamplight import SPECTRA_NM, Band, Lamplight, Response
 from mitsim.rig.projector import Spectrum
 from mitsim.transport.from_camera import FromCameraTracer
-from mitsim.transport.lamps import CARRIED, Counted, LampTracer
+from mitsim.transport.lamps import Counted, LampTracer
 
 _STEP_NM = 24.0
 """Widest part of a band whose light diffracts as that of its middle: a shadow's fringes hardly move over it, as for
@@ -54,22 +55,22 @@ def lit_by_lamps(bench: Bench, effects: Mapping[str, bool], seed: int) -> Bench:
     tracer = Simulation(bench, settings, pixels=min(bench.n, _CELLS)).from_camera
     assert isinstance(tracer, FromCameraTracer), "lamps are followed, not yet apart"
     first, last = response.range_nm
-    parts = math.ceil((last - first) / CARRIED / _STEP_NM)
+    parts = math.ceil((last - first) / MOST_LINES / _STEP_NM)
     stream = integer(seed, "lamplight")
 
     def seen(*bands: Band) -> FloatArray:
         """(bands,) light of each."""
         light = LampTracer(tracer, Counted(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
-        return np.asarray(np.bincount(light.pixel - bench.n**2, light.value, CARRIED) / _SAMPLES)
+        return np.asarray(np.bincount(light.pixel - bench.n**2, light.value, MOST_LINES) / _SAMPLES)
 
     # (bands, parts)
-    light = np.stack([seen(*response.bands(CARRIED, part, parts)) for part in range(parts)], axis=1)
-    middles = [[(low + high) / 2 for low, high in response.bands(CARRIED, part, parts)] for part in range(parts)]
+    light = np.stack([seen(*response.bands(MOST_LINES, part, parts)) for part in range(parts)], axis=1)
+    middles = [[(low + high) / 2 for low, high in response.bands(MOST_LINES, part, parts)] for part in range(parts)]
     lamplight = Lamplight(
         response,
-        response.bands(CARRIED),
+        response.bands(MOST_LINES),
         tuple(map(_spectrum, np.array(middles).T, light)),
-        light.sum(axis=1) / light.sum() if light.any() else np.full(CARRIED, 1 / CARRIED),
+        light.sum(axis=1) / light.sum() if light.any() else np.full(MOST_LINES, 1 / MOST_LINES),
         _unknown(response, seen((SPECTRA_NM[0], first), (last, SPECTRA_NM[1]), *_ends()), float(light.sum())),
     )
     return replace(bench, lamplight=lamplight)

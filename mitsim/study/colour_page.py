@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from mitsim.core.output import whole_file
 from mitsim.core.pictures import colour_png, data_uri, grey_png, lightness
 from mitsim.core.versions import versions
 from mitsim.reconstruct.colour import chart, linear_srgb
 from mitsim.study.colour_plots import by_patch, differences, halves
 from mitsim.study.coloured import ColourImage, Patch, mean_of
+from mitsim.study.html import rendered, shown_figure, write_html
 from mitsim.study.metrics import Quality
 
 PAGE = "report.html"
-_SMALLEST, _DPI, _SHOWN_DPI = 512, 220, 110
-"""Pixels a side of a picture, in two dots each of a column of the page; figures are of as many dots."""
+_SMALLEST = 512
+"""Pixels a side of a picture, in two dots each of a column of the page."""
 _INK = 0.5
 """Of a colour's lightness, below which letters on it are white."""
 
@@ -53,9 +51,8 @@ def write_page(
     MitsimError
         when it cannot be written.
     """
-    loader = PackageLoader("mitsim.study")
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    text = environment.get_template("colour.html").render(
+    text = rendered(
+        "colour.html",
         verdict=_verdict(image),
         pictures=_pictures(image),
         lines=[_line(image, number, qualities[name]) for number, name in enumerate(image.lines.names)],
@@ -71,9 +68,7 @@ def write_page(
         board=image.board,
         versions=versions(),
     )
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return path
+    return write_html(path, text)
 
 
 def _verdict(image: ColourImage) -> tuple[str, str]:
@@ -123,14 +118,7 @@ def _figures(image: ColourImage) -> dict[str, tuple[str, int]]:
         drawn["by_patch"] = by_patch(names, [patch.floor for patch in image.patches], {"this image": found})
         title = "Left half: the patch's spectrum in D65. Right half: this image. Number: Delta E 2000"
         drawn["halves"] = halves(names, found, chart().xyz, image.chart.means(image.xyz), title)
-    return {
-        name: (_address(figure), round(float(figure.get_figwidth()) * _SHOWN_DPI)) for name, figure in drawn.items()
-    }
-
-
-def _address(figure: Figure) -> str:
-    figure.savefig(buffer := BytesIO(), format="png", dpi=_DPI)
-    return data_uri(buffer.getvalue())
+    return {name: shown_figure(figure) for name, figure in drawn.items()}
 
 
 def _means(patches: Sequence[Patch]) -> tuple[float, float, float | None]:

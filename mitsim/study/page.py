@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from mitsim.core.output import whole_file
-from mitsim.core.pictures import data_uri
 from mitsim.core.versions import versions
 from mitsim.study.experiment import HEADS, Claim, Experiment, PageTable, Results, Scope
+from mitsim.study.html import rendered, shown_figure, write_html
 from mitsim.study.pictures import TEST_IMAGES
-
-_DPI, _SHOWN_DPI = 220, 110
-"""Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +58,7 @@ class Section:
             title=experiment.title,
             question=experiment.question,
             claims=tuple(claims),
-            pictures={name: (_address(figure), _width(figure)) for name, figure in figures.items()},
+            pictures={name: shown_figure(figure) for name, figure in figures.items()},
             count=f"{len(results.table)} measurements{means}, light to {setup.accuracy:g}",
             command=" ".join(command),
             about=experiment.about,
@@ -98,9 +92,10 @@ def build_findings(name: str, title: str, where: str, parts: Sequence[Part], fig
     figures
         by file name.
     """
-    pictures = {file: (_address(figure), _width(figure)) for file, figure in figures.items()}
-    template = _environment().get_template("findings.html")
-    return template.render(name=name, title=title, where=where, parts=parts, pictures=pictures, versions=versions())
+    pictures = {file: shown_figure(figure) for file, figure in figures.items()}
+    return rendered(
+        "findings.html", name=name, title=title, where=where, parts=parts, pictures=pictures, versions=versions()
+    )
 
 
 def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
@@ -115,15 +110,7 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     path
         where.
     """
-    text = _environment().get_template("study.html").render(title=title, sections=sections, versions=versions())
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return path
-
-
-def _environment() -> Environment:
-    loader = PackageLoader("mitsim.study")
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    return write_html(path, rendered("study.html", title=title, sections=sections, versions=versions()))
 
 
 def _options(scope: Scope) -> list[str]:
@@ -134,13 +121,3 @@ def _options(scope: Scope) -> list[str]:
     given += [f"--over {name}={','.join(values)}" for name, values in scope.sweep]
     given += [f"--recipe {scope.recipe}"] if scope.recipe else []
     return [*given, *(["--quick"] if scope.quick else [])]
-
-
-def _width(figure: Figure) -> int:
-    """On the page: letters have one size in all figures."""
-    return round(float(figure.get_figwidth()) * _SHOWN_DPI)
-
-
-def _address(figure: Figure) -> str:
-    figure.savefig(buffer := BytesIO(), format="png", dpi=_DPI)
-    return data_uri(buffer.getvalue())

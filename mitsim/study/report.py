@@ -7,9 +7,8 @@ carries no time of writing, so the same data give the same bytes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,10 +19,10 @@ from matplotlib.figure import Figure
 from mitsim.capture.plan import PlanRow
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri, grey_png, lightness
 from mitsim.reconstruct.misfit import shown
 from mitsim.study import plots
+from mitsim.study.html import figure_uri, rendered, write_html
 from mitsim.study.metrics import Quality
 from mitsim.study.table import Mean
 from mitsim.study.trust import Trust
@@ -140,36 +139,22 @@ def build_report(report: ReportData, path: Path) -> Path:
 
     MitsimError when an image holds values that are not finite or the place cannot be written.
     """
-    text = render_html(report)
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return Path(path)
+    return write_html(Path(path), render_html(report))
 
 
 def render_html(report: ReportData) -> str:
     """The page of a ``report`` as text; `build_report` writes it."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("mitsim.study"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(
-        sci=_scientific,
-        chi=lambda value: _DASH if value is None else shown(value),
-        db=_decibel,
-        seconds=_seconds,
-        trouble=_trouble,
-        reflectance=_reflectance,
-        pattern=_pattern,
-    )
-    page = environment.get_template("report.html")
-    return page.render(
-        report=report, figures=_figures(report), best=_best(report.families), pattern_corner=_PATTERN_CORNER
-    )
+    filters: dict[str, Callable[..., str]] = {
+        "sci": _scientific,
+        "chi": lambda value: _DASH if value is None else shown(value),
+        "db": _decibel,
+        "seconds": _seconds,
+        "trouble": _trouble,
+        "reflectance": _reflectance,
+        "pattern": _pattern,
+    }
+    facts = {"figures": _figures(report), "best": _best(report.families), "pattern_corner": _PATTERN_CORNER}
+    return rendered("report.html", filters, report=report, **facts)
 
 
 def _reflectance(image: npt.ArrayLike, name: str = "image") -> str:
@@ -184,8 +169,7 @@ def _pattern(pattern: npt.ArrayLike) -> str:
 
 
 def _picture(figure: Figure) -> str:
-    figure.savefig(buffer := BytesIO(), format="png", dpi=_FIGURE_DPI)
-    return data_uri(buffer.getvalue())
+    return figure_uri(figure, _FIGURE_DPI)
 
 
 def _finite(image: npt.ArrayLike, name: str) -> FloatArray:

@@ -17,13 +17,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsim.core.colours import MOST_LINES
 from mitsim.rig.lamplight import SPECTRA_NM, Band, Response
 from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.sampling import shuffled, stratified
-
-CARRIED = 4
-"""Wavelengths that a path carries in Mitsuba's spectral variants."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +88,7 @@ class LampTracer(FromCameraTracer):
             low, high = dr.gather(mi.Float, counts, below), dr.gather(mi.Float, counts, below + 1)
             count = low + (high - low) * (position - mi.Float(below))
             wavelengths.append(wavelength)
-            weights.append(CARRIED * count * width / (SPECTRA_NM[1] - SPECTRA_NM[0]))
+            weights.append(MOST_LINES * count * width / (SPECTRA_NM[1] - SPECTRA_NM[0]))
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
     def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
@@ -102,16 +100,16 @@ class LampTracer(FromCameraTracer):
         light = found.lines.T.ravel().astype(np.float64)
         several = Deposits(
             **{
-                name: np.repeat(getattr(found, name), CARRIED)
+                name: np.repeat(getattr(found, name), MOST_LINES)
                 for name in ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind")
             },
-            pixel=(found.pixel[:, None] + np.arange(CARRIED)).ravel(),
+            pixel=(found.pixel[:, None] + np.arange(MOST_LINES)).ravel(),
             value=light * self.counted.units[0],
-            lane=None if found.lane is None else np.repeat(found.lane, CARRIED),
+            lane=None if found.lane is None else np.repeat(found.lane, MOST_LINES),
         )
         if not self.projector.by_line:
             return several
-        units = np.zeros(CARRIED)
+        units = np.zeros(MOST_LINES)
         units[: len(self.counted.units)] = self.counted.units
         return replace(several, lines=(units[:, None] * light).astype(np.float32))
 

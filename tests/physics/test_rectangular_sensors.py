@@ -20,7 +20,7 @@ from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.optics.closed_form import FrameOptics
+from mitsim.optics.closed_form import FrameOptics, raster_error
 from mitsim.optics.shadow import Directions
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.patterns import Lighting
@@ -105,6 +105,21 @@ def test_any_masks_shadow_on_a_part_is_the_wholes_part(mask: dict[str, object], 
     expected = seen[0][12:53, 11:41]
     tolerance = 1e-4 if "tilt_row_mrad" in mask else 1e-11
     np.testing.assert_allclose(seen[1], expected, rtol=0, atol=tolerance * expected.mean())
+
+
+def test_what_is_chosen_behind_a_mask_follows_the_sensors_shape() -> None:
+    """No raster under tall pixels; what one leaves is told of a corner's region as of the whole; a tilt has nodes for
+    the finer pitch. (Planted: tall pixels not looked at; the region kept on the few pixels; the coarser pitch.)"""
+    random = MaskProfile(kind="random", feature_mm=0.06, features=61).worn(CameraGeometry(pixels=96), Path())
+    tall = random.model_copy(update={"row_pitch": 2 * random.pixel_pitch})
+    assert random.may_be_drawn(waves=False) and not tall.may_be_drawn(waves=False)
+    at, light = Directions.cells(np.linspace(-0.15, 0.15, 21)), np.random.default_rng(0).random((20, 20))
+    corner = random.model_copy(update={"roi": (70, 70, 26, 26)})
+    told = [raster_error(each, at, at, 400.0, None, light)[0] for each in (random, corner)]
+    assert told[0] == told[1] > 0
+    tilted = MaskProfile(kind="separable", feature_mm=0.06, order=6, tilt_row_mrad=20.0).worn(CameraGeometry(), Path())
+    fine = tilted.model_copy(update={"row_pitch": tilted.pixel_pitch / 2})
+    assert max(fine.tilt_nodes(waves=False) or ()) > 1.5 * max(tilted.tilt_nodes(waves=False) or ())
 
 
 def test_a_pixel_of_two_rows_sees_the_mean_of_both(small_scene: Write) -> None:

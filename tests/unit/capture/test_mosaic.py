@@ -105,6 +105,15 @@ def test_only_a_camera_with_filters_has_a_mosaic(bench: Bench) -> None:
             mono()
 
 
+@pytest.mark.parametrize("part", [{"rows": 63}, {"roi": (0, 3, 20, 20)}, {"roi": (2, 0, 21, 20)}])
+def test_frames_that_cut_through_filters_are_refused(bench: Bench, part: dict[str, object]) -> None:
+    """An odd side, and a region that begins at another filter. (Planted: where a region begins not looked at.)"""
+    seen = coloured(bench)
+    rig = replace(seen.rig, camera=seen.rig.camera.model_copy(update=part))
+    with pytest.raises(MitsimError, match=r"do not hold whole filters of 2 x 2; give the scene's film even numbers"):
+        MosaicBench.of(replace(seen, rig=rig))
+
+
 def test_a_bench_behind_filters_says_which_camera_it_has(bench: Bench) -> None:
     """The sensor's own identity, filters and all, though frames are formed of bare pixels."""
     seen = MosaicBench.of(coloured(bench))

@@ -106,7 +106,8 @@ def test_gains_of_two_frames_weigh_what_black_pixels_leak() -> None:
 def test_variances_are_sums_over_all_that_varies(name: str) -> None:
     """The solver is linear in frames: the squares of what each datum, each frame's gain and each number of a factor
     does to the image alone, added up. (Planted: the filter once; the right factor's scene not transposed; the ambient
-    frame's noise as that of data; noise and flicker of one frame of two; columns' light of the other side.)"""
+    frame's noise as that of data; noise and flicker of one frame of two, of
+    their light without the leak; columns' light of the other side.)"""
     shown = family(name)
     frames, dark = seen(shown), np.zeros_like(seen(shown))
     count = frames.shape[:3]
@@ -130,6 +131,7 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
     common = [single((..., *place)) for place in np.ndindex(PIXELS, PIXELS)]
     alone = [single(shot) for shot in np.ndindex(count)]
     of_frames, of_added = ([light * one for one in alone] for light in (frames, FRAME))
+    of_leaking = [seen(shown, LEAK) * one for one in alone]
     left = [shadow(unit(place), RIGHT, shown) for place in np.ndindex(PIXELS, N)]
     right = [shadow(LEFT, unit(place), shown) for place in np.ndindex(PIXELS, N)]
     light = [shadow(LEFT, RIGHT, shown, one) for one in pixels]
@@ -152,6 +154,7 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
         (Changed(added=FRAME, added_gain=0.0, added_flicker=(0.3,)), None, 0.09, of_added),
         (Changed(added=FRAME, added_gain=0.0, added_common=(0.3,)), None, 0.09, [dark + FRAME]),
         (Changed(flicker=(0.5 * rows, 0.2)), None, 1.0, rippled),
+        *([(Changed(flicker=(0.3,), leak=LEAK), None, 0.09, of_leaking)] if shown.signed else []),
         (Changed(added=FRAME, added_gain=0.0, added_flicker=(0.5 * rows, 0.2)), None, 1.0, added),
         (Changed(added=FRAME, added_gain=0.0, added_common=(0.5 * rows, 0.2)), None, 1.0, common_rows),
     ]
