@@ -19,10 +19,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from mitsim.capture import colour
 from mitsim.capture.bench import open_bench
 from mitsim.capture.colour import ColourBench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.filing import Tray
+from mitsim.capture.request import Request
 from mitsim.capture.run import _of_unknown_light
 from mitsim.capture.simulation import Simulation
 from mitsim.core.colours import RUN
@@ -256,3 +258,26 @@ def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool)
     light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), plan=SimpleNamespace(accuracy=1e-3))
     said = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
     assert bool(said) is flagged and all("4.0% of the lamps' light is in no frame" in sentence for sentence in said)
+
+
+def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever they are planned: `mitsim plan` has not lit them before. (Planted: planned as they are.)"""
+    planned: list[Any] = []
+    alone, whole = (
+        SimpleNamespace(lamplight=object()),
+        SimpleNamespace(
+            family=lambda patterns, seed: SimpleNamespace(lighting=Lighting(np.zeros(4, int), np.ones((1, 1))))
+        ),
+    )
+    lit = SimpleNamespace(roughest=lambda seed, part: alone)
+    colours: Any = SimpleNamespace(
+        whole=whole, lit_by_lamps=lambda effects, seed: lit, roughest=lambda seed, part: SimpleNamespace(lamplight=None)
+    )
+
+    def plan_request(bench: Any, request: Any) -> Any:
+        planned.append((bench, dict(request.effects)))
+        return SimpleNamespace(settings=SimpleNamespace(effects=frozenset()))
+
+    monkeypatch.setattr(colour, "plan_request", plan_request)
+    colour.plan_lines(colours, Request.of(patterns="uniform"))
+    assert planned == [(alone, {}), (alone, {"ambient": True})]
