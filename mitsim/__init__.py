@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mitsim.rig.modelling import Modelling
     from mitsim.rig.recipe import load_recipe
     from mitsim.study.calibration_plan import CalibrationPlan, plan_calibration
-    from mitsim.study.colours import reconstruct_colours
+    from mitsim.study.colour.by_line import reconstruct_colours
     from mitsim.study.metrics import psnr, ssim
 
 __version__ = "0.4.0"
@@ -51,7 +51,7 @@ _HOMES = {
     "calibrate_model": "capture.modelling",
     "plan_calibration": "study.calibration_plan",
     "reconstruct": "reconstruct.reconstruction",
-    "reconstruct_colours": "study.colours",
+    "reconstruct_colours": "study.colour.by_line",
     "psnr": "study.metrics",
     "ssim": "study.metrics",
     "Bench": "capture.bench",

@@ -234,7 +234,7 @@ def reconstruct_lines(
         read_manifest(calibration / name, CalibrationManifest)
     place = None if chart is None else load_chart(chart)
     from mitsim.core.resources import memory_from_here, peak_memory
-    from mitsim.study.colours import reconstruct_colours
+    from mitsim.study.colour.by_line import reconstruct_colours
 
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)

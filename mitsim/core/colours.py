@@ -31,7 +31,8 @@ MONO, LINES, BANDS = "mono", "lines", "bands"
 MOST_LINES = 4
 """Lines that light is traced at together: wavelengths that a path carries in Mitsuba's spectral variants."""
 JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
-"""Ways to images of lines from frames behind colour filters (:mod:`mitsim.study.filters`), that of most PSNR first."""
+"""Ways to images of lines from frames behind colour filters, that of most PSNR first
+(:mod:`mitsim.study.colour.ways`)."""
 Weight = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 

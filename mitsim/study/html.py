@@ -38,18 +38,55 @@ def rendered(template: str, filters: Mapping[str, Callable[..., str]] | None = N
 
 
 def write_html(path: Path, text: str) -> Path:
-    """Write a page, all or nothing, and return its path; MitsimError when it cannot be written."""
+    """Write a page, all or nothing.
+
+    Parameters
+    ----------
+    path
+        the file.
+    text
+        of the page.
+
+    Returns
+    -------
+    Path
+        of the file.
+
+    Raises
+    ------
+    MitsimError
+        when it cannot be written.
+    """
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
     return path
 
 
 def shown_figure(figure: Figure) -> tuple[str, int]:
-    """A figure as a data URI, and how wide it is shown [pixels]."""
+    """A figure for a page.
+
+    Parameters
+    ----------
+    figure
+        drawn.
+
+    Returns
+    -------
+    tuple of str and int
+        its data URI, and how wide it is shown [pixels].
+    """
     return figure_uri(figure, _DPI), round(float(figure.get_figwidth()) * _SHOWN_DPI)
 
 
 def figure_uri(figure: Figure, dots_per_inch: int) -> str:
-    """A figure as a data URI of so many ``dots_per_inch``."""
+    """A figure as a data URI.
+
+    Parameters
+    ----------
+    figure
+        drawn.
+    dots_per_inch
+        of its picture.
+    """
     figure.savefig(buffer := BytesIO(), format="png", dpi=dots_per_inch)
     return data_uri(buffer.getvalue())

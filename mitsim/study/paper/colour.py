@@ -3,7 +3,7 @@
 *Floor*: no camera, but the matrix from reflectances at the projector's lines to XYZ; what three lines cannot tell.
 *Rendered*: frames of every line with the sensor's noise, a calibration and a solve for each. *One calibration for all*:
 the middle line's factors serve all lines. *D65*: a lamp of daylight shines on the chart, its frame taken off. *Mosaic*:
-all lines at once behind colour filters (:mod:`mitsim.study.mosaic`).
+all lines at once behind colour filters (:mod:`mitsim.study.colour.shots`).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.rig.chart import ChartPlace, load_chart
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.study.colour_plots import by_patch, halves
+from mitsim.study.colour.lit import LitLine, daylit, lit_lines, serving
+from mitsim.study.colour.plots import by_patch, halves
+from mitsim.study.colour.shots import exposed, installed, mosaic_shots, peak_seconds
 from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope
 from mitsim.study.exposures import RENDERED
-from mitsim.study.lines import LitLine, daylit, lit_lines, serving
 from mitsim.study.metrics import psnr
-from mitsim.study.mosaic import exposed, installed, mosaic_shots, peak_seconds
 from mitsim.study.paper.measure import verdict
 from mitsim.study.plots import BLUE, FONT, VERMILION, figure_of, label_axes
 from mitsim.study.studio import Studio

@@ -12,11 +12,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame
 from mitsim.core.mosaics import load_mosaic
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
-from mitsim.study.colours import reconstruct_colours
+from mitsim.study.colour.by_line import reconstruct_colours
+from mitsim.study.colour.mosaic import JudgedMosaic
 from mitsim.study.metrics import psnr
-from mitsim.study.mosaics import JudgedMosaic
 from tests.coloured import LINES, PLACE, WEIGHTS, mosaic_folders, scenes
-from tests.unit.study.test_colours import main
+from tests.unit.study.test_colour_by_line import main
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 

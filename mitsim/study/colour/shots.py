@@ -1,7 +1,7 @@
 """Light of each line in, and filters over the sensor's pixels; frames that show all lines at once, and images, out.
 
-Three ways to images of the lines are compared (:mod:`mitsim.study.filters`), all with factors that were calibrated line
-by line, each with its best lambda.
+Three ways to images of the lines are compared (:mod:`mitsim.study.colour.ways`), all with factors that were calibrated
+line by line, each with its best lambda.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from mitsim.core.seeds import integer
 from mitsim.reconstruct.mosaic import behind
 from mitsim.rig.patterns import PatternFamily
 from mitsim.rig.sensor import SensorModel
+from mitsim.study.colour.lit import LitLine
+from mitsim.study.colour.ways import MosaicCamera, Solver, solver_of
 from mitsim.study.exposures import LAMBDAS
-from mitsim.study.filters import MosaicCamera, Solver, solver_of
-from mitsim.study.lines import LitLine
 from mitsim.study.metrics import psnr
 
 DEMOSAICED, HALF, JOINT = "demosaiced", "half resolution", "joint"

@@ -16,10 +16,10 @@ from mitsim.core.output import output_folder
 from mitsim.core.runs import load_run
 from mitsim.reconstruct.colour import ColourModel
 from mitsim.rig.chart import ChartPlace
-from mitsim.study.colour_page import PAGE, write_page
-from mitsim.study.coloured import ColourImage, board_of
+from mitsim.study.colour.image import ColourImage, board_of
+from mitsim.study.colour.mosaic import JudgedMosaic, reconstruct_mosaic
+from mitsim.study.colour.page import PAGE, write_page
 from mitsim.study.metrics import truth_for
-from mitsim.study.mosaics import JudgedMosaic, reconstruct_mosaic
 from mitsim.study.quality import Judged, reconstruct
 
 
@@ -141,7 +141,7 @@ def reconstruct_colours(
         whether an earlier image of other inputs may be replaced.
     **options
         of :func:`mitsim.study.quality.reconstruct`, for every line; of a run behind colour filters, ``way`` and ``lam``
-        as for :func:`mitsim.study.mosaics.reconstruct_mosaic`.
+        as for :func:`mitsim.study.colour.mosaic.reconstruct_mosaic`.
 
     Raises
     ------

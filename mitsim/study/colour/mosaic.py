@@ -33,9 +33,9 @@ from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.result import IMAGE_FILE
 from mitsim.rig.chart import ChartPlace
-from mitsim.study.colour_page import PAGE, write_page
-from mitsim.study.coloured import ColourImage, board_of
-from mitsim.study.filters import Lambda, LineImages, MosaicCamera, Solver, solver_of
+from mitsim.study.colour.image import ColourImage, board_of
+from mitsim.study.colour.page import PAGE, write_page
+from mitsim.study.colour.ways import Lambda, LineImages, MosaicCamera, Solver, solver_of
 from mitsim.study.metrics import Quality
 
 
@@ -148,7 +148,7 @@ def reconstruct_mosaic(
     run, calibration
         folders of `mitsim capture --colour mosaic` and `mitsim calibrate --colour mosaic`.
     output, chart, overwrite
-        as :func:`mitsim.study.colours.reconstruct_colours`.
+        as :func:`mitsim.study.colour.by_line.reconstruct_colours`.
     way
         one of :data:`mitsim.core.colours.WAYS`.
     lam
@@ -159,7 +159,7 @@ def reconstruct_mosaic(
     ------
     MitsimError
         for folders that do not fit each other, a way that there is not, and as
-        :func:`mitsim.study.colours.reconstruct_colours`.
+        :func:`mitsim.study.colour.by_line.reconstruct_colours`.
     """
     started = time.perf_counter()
     check_way(way)

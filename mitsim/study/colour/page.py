@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from mitsim.core.pictures import colour_png, data_uri, grey_png, lightness
 from mitsim.core.versions import versions
 from mitsim.reconstruct.colour import chart, linear_srgb
-from mitsim.study.colour_plots import by_patch, differences, halves
-from mitsim.study.coloured import ColourImage, Patch, mean_of
+from mitsim.study.colour.image import ColourImage, Patch, mean_of
+from mitsim.study.colour.plots import by_patch, differences, halves
 from mitsim.study.html import rendered, shown_figure, write_html
 from mitsim.study.metrics import Quality
 

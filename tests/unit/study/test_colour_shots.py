@@ -17,10 +17,10 @@ from mitsim.reconstruct.colour import chart
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.mosaic import PLANES, JointMosaic
 from mitsim.rig.patterns import parse_patterns
-from mitsim.study.filters import demosaiced
-from mitsim.study.lines import respectred, serving
+from mitsim.study.colour.lit import respectred, serving
+from mitsim.study.colour.shots import ARRAY, HALF, JOINT, MosaicShots, filter_weights
+from mitsim.study.colour.ways import demosaiced
 from mitsim.study.metrics import psnr
-from mitsim.study.mosaic import ARRAY, HALF, JOINT, MosaicShots, filter_weights
 from tests.ideal_sessions import picture, shadow
 from tests.invented import sensor
 

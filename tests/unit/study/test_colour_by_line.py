@@ -15,9 +15,9 @@ from mitsim.core.framefile import read_frame
 from mitsim.core.runs import load_run
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.study.colours import reconstruct_colours
+from mitsim.study.colour.by_line import reconstruct_colours
+from mitsim.study.colour.lit import LitLine, serving
 from mitsim.study.exposures import LitScene
-from mitsim.study.lines import LitLine, serving
 from mitsim.study.quality import reconstruct
 from tests.coloured import LINES, PLACE, folders
 
