@@ -68,11 +68,6 @@ class FiledLight:
         """(rows,) light of each row, a mean over the sensor, but for pixels that are traced apart [W m^-2]."""
         return np.asarray(self.fine.sum(axis=1) + self.smooth.sum(axis=1), dtype=np.float64)
 
-    @property
-    def lost(self) -> float:
-        """Part of the light that is in no frame."""
-        return self.outside / self.received if self.outside else 0.0
-
 
 def _sum(one: Any, other: Any) -> Any:
     """Of numbers or matrices; a matrix to which nothing is added is not copied."""

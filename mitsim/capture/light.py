@@ -166,7 +166,8 @@ class Light:
     @property
     def lost(self) -> float:
         """Part of the light that came from beyond all cells and is in no frame."""
-        return reduce(add, self.groups).lost
+        outside = sum(group.outside for group in self.groups)
+        return outside / sum(group.received for group in self.groups) if outside else 0.0
 
     @property
     def warnings(self) -> tuple[str, ...]:
