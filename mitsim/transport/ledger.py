@@ -135,12 +135,12 @@ class Ledger:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        by_row = np.ascontiguousarray(counted[:-1].reshape(self._width, self._rows).T)
-        row, places = np.nonzero(by_row)
-        light = by_row[row, places] * self._unit
-        inside = places < self._bundle.size
-        outside = float(light[~inside].sum())
-        rows = self._rows + self._bundle.lamps
-        starts = np.append(0, np.cumsum(np.bincount(row[inside], minlength=rows)))
-        entries = light[inside], places[inside].astype(np.int32), starts
-        return sparse.csr_array(entries, shape=(rows, self._bundle.size)), float(light.sum()), outside
+        lit = np.flatnonzero(counted[:-1])
+        light = counted[lit] * self._unit
+        # What lay outside has the last place. All places fit 32 bits, in which matrices take half the time.
+        inside = int(np.searchsorted(lit, self._bundle.size * self._rows))
+        places, row = np.divmod(lit[:inside].astype(np.int32), np.int32(self._rows))
+        starts = np.append(0, np.cumsum(np.bincount(places, minlength=self._bundle.size))).astype(np.int32)
+        shape = self._rows + self._bundle.lamps, self._bundle.size
+        filed = sparse.csc_array((light[:inside], row, starts), shape=shape).tocsr()
+        return filed, float(light.sum()), float(light[inside:].sum())
