@@ -14,8 +14,9 @@ points correlate their frames, but make none of them noisier.
 x2 hands on: to the sensor, by its BSDF, of each x1_i; and to further surfaces, where it is diffuse, as the path goes on
 that pixel k follows. Such a path leaves x2 on the side that x1_k lights, by the shading normal; it stands for light of
 those x1_i that light the same side, and in its density count only x1_j that do. A glossy x2 is followed further for its
-own pixel alone. Deltas at x1 (mirrors), light of several wavelengths, and scenes that light passes straight are not
-shared.
+own pixel alone. Where paths carry the projector's lines, pairs bring light of each, by the same weights: these are of
+geometry alone. Deltas at x1 (mirrors), wavelengths that every path draws for itself, and scenes that light passes
+straight are not shared.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import cycle
+from operator import or_
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -39,9 +42,10 @@ from mitsim.transport.repeats import MEMBERS, SIDE, blocks_of
 from mitsim.transport.sampling import generator, panchromatic, seed_of, stratified
 
 if TYPE_CHECKING:
-    Store = Callable[[mi.UInt32, mi.UInt32, list[mi.Float], mi.Bool], None]
-    Sender = Callable[[mi.Vector3f, mi.Bool], tuple[mi.Float, mi.Float]]
-    Turner = Callable[[mi.UInt32, mi.Bool], tuple[mi.Float, mi.Float]]
+    ByLine = list[mi.Float]
+    Store = Callable[[mi.UInt32, mi.UInt32, tuple[ByLine, ByLine], mi.Bool], None]
+    Sender = Callable[[mi.Vector3f, mi.Bool], tuple[ByLine, mi.Float]]
+    Turner = Callable[[mi.UInt32, mi.Bool], tuple[ByLine, ByLine]]
 
 _STEP, _TURN = 5, 16
 """Members of a block take the points of their common sequence in turn; each sample begins five members on, and sixteen
@@ -74,8 +78,15 @@ class NeighbourTracer(IndirectTracer):
 
     def shares(self) -> bool:
         """Whether what is to be followed can be shared: as the module says."""
-        several = self.points.count > 1 or not mi.is_monochromatic or mi.is_polarized
+        lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
+        several = self.points.count > 1 or not lines or mi.is_polarized
         return self.interreflection and not several and not self.receiver.passage.open
+
+    @property
+    def lines(self) -> int:
+        """Lines that light is told apart by; 1 where it is not."""
+        lines = self.projector.lines
+        return len(lines.shares) if lines is not None and mi.is_spectral else 1
 
     @cached_property
     def diffuse(self) -> frozenset[int]:
@@ -125,29 +136,30 @@ class _Block(IndirectWalk):
 
     def deposits(self, further: bool) -> list[Deposits]:
         """Light on the host: of each pixel's own paths, and of all pairs of pixels and second points."""
-        own = self._own()
-        values = [dr.zeros(mi.Float, dr.width(self.lit) * MEMBERS) for _ in range(2)]
+        own, count = self._own(), dr.width(self.lit) * MEMBERS
+        values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
 
-        def store(place: mi.UInt32, at: mi.UInt32, light: list[mi.Float], active: mi.Bool) -> None:
-            for each, value in zip(values, light, strict=True):
-                dr.scatter(each, value, place, active)
+        def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
+            for kept, by_line in zip(values, light, strict=True):
+                for each, value in zip(kept, by_line, strict=True):
+                    dr.scatter(each, value, place, active)
 
         self._hand_on(*self._weights(), store)
         dr.eval(values)
         return [*own, self._paired(values[0], self.way), self._paired(values[1], self.further)]
 
     def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
-        """Light of each pixel's own paths on the host; that of pairs in ``ledgers``, of which there is one."""
-        (ledger,) = ledgers
+        """Light of each pixel's own paths on the host; that of pairs in ``ledgers``, one for each line."""
         own = self._own()
         seen = Sightings(self.way.geometric, self.pixel, self.way.row, self.way.column, self.way.inverse_depth)
-        places = [ledger.place(each, self.rng.next_float32()) for each in (seen, self.further)]
+        places = [ledgers[0].place(each, self.rng.next_float32()) for each in (seen, self.further)]
         dr.eval(places)
 
-        def store(place: mi.UInt32, at: mi.UInt32, light: list[mi.Float], active: mi.Bool) -> None:
-            for each, value in zip(places, light, strict=True):
-                lit = active & ~(value == 0)  # not a number is light to be refused
-                ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
+        def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
+            for each, by_line in zip(places, light, strict=True):
+                for ledger, value in zip(ledgers, by_line, strict=True):
+                    lit = active & ~(value == 0)  # not a number is light to be refused
+                    ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
 
         self._hand_on(*self._weights(), store)
         return own
@@ -158,15 +170,21 @@ class _Block(IndirectWalk):
         self._second()
         self._follow_on()
         kept = self.kept["indirect"]
-        followed = dr.select(self.follows, kept.value, 0)
-        self.further = Sightings(followed, kept.pixel, kept.row, kept.column, kept.inverse_depth)
+        place = kept.pixel, kept.row, kept.column, kept.inverse_depth
+        self.further = Sightings(dr.select(self.follows, kept.value, 0), *place)
+        # Of unit light, whose mean over wavelengths the sightings hold.
+        self.beyond = [self.further.value]
+        if kept.lines is not None:
+            unit = dr.select(self.follows, kept.lines * len(kept.lines), 0)
+            self.beyond = [unit[line] for line in range(self.tracer.lines)]
+            kept.lines = dr.select(self.follows, 0, kept.lines)
         kept.value = dr.select(self.follows, 0, kept.value)
         dr.eval(vars(self))
         return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
 
     def _first(self) -> None:
         """The first surface, and each path's turn there."""
-        self.lit_by, self.power = mi.Ray3f(self.ray), panchromatic(self.flux)
+        self.lit_by, self.power = mi.Ray3f(self.ray), self._light(self.flux)
         self.lit_at = self.scene.ray_intersect_preliminary(self.ray, active=self.active)
         si = self.lit_at.compute_surface_interaction(self.ray, active=self.active)
         self.active &= si.is_valid()
@@ -204,24 +222,34 @@ class _Block(IndirectWalk):
             found |= si.shape == mi.ShapePtr(shapes[place])
         return found if few is diffuse else ~found
 
-    @staticmethod
-    def _turn(si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def _light(self, flux: mi.UnpolarizedSpectrum) -> ByLine:
+        """Light at the wavelengths of a path, by line or in all."""
+        if self.tracer.lines == 1:
+            return [panchromatic(flux)]
+        return [flux[line] / len(flux) for line in range(self.tracer.lines)]
+
+    def _factors(self, spectrum: mi.UnpolarizedSpectrum) -> ByLine:
+        """What a ``spectrum`` makes of light by line: where no lines are told apart, all its numbers are the same."""
+        return [spectrum[line] for line in range(self.tracer.lines)]
+
+    def _turn(self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> ByLine:
         """Light that a surface turns from ``toward`` to ``onward``, but for a factor of the latter."""
         si.wi = si.to_local(toward)
         context = mi.BSDFContext(mi.TransportMode.Importance)
-        value = panchromatic(mi.unpolarized_spectrum(si.bsdf().eval(context, si, si.to_local(onward), active)))
+        value = mi.unpolarized_spectrum(si.bsdf().eval(context, si, si.to_local(onward), active))
         value *= dr.abs(mi.Frame3f.cos_theta(si.wi) / dr.dot(si.n, toward))
-        return dr.select(active & dr.isfinite(value), value, 0)
+        return self._factors(dr.select(active & dr.isfinite(value), value, 0))
 
-    def _weights(self) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """(lanes * members,) what each pixel sends to each second point of its block, negative to its other side;
-        (lanes,) the points' densities, and those with which their own side is lit."""
+    def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
+        """(lanes * members,) what each pixel sends to each second point of its block, negative to its other side, by
+        line or the same for all; (lanes,) the points' densities, and those with which their own side is lit."""
         width = dr.width(self.lit)
-        sent, density = (dr.zeros(mi.Float, width * MEMBERS) for _ in range(2))
+        density = dr.zeros(mi.Float, width * MEMBERS)
         index, si = dr.arange(mi.UInt32, width), self._first_points()
         first = index - self.member
 
         send = self._sender(si)
+        sent = [dr.zeros(mi.Float, width * MEMBERS) for _ in range(self.sends)]
 
         def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
             known = self.point, self.normal, self.shading, self.side
@@ -230,14 +258,16 @@ class _Block(IndirectWalk):
             offset = point - si.p
             squared = dr.squared_norm(offset)
             direction = offset * dr.rsqrt(squared)
-            value, pdf = send(direction, active)
+            by_line, pdf = send(direction, active)
             to_area = dr.abs(dr.dot(normal, direction)) / squared
-            value *= to_area
-            active &= (value > 0) & (value < dr.inf) & (pdf > 0)
+            values = [value * to_area for value in by_line]
+            some = reduce(dr.maximum, values)
+            active &= (some > 0) & (some < dr.inf) & (pdf > 0)
             another = active & (other != self.member)
             active &= ~self.scene.ray_test(si.spawn_ray_to(point), another) | ~another
             place, sign = index * MEMBERS + other, dr.select(dr.dot(shading, direction) * side < 0, mi.Float(1), -1)
-            dr.scatter(sent, value * sign, place, active)
+            for each, value in zip(sent, values, strict=True):
+                dr.scatter(each, value * sign, place, active)
             dr.scatter(density, pdf * to_area * sign, place, active)
             return (other + 1,)
 
@@ -250,7 +280,7 @@ class _Block(IndirectWalk):
             whole, same_side = whole + dr.abs(each), same_side + dr.maximum(each, 0)
         return sent, whole, same_side
 
-    def _hand_on(self, sent: mi.Float, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
+    def _hand_on(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
         """Light of each pixel by each second point of its block, straight to the sensor and further on.
 
         Parameters
@@ -268,26 +298,33 @@ class _Block(IndirectWalk):
 
         def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
             place, at = index * MEMBERS + other, first + other
-            given = dr.gather(mi.Float, sent, place)
-            active = self.lit & (given != 0)
-            weight = self.power * dr.abs(given) / dr.gather(mi.Float, whole, at)
+            given = [dr.gather(mi.Float, each, place) for each in sent]
+            active = self.lit & reduce(or_, (each != 0 for each in given))
             connected, further = turn(at, active)
-            further *= self.power * given / dr.gather(mi.Float, same_side, at)
-            store(place, at, [connected * weight, dr.select((given > 0) & (further > 0), further, 0)], active)
+            all_ways, same_way = (1 / dr.gather(mi.Float, density, at) for density in (whole, same_side))
+            light = [power * each for power, each in zip(self.power, cycle(given))]
+            straight = [value * dr.abs(each) * all_ways for value, each in zip(connected, light, strict=True)]
+            onward = [value * each * same_way for value, each in zip(further, light, strict=True)]
+            store(place, at, (straight, [dr.select(each > 0, each, 0) for each in onward]), active)
             return (other + 1,)
 
         dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
+
+    @property
+    def sends(self) -> int:
+        """Numbers that tell what a pixel sends to a second point: one for each line, or for all."""
+        return self.tracer.lines
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
         """What first surfaces at ``si`` send in a direction [1/sr], and the density [1/sr] of sampling that."""
         context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.lit_by.d
 
-        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
             local = si.to_local(direction)
             reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
             turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
             turned /= mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward)
-            return panchromatic(mi.unpolarized_spectrum(reflected)) * dr.abs(turned), pdf
+            return self._factors(mi.unpolarized_spectrum(reflected) * dr.abs(turned)), pdf
 
         return send
 
@@ -295,29 +332,35 @@ class _Block(IndirectWalk):
         """What second points of lanes turn of light from first points at ``si``: to the sensor, and on the ways that
         are followed further."""
 
-        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
             met, ray = (dr.gather(type(each), each, at, active) for each in (self.arrived_at, self.arrived_by))
             second = met.compute_surface_interaction(ray, active=active)
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.way, at, active)
             reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
-            connected = panchromatic(reception.irradiance) * (1 - camera_part(reception.pdf))
-            beyond = dr.gather(mi.Float, self.further.value, at, active)
-            onward, turned = (dr.gather(type(each), each, at, active) for each in (self.onward, self.turned))
-            handed = active & (beyond > 0) & (turned > 0)
-            scale = self._turn(second, toward, onward, handed) / turned
-            return connected, dr.select(handed, beyond * scale, 0)
+            connected = self._factors(reception.irradiance * (1 - camera_part(reception.pdf)))
+            beyond, turned = (
+                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.turned)
+            )
+            handed = [active & (light > 0) & (own > 0) for light, own in zip(beyond, turned, strict=True)]
+            onward = dr.gather(mi.Vector3f, self.onward, at, active)
+            others = self._turn(second, toward, onward, reduce(or_, handed))
+            further = [light * other / own for light, other, own in zip(beyond, others, turned, strict=True)]
+            return connected, [dr.select(some, light, 0) for some, light in zip(handed, further, strict=True)]
 
         return turn
 
     def _first_points(self) -> mi.SurfaceInteraction3f:
         return self.lit_at.compute_surface_interaction(self.lit_by, active=self.lit)
 
-    def _paired(self, values: mi.Float, seen: Way | Sightings) -> Deposits:
+    def _paired(self, values: ByLine, seen: Way | Sightings) -> Deposits:
         """Light on the host of pairs of pixels and second points."""
-        light = np.array(values)
+        by_line = np.array(values)
+        light = by_line.sum(axis=0)
         check_finite(light)
         pairs = np.flatnonzero(light)
+        lines = np.zeros((len(mi.Spectrum()), len(pairs)), np.float32)
+        lines[: len(by_line)] = by_line[:, pairs]
         lane, other = np.divmod(pairs, MEMBERS)
         at = lane - lane % MEMBERS + other
         none = np.zeros(len(pairs), np.int64)
@@ -331,6 +374,7 @@ class _Block(IndirectWalk):
             inverse_depth=inverse.astype(np.float64),
             value=light[pairs].astype(np.float64),
             kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
+            lines=lines if self.by_line else None,
         )
 
 
@@ -341,6 +385,16 @@ class _DiffuseBlock(_Block):
     it goes on to, on the side that s w tells.
     """
 
+    sends = 1
+
+    def _first(self) -> None:
+        super()._first()
+        si = self._first_points()
+        self.facing = dr.sign(mi.Frame3f.cos_theta(si.wi))
+        turned = self._turn(si, -self.lit_by.d, si.sh_frame.n * self.facing, self.lit)
+        self.lit &= reduce(dr.maximum, turned) > 0
+        self.power = [power * own for power, own in zip(self.power, turned, strict=True)]
+
     def _second(self) -> None:
         super()._second()
         second = self.arrived_at.compute_surface_interaction(self.arrived_by, active=self.shared)
@@ -348,30 +402,31 @@ class _DiffuseBlock(_Block):
         facing = self.shading * self.sensor_side
         way = replace(self.way, open=self.way.open & self.shared)
         reception = self.tracer.receiver.received(second, facing, way)
-        self.to_sensor = panchromatic(reception.irradiance) * dr.abs(dr.dot(self.normal, facing))
+        self.to_sensor = self._factors(reception.irradiance * dr.abs(dr.dot(self.normal, facing)))
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
-        side = dr.sign(mi.Frame3f.cos_theta(si.wi))
-        turned = self._turn(si, -self.lit_by.d, si.sh_frame.n * side, self.lit)
-
-        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-            cosine = dr.dot(si.sh_frame.n, direction) * side
-            value = turned * dr.abs(dr.dot(si.n, direction))
-            return dr.select(active & (cosine > 0), value, 0), cosine * dr.inv_pi
+        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
+            cosine = dr.dot(si.sh_frame.n, direction) * self.facing
+            value = dr.abs(dr.dot(si.n, direction))
+            return [dr.select(active & (cosine > 0), value, 0)], cosine * dr.inv_pi
 
         return send
 
     def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
         own = self._cosines(self.shading, self.normal, -self.arrived_by.d)
-        further = dr.select(own > 0, self.further.value / own, 0)
+        further = [dr.select(own > 0, light / own, 0) for light in self.beyond]
         dr.eval(further)
 
-        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-            known = self.point, self.normal, self.shading, self.sensor_side, self.to_sensor, further
-            point, normal, shading, side, to_sensor, beyond = (dr.gather(type(e), e, at, active) for e in known)
+        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
+            known = self.point, self.normal, self.shading, self.sensor_side
+            point, normal, shading, side = (dr.gather(type(each), each, at, active) for each in known)
+            to_sensor, beyond = (
+                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.to_sensor, further)
+            )
             toward = dr.normalize(si.p - point)
             cosines = self._cosines(shading, normal, toward)
-            return dr.select(dr.dot(shading, toward) * side > 0, to_sensor * cosines, 0), beyond * cosines
+            seen = dr.select(dr.dot(shading, toward) * side > 0, cosines, 0)
+            return [light * seen for light in to_sensor], [light * cosines for light in beyond]
 
         return turn
 
