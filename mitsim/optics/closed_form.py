@@ -30,6 +30,8 @@ from mitsim.rig.projector import Spectrum
 IntArray = npt.NDArray[np.integer]
 Entries = tuple[IntArray, FloatArray]
 """Distinct indices into (layers, rows, columns), and the light [W m^-2] at each."""
+_FILLED = 1 / 8
+"""Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
 _HELD = 8
 """Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
 _kept_shadow = lru_cache(maxsize=24)(shadow_terms)
@@ -156,7 +158,7 @@ class _TermsLayer:
 
     def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _Block:
         """The layer with ``lights`` (estimates, r, c) in these ``rows`` and ``columns``."""
-        return _Block([(left[rows], right[columns]) for left, right in self.terms], lights)
+        return _Block([(_picked(left, rows), _picked(right, columns)) for left, right in self.terms], lights)
 
 
 class FrameOptics:
@@ -250,7 +252,7 @@ class FrameOptics:
         """
         probes = 0 if vectors is None else vectors.shape[1]
         frame, probed = None, np.zeros((self.frame_shape[0], len(estimates) * probes))
-        for block in self._blocks(estimates):
+        for block in self._blocks(estimates, together=vectors is None):
             frame = block.frame(out) if frame is None else np.add(frame, block.frame(), out=frame)
             if vectors is not None:
                 probed += block.probe(vectors)
@@ -258,22 +260,41 @@ class FrameOptics:
             frame = np.zeros(self.frame_shape) if out is None else out
         return frame, probed
 
-    def _blocks(self, estimates: Sequence[Entries]) -> Iterator[_Block | _RasterBlock]:
-        """The light of each layer that holds any."""
+    def _blocks(self, estimates: Sequence[Entries], together: bool = False) -> Iterator[_Block | _RasterBlock]:
+        """The light of each layer that holds any, of each estimate or of their mean ``together``."""
         split = [self._split(*entries) for entries in estimates]
-        for of_depth, parts in zip(self._layers, zip(*split, strict=True), strict=True):
-            places = [np.divmod(place, self.shape[1]) for place, _ in parts]
-            lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
-            for row, column in places:
-                lit_row[row], lit_column[column] = True, True
-            rows, columns = np.flatnonzero(lit_row), np.flatnonzero(lit_column)
-            if not len(rows):
+        for of_depth, of_layer in zip(self._layers, zip(*split, strict=True), strict=True):
+            parts = list(of_layer)
+            most = max(len(place) for place, _ in parts)
+            if not most:
                 continue
-            row_of, column_of = np.cumsum(lit_row) - 1, np.cumsum(lit_column) - 1
-            lights = np.zeros((len(parts), len(rows), len(columns)))
-            for light, (row, column), (_, values) in zip(lights, places, parts, strict=True):
-                light[row_of[row], column_of[column]] = values
-            yield of_depth.block(rows, columns, lights)
+            if most < _FILLED * self.shape[0] * self.shape[1]:
+                rows, columns, parts = self._lit(parts)
+            else:
+                rows, columns = (np.arange(count) for count in self.shape)
+            lights = np.zeros((1 if together else len(parts), len(rows) * len(columns)))
+            for number, (place, values) in enumerate(parts):
+                lights[0 if together else number, place] += values
+            if together:
+                lights /= len(parts)
+            yield of_depth.block(rows, columns, lights.reshape(-1, len(rows), len(columns)))
+
+    def _lit(self, parts: Sequence[Entries]) -> tuple[IntArray, IntArray, list[Entries]]:
+        """Rows and columns that any of some ``parts`` lights, and the parts by places among these alone."""
+        places = [np.divmod(place, self.shape[1]) for place, _ in parts]
+        lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
+        for row, column in places:
+            lit_row[row], lit_column[column] = True, True
+        rows, columns = np.flatnonzero(lit_row), np.flatnonzero(lit_column)
+        row_of, column_of = (np.cumsum(lit_row) - 1) * len(columns), np.cumsum(lit_column) - 1
+        return (
+            rows,
+            columns,
+            [
+                (row_of[row] + column_of[column], values)
+                for (row, column), (_, values) in zip(places, parts, strict=True)
+            ],
+        )
 
     def _split(self, flat: IntArray, light: FloatArray) -> list[Entries]:
         """What lies in each layer: places in (rows, columns), and light."""
@@ -338,6 +359,12 @@ def _correlation(
     """The shadow of a mask that is drawn on a raster, prepared once."""
     shadow = replace(ShadowGeometry.of(geometry, depth), mask=raster(geometry, depth, spectrum))
     return Correlation(shadow, rows, columns, geometry.pixel_fill_factor)
+
+
+def _picked(factor: FloatArray | _Stack, rows: IntArray) -> FloatArray:
+    """The ``rows`` of a factor; the factor itself where they are all."""
+    whole = isinstance(factor, np.ndarray) and len(rows) == len(factor)
+    return factor if whole else factor[rows]  # type: ignore[return-value]
 
 
 class _Stack:

@@ -192,3 +192,21 @@ def test_estimates_that_light_different_places_are_seen_as_each_is() -> None:
     assert np.allclose(frame, sum(alone) / 3, rtol=1e-12)
     assert np.allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-10)
     assert np.array_equal(probed, optics.probe(estimates, vectors))
+
+
+def test_light_that_fills_its_cells_casts_what_its_parts_do() -> None:
+    """It is laid out whole, and parts by the rows and columns that they light: two layers, of different fill."""
+    rng, rows = np.random.default_rng(9), Directions.cells(np.linspace(-0.2, 0.2, 11))
+    columns = Directions.cells(np.linspace(-0.1, 0.3, 9))
+    optics = FrameOptics(CAMERA, rows, columns, (60.0, 20.0), 2)
+    estimates = [(np.sort(rng.choice(500, 300, replace=False)), rng.random(300)) for _ in range(3)]
+    vectors = rng.standard_normal((96, 4))
+    parts = [
+        [optics.frame(flat[start : start + 20], light[start : start + 20]) for start in range(0, 300, 20)]
+        for flat, light in estimates
+    ]
+    alone = [np.sum(each, axis=0) for each in parts]
+    frame, probed = optics.seen(estimates, vectors)
+    np.testing.assert_allclose(frame, sum(alone) / 3, rtol=1e-12)
+    np.testing.assert_allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(optics.seen(estimates, None)[0], frame, rtol=1e-12)
