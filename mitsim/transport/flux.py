@@ -20,7 +20,7 @@ from mitsim.transport.landing import landing
 from mitsim.transport.paths import LANES_PER_LAUNCH
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, SensorPoints, sampled_wavelengths
-from mitsim.transport.sampling import panchromatic, shuffled, stratified, streams
+from mitsim.transport.sampling import shuffled, stratified, streams, told_apart
 
 IntArray = npt.NDArray[np.int64]
 
@@ -95,18 +95,12 @@ class FluxTracer:
             number = block - group * count
             sample = dr.gather(mi.UInt32, starts, number) + (lane - place * each)
             light = self._light(seed, group, dr.gather(mi.UInt32, numbers, number), sample)
-            for own, value in zip(total, self._by_line(light, len(total)), strict=True):
+            if len(total) > 1:
+                dr.eval(light)  # together: apart, each line would trace it
+            for own, value in zip(total, told_apart(light, len(total)), strict=True):
                 own[start:stop] = np.array(dr.block_sum(mi.Float64(value), samples))
         check_finite(total)
         return total.reshape(len(total), groups, -1)
-
-    @staticmethod
-    def _by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
-        """Light of each of several ``lines``, or of all in one; worked out together, for apart each would trace it."""
-        if lines == 1:
-            return [panchromatic(light)]
-        dr.eval(light)
-        return [light[line] / len(light) for line in range(lines)]
 
     def _light(self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.UnpolarizedSpectrum:
         """Mean irradiance that one ray of each ``pixel`` brings to the sensor."""

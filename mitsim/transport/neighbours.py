@@ -39,7 +39,7 @@ from mitsim.transport.ledger import Ledger
 from mitsim.transport.paths import KINDS, camera_part
 from mitsim.transport.receiver import Way
 from mitsim.transport.repeats import MEMBERS, SIDE, blocks_of
-from mitsim.transport.sampling import generator, panchromatic, seed_of, stratified
+from mitsim.transport.sampling import generator, seed_of, stratified, told_apart
 
 if TYPE_CHECKING:
     ByLine = list[mi.Float]
@@ -177,14 +177,13 @@ class _Block(IndirectWalk):
         if kept.lines is not None:
             unit = dr.select(self.follows, kept.lines * len(kept.lines), 0)
             self.beyond = [unit[line] for line in range(self.tracer.lines)]
-            kept.lines = dr.select(self.follows, 0, kept.lines)
         kept.value = dr.select(self.follows, 0, kept.value)
         dr.eval(vars(self))
         return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
 
     def _first(self) -> None:
         """The first surface, and each path's turn there."""
-        self.lit_by, self.power = mi.Ray3f(self.ray), self._light(self.flux)
+        self.lit_by, self.power = mi.Ray3f(self.ray), told_apart(self.flux, self.tracer.lines)
         self.lit_at = self.scene.ray_intersect_preliminary(self.ray, active=self.active)
         si = self.lit_at.compute_surface_interaction(self.ray, active=self.active)
         self.active &= si.is_valid()
@@ -221,12 +220,6 @@ class _Block(IndirectWalk):
         for place in few:
             found |= si.shape == mi.ShapePtr(shapes[place])
         return found if few is diffuse else ~found
-
-    def _light(self, flux: mi.UnpolarizedSpectrum) -> ByLine:
-        """Light at the wavelengths of a path, by line or in all."""
-        if self.tracer.lines == 1:
-            return [panchromatic(flux)]
-        return [flux[line] / len(flux) for line in range(self.tracer.lines)]
 
     def _factors(self, spectrum: mi.UnpolarizedSpectrum) -> ByLine:
         """What a ``spectrum`` makes of light by line: where no lines are told apart, all its numbers are the same."""

@@ -83,3 +83,9 @@ def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
     """One number for a spectrum of ``radiance``, by a flat response: the mean over channels, or over wavelengths that
     have the weights of :func:`mitsim.transport.receiver.sampled_wavelengths`."""
     return dr.mean(radiance)
+
+
+def told_apart(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
+    """Light of each of several ``lines``, or of all in one, whose weights ``light`` has as :func:`panchromatic` takes
+    them."""
+    return [panchromatic(light)] if lines == 1 else [light[line] / len(light) for line in range(lines)]
