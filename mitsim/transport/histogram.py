@@ -26,8 +26,8 @@ from mitsim.transport.sampling import panchromatic
 IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
 """Kinds of light: of lamps, of the projector over one surface that is no mirror, and over several."""
-_COUNTED = 2**26
-"""Places that light is counted in; more of them are sorted."""
+_COUNTED = 4
+"""Places for each entry of light up to which entries are counted by place; where places are more, sorting is faster."""
 
 
 @dataclass
@@ -284,8 +284,8 @@ class Bundle:
         index = _index_type(*shape)
         row = np.append(labels, count + np.arange(self.lamps))[pixel]
         light = sparse.coo_array((values, (row.astype(index), flat.astype(index))), shape=shape)
-        # By way of columns, for two passes of counting take half the time of sorting; but a count takes a word a place.
-        light = light.tocsc().tocsr() if self.size < _COUNTED else light.tocsr()
+        # By way of columns two passes of counting take half the time of sorting; but they go through all places.
+        light = light.tocsc().tocsr() if self.size < _COUNTED * len(values) else light.tocsr()
         light.sum_duplicates()
         light.eliminate_zeros()
         return light
