@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +22,7 @@ from mitsim.capture.simulation import Simulation, Stage
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.job import Progress, silent
-from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.parallel import Behind, single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.rig.patterns import Lighting, PatternFamily
@@ -52,8 +50,6 @@ _FIRST = 0.7
 """Part of the samples that the plan predicts with which sampling begins where most paths are of followed light: the
 prediction is safe, and a look costs less than samples that are too many (corner took 1.4 times what its target
 needs)."""
-_WAITING = 2
-"""Traced parts that wait to be filed, at most: some 0.2 GB each."""
 _VIEW_SAMPLES = 64
 """Samples a cell of a picture to look at: below the step of eight bits."""
 _LOST = 0.1
@@ -365,8 +361,10 @@ def trace_lines(
     groups = [_Group(simulation, labels, stream, len(benches)) for stream in streams]
     rounds = first_round(simulation)
     while True:
-        for group in groups:
-            group.sample(rounds)
+        with Behind(_filed) as filing:
+            for group in groups:
+                group.sample(rounds, filing)
+            filing.wait()
         lights, most, near = list[Light](), 0.0, 1.0
         for line, each in enumerate(own):
             light, bound = _looked(_line_of(groups, line, each, plan, seed), lighting, followed)
@@ -406,8 +404,10 @@ def traced_again(light: Light, simulation: Simulation, purpose: str = "scene") -
     """
     streams = [integer(light.seed, "transport", purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, light.labels, stream) for stream in streams]
-    for group in groups:
-        group.trace(light.samples)
+    with Behind(_filed) as filing:
+        for group in groups:
+            group.trace(light.samples, filing)
+        filing.wait()
     flux = np.mean([group.flux() for group in groups], axis=0)
     return replace(light, groups=tuple(group.light() for group in groups), simulation=simulation, flux=flux)
 
@@ -501,6 +501,15 @@ def _unchecked(light: Light, lighting: Lighting, checked: Lighting) -> tuple[flo
     return error, bound
 
 
+Filing = Callable[[], None]
+"""Adds light of one line to what a group has."""
+
+
+def _filed(filing: Filing) -> None:
+    """Do it."""
+    filing()
+
+
 class _Group:
     """One independent estimate of the light, by line: the sum over its samples so far."""
 
@@ -512,60 +521,58 @@ class _Group:
         self._sums: list[dict[str, FiledLight]] = [{} for _ in range(lines)]
         self._flux = [{name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")} for _ in range(lines)]
 
-    def sample(self, rounds: float) -> None:
-        """Trace until this many times the samples that the plan predicted are done."""
-        self.trace(samples_of(self.simulation, rounds))
+    def sample(self, rounds: float, filing: Behind[Filing]) -> None:
+        """Trace until this many times the samples that the plan predicted are done.
 
-    def trace(self, wanted: Mapping[str, int]) -> None:
+        Parameters
+        ----------
+        rounds
+            times.
+        filing
+            as for :meth:`trace`.
+        """
+        self.trace(samples_of(self.simulation, rounds), filing)
+
+    def trace(self, wanted: Mapping[str, int], filing: Behind[Filing]) -> None:
         """Trace until so many samples as are ``wanted`` of each stage by its name are done.
 
-        Light is filed while the next is traced: filing takes one processor, and a tracer waits for its last paths.
+        Parameters
+        ----------
+        wanted
+            samples.
+        filing
+            what light is filed by while the next is traced: filing takes one processor, and a tracer waits for its last
+            paths. All is there when it has been waited for.
         """
-        with ThreadPoolExecutor(1) as filing:
-            filed: deque[Future[list[_Filed]]] = deque()
-            for name, stage in self.simulation.tracers().items():
-                seed = integer(self.seed, stage.stream)
-                more = self.done.get(name, 0) < wanted.get(name, 0)
-                ledgers = stage.ledgers(self.labels, self._lines) if more else ()
-                while (done := self.done.get(name, 0)) < wanted.get(name, 0):
-                    count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
-                    deposits = stage.trace(seed, done, count, ledgers)
-                    if len(filed) == _WAITING:
-                        self._add(filed.popleft().result())
-                    filed.append(filing.submit(self._filed, name, stage, deposits))
-                    self.done[name] = done + count
-                    self.paths += count * stage.tracer.lanes
-                if ledgers:
-                    counted = [ledger.fetched() for ledger in ledgers]
-                    filed.append(filing.submit(self._from_ledgers, name, stage, ledgers, counted))
-            while filed:
-                self._add(filed.popleft().result())
+        for name, stage in self.simulation.tracers().items():
+            seed = integer(self.seed, stage.stream)
+            more = self.done.get(name, 0) < wanted.get(name, 0)
+            ledgers = stage.ledgers(self.labels, self._lines) if more else ()
+            while (done := self.done.get(name, 0)) < wanted.get(name, 0):
+                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
+                deposits = stage.trace(seed, done, count, ledgers)
+                lights = enumerate(deposits.by_line(self._lines))
+                filing.give([partial(self._file, name, stage, light, line) for line, light in lights])
+                self.done[name] = done + count
+                self.paths += count * stage.tracer.lanes
+            if ledgers:
+                held = [(ledger, ledger.fetched()) for ledger in ledgers]
+                filing.give([partial(self._file_ledger, name, stage, *each, line) for line, each in enumerate(held)])
 
-    def _filed(self, name: str, stage: Stage, deposits: Deposits) -> list[_Filed]:
-        """Light of a stage by line, and the flux of each pixel where it is direct light."""
-        return [
-            _Filed(
-                name,
-                stage.file(light, self.labels, 1),
-                self.simulation.flux(light, 1) if name in self._flux[0] else None,
-            )
-            for light in deposits.by_line(self._lines)
-        ]
+    def _file(self, name: str, stage: Stage, deposits: Deposits, line: int) -> None:
+        """Add light of a stage and a line, and the flux of each pixel where it is direct light."""
+        if name in self._flux[line]:
+            self._flux[line][name] += self.simulation.flux(deposits, 1)
+        self._add(name, stage.file(deposits, self.labels, 1), line)
 
-    @staticmethod
-    def _from_ledgers(
-        name: str, stage: Stage, ledgers: Sequence[Ledger], counted: Sequence[npt.NDArray[np.uint64]]
-    ) -> list[_Filed]:
-        """Light of a stage by line that its ledgers ``counted``."""
+    def _file_ledger(self, name: str, stage: Stage, ledger: Ledger, counted: npt.NDArray[np.uint64], line: int) -> None:
+        """Add light of a stage and a line that its ledger ``counted``."""
         assert stage.file_ledger is not None
-        pairs = zip(ledgers, counted, strict=True)
-        return [_Filed(name, stage.file_ledger(ledger, units), None) for ledger, units in pairs]
+        self._add(name, stage.file_ledger(ledger, counted), line)
 
-    def _add(self, by_line: Sequence[_Filed]) -> None:
-        for sums, fluxes, more in zip(self._sums, self._flux, by_line, strict=True):
-            sums[more.name] = sums[more.name] + more.light if more.name in sums else more.light
-            if more.flux is not None:
-                fluxes[more.name] += more.flux
+    def _add(self, name: str, light: FiledLight, line: int) -> None:
+        sums = self._sums[line]
+        sums[name] = sums[name] + light if name in sums else light
 
     def light(self, line: int = 0) -> FiledLight:
         """Mean over the samples, of a ``line``."""
@@ -575,15 +582,6 @@ class _Group:
         """(n^2,) mean over the samples, of a ``line``."""
         fluxes = self._flux[line]
         return np.asarray(sum(fluxes[name] / done for name, done in self.done.items() if name in fluxes))
-
-
-@dataclass(frozen=True, eq=False)
-class _Filed:
-    """Light of a stage by its ``name``, and the flux of each pixel (n^2,) where it is direct light."""
-
-    name: str
-    light: FiledLight
-    flux: FloatArray | None
 
 
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:
