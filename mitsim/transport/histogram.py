@@ -132,6 +132,8 @@ class Deposits:
     def joined(cls, parts: Sequence[Deposits]) -> Deposits:
         """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
+        if len(parts) == 1:
+            return parts[0]
         by_line = [part.lines for part in parts if part.lines is not None]
         lines = np.concatenate(by_line, axis=1) if by_line and len(by_line) == len(parts) else None
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
