@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-SCENES = ("photograph", "colour_checker")
+SCENES = ("photograph", "colour_checker", "corner")
 TRACED = ("plan", "transport", "truth")
 PROJECTOR = Path(__file__).parents[1] / "calibration" / "mp_cl1.toml"
 GOAL = 1.6
