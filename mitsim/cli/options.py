@@ -153,7 +153,7 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
 def check_setup(scope: Scope, scene: str | None) -> None:
     """MitsimError where the files that a ``scope`` names cannot be, before the renderer is imported; a study without a
     ``scene`` of its own may take others."""
-    from mitsim.capture.bench import check_devices, check_scene
+    from mitsim.capture.opening import check_devices, check_scene
     from mitsim.study.asked import NO_SCENE
 
     check_devices(scope.setup.camera, scope.setup.projector)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.optics.diffraction import wave_terms
 from mitsim.optics.samplers import SeparableTerm, geometric_samplers, wave_samplers
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
