@@ -147,7 +147,7 @@ def capture(
     job = job or Job()
     spent = job.clock.seconds()
     starting = spent["total"] - spent.get("plan", 0.0)  # a plan that was made already has its own seconds
-    request.timing.check(bench.rig)
+    request.timing.check(bench.sensor, bench.rig.camera_file)
     family = bench.family(request.patterns, request.seed)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     lighting = family.lighting
@@ -228,7 +228,7 @@ def check_run(bench: Bench, request: Request, output: Path | None, resume: bool)
     MitsimError
         for another configuration, and an exposure that the camera cannot have.
     """
-    request.timing.check(bench.rig)
+    request.timing.check(bench.sensor, bench.rig.camera_file)
     if output is not None and resume and (output / MANIFEST).is_file():
         check_same(output, RunHead.of(_configuration(bench, request)))
 

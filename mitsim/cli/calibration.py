@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.cli.colour import MOSAIC, NO, Colour, in_colour, of_calibration, variant_for
+from mitsim.cli.colour import MOSAIC, NO, Colour, check_colour, in_colour, of_calibration, variant_for
 from mitsim.cli.modelling import calibrate_model, modelling_of
 from mitsim.cli.options import (
     DAY,
@@ -28,6 +28,8 @@ from mitsim.cli.options import (
     Seed,
     Variant,
     bench_of,
+    check_camera,
+    check_work,
     is_given,
     job_of,
     request_of,
@@ -112,11 +114,16 @@ def calibrate(
         return _calibrate_frames(frames, check_no_plan(None, None, output), camera, others, as_json, quiet)
     if scene is None:
         raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
+    from mitsim.capture.request import Exposure
+    from mitsim.core.output import check_output
     from mitsim.core.resources import memory_from_here, peak_memory
     from mitsim.rig.recipe import load_recipe
 
     request = request_of(accuracy=accuracy, seed=seed)
     session = load_recipe(recipe)
+    exposure = Exposure(None, session.exposure_fraction)
+    if planning or write_frames is not None or colour != NO:
+        session.of_one_depth()
     if write_frames is not None and resume:
         raise MitsimError("--write-frames: a resumed session shows its finished patterns no more; leave out --resume")
     if colour != NO and write_frames is not None:
@@ -129,11 +136,18 @@ def calibrate(
         if colour != NO:
             raise MitsimError(f"--colour {colour}: --plan is for light that is not told apart; leave one of them out")
         wanted = Wanted.of(psnr, patterns, output, resume)
+        check_camera(camera, exposure)
         with job_of(quiet or as_json, max_seconds, max_memory) as job:
             with job.clock.stage("open scene"):
                 bench = bench_of(scene, variant, camera, projector, define, outside)
             return wanted.planned(bench, session, request, job, as_json)
     folder, traced_in = check_no_plan(psnr, patterns, output), variant_for(colour, variant, camera)
+    check_work(folder, resume, several=colour != NO or bool(session.depths))
+    if write_frames is not None:
+        check_output(write_frames)
+    check_colour(colour, variant, projector)
+    if colour != MOSAIC:
+        check_camera(camera, exposure)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):

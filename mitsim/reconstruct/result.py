@@ -15,6 +15,7 @@ from mitsim.core.framefile import write_frame
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.pictures import card, png, scaled, span
+from mitsim.reconstruct.asked import IMAGE_FILE
 from mitsim.reconstruct.cost import Predicted
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depthmap import DepthMap
@@ -22,7 +23,7 @@ from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty
 
-IMAGE_FILE, UNCERTAINTY_FILE, DEPTH_FILE = "image.exr", "uncertainty.exr", "depth.exr"
+UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 RESULT_FILE = "result.json"
 
 

@@ -25,8 +25,10 @@ from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.emva import SPLIT, Session, figures
 from mitsim.sensor.specimen import mean_dark_current
 from mitsim.study.characterise_plots import MOST_OFF, figures_of
-from mitsim.study.procedure import Frames, Procedure, capacity_of, drawn, efficiency_of
-from mitsim.study.runner import DPI, study_folder
+from mitsim.study.emva import Procedure, capacity_of, efficiency_of
+from mitsim.study.folder import study_folder
+from mitsim.study.procedure import Frames, drawn
+from mitsim.study.runner import DPI
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
@@ -167,7 +169,7 @@ def characterise(
     efficiency_of(sensor, procedure)
     if output is None:
         return _characterised(sensor, procedure, capacity, job)
-    with study_folder(output, "characterise", ("*.png",)) as folder:
+    with study_folder(output, "characterise") as folder:
         done = _characterised(sensor, procedure, capacity, job, str(folder))
         write_json(folder / "characterise.json", {**done.payload(), "kind": "characterise", "versions": versions()})
         for file, figure in done.figures().items():

@@ -29,9 +29,9 @@ from mitsim.core.mosaics import MosaicCapture, load_mosaic
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.pictures import png
+from mitsim.reconstruct.asked import IMAGE_FILE, check_joint
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.reconstruct.result import IMAGE_FILE
 from mitsim.rig.chart import ChartPlace
 from mitsim.study.colour.image import ColourImage, board_of
 from mitsim.study.colour.page import PAGE, write_page
@@ -163,8 +163,7 @@ def reconstruct_mosaic(
     """
     started = time.perf_counter()
     check_way(way)
-    if lam != "auto" and not 0 < lam < np.inf:
-        raise MitsimError(f"lambda is {lam}; behind colour filters give a finite number above 0, or auto")
+    check_joint(lam)
     run, calibration = Path(run), Path(calibration)
     shots = load_mosaic(run)
     factors = fitting_factors(shots, calibration)
