@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from mitsim.capture.decision import SceneFacts
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.modelling import model_of
 from mitsim.capture.opening import open_bench
-from mitsim.capture.plan import SceneFacts
 from mitsim.capture.session import Session
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError

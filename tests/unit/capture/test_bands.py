@@ -134,8 +134,8 @@ def test_errors_are_rounded_up_to_two_digits(error: float, said: float) -> None:
 
 def test_a_plan_says_of_which_tag_mono_knows_no_colours(small_scene: Callable[..., Path]) -> None:
     """Without tracing: the error of a scene in greys is 0, that of another is not known."""
+    from mitsim.capture.decision import SceneFacts
     from mitsim.capture.opening import open_bench
-    from mitsim.capture.plan import SceneFacts
 
     scene = small_scene()
     grey, red = (SceneFacts.of(open_bench(scene, albedo=a)).spectrum for a in ("0.5", "400:0.2, 700:0.5"))
