@@ -31,7 +31,7 @@ from mitsim.core.output import output_folder, whole_folder
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
-from mitsim.core.versions import DECIDING, versions
+from mitsim.core.versions import deciding_versions, versions
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
@@ -169,7 +169,7 @@ def calibrate_session(
         "seed": session.seed,
         **({} if session.depth is None else {"depth_mm": session.depth}),
         "recipe": recipe.model_dump(exclude_defaults=True, exclude={"depths"}),
-        "versions": {name: version for name, version in versions().items() if name in DECIDING},
+        "versions": deciding_versions(),
     }
     if session.depth is not None and resume and output is not None and is_finished(output, configuration):
         return load_calibration(output)

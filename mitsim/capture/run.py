@@ -31,7 +31,7 @@ from mitsim.core.output import FRAMES
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.recorders import AMBIENT, Recorder, RunMemory, check_same, claimed, frame_name
 from mitsim.core.runs import Capture
-from mitsim.core.versions import DECIDING, versions
+from mitsim.core.versions import deciding_versions, versions
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import Lighting, PatternFamily
@@ -235,8 +235,7 @@ def check_run(bench: Bench, request: Request, output: Path | None, resume: bool)
 
 def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
     """All that decides the frames."""
-    deciding = {name: version for name, version in versions().items() if name in DECIDING}
-    return {**bench.provenance(), **bench.identity(), **request.deciding, "versions": deciding}
+    return {**bench.provenance(), **bench.identity(), **request.deciding, "versions": deciding_versions()}
 
 
 @contextmanager

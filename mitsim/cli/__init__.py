@@ -221,7 +221,7 @@ def capture(
     quiet: Quiet = False,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.core.resources import memory_from_here, memory_since
 
     request = request_of(
         patterns=patterns,
@@ -248,7 +248,7 @@ def capture(
         if colour == MOSAIC:
             seen = bench.capture_mosaic(request.pop("patterns"), output, resume, job, **request)
             payload, lines = of_mosaic(seen)
-            payload["memory_bytes"] = max(peak_memory() - held, 0.0)
+            payload["memory_bytes"] = memory_since(held)
             return finish(as_json, payload, lines, seen.warnings)
         what, more = request.pop("patterns"), request
         if colour == AUTO:
@@ -257,10 +257,10 @@ def capture(
         if by_line(colour):
             runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **more)
             payload, lines = of_capture(runs, output)
-            payload["memory_bytes"] = max(peak_memory() - held, 0.0)
+            payload["memory_bytes"] = memory_since(held)
             return finish(as_json, payload, lines, payload["warnings"])
         shots = bench.capture(what, output, resume, job, **more)
-    payload = {**shots.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    payload = {**shots.summary(), "memory_bytes": memory_since(held)}
     taken = payload["seconds"]
     lines = [
         f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {taken['total']:.1f} s "

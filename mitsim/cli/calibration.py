@@ -116,7 +116,7 @@ def calibrate(
         raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
     from mitsim.capture.request import Exposure
     from mitsim.core.output import check_output
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.rig.recipe import load_recipe
 
     request = request_of(accuracy=accuracy, seed=seed)
@@ -159,7 +159,7 @@ def calibrate(
             shown = None if recipe is None else session
             colours = by_line(**request, recipe=shown, output=folder, resume=resume, job=job)
             payload, lines = of_calibration(colours, folder)
-            payload["memory_bytes"] = max(peak_memory() - held, 0.0)
+            payload["memory_bytes"] = memory_since(held)
             return finish(as_json, payload, lines, payload["warnings"])
         whole: dict[str, Any] = {**request, "recipe": session, "output": folder, "job": job}
         if write_frames is not None:
@@ -168,7 +168,7 @@ def calibrate(
             found = [*bench.calibrate_depths(**whole, resume=resume).values()]
         else:
             found = [bench.calibrate(**whole, resume=resume)]
-    taken = max(peak_memory() - held, 0.0)
+    taken = memory_since(held)
     places = [str(folder / f"{depth:g}") for depth in session.depths] or [str(folder)]
     payloads = [
         {**factors.manifest.result, "memory_bytes": taken, "output": place}
@@ -218,7 +218,7 @@ def _calibrate_frames(
     if others:
         name = _SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
         raise MitsimError(f"--frames {folder}: frames and their list decide; leave out {name}")
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.rig.framelist import load_frames
 
     session = load_frames(folder)  # refused before the estimator is imported
@@ -229,7 +229,7 @@ def _calibrate_frames(
         factors = calibrate_frames(session, output, job, camera)
     payload = {
         **factors.manifest.result,
-        "memory_bytes": max(peak_memory() - held, 0.0),
+        "memory_bytes": memory_since(held),
         "output": str(output),
     }
     residual, error, condition = (

@@ -272,12 +272,12 @@ def reconstruct_lines(
     place = None if chart is None else load_chart(chart)
     # What it holds is looked into later: an image of the same inputs may be replaced.
     check_output(output, overwrite=is_coloured(output))
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.study.colour.by_line import reconstruct_colours
 
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)
-    payload = {**found.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    payload = {**found.summary(), "memory_bytes": memory_since(held)}
     return finish(as_json, payload, [*found.sentences, found.output], found.warnings)
 
 

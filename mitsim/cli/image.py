@@ -85,13 +85,13 @@ def reconstruct(
     read_manifest(run, RunManifest)
     read_manifest(calibration, CalibrationManifest)
     check_output(output, overwrite=(output / IMAGE_FILE).is_file())
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
     held = memory_from_here()
     place: dict[str, Any] = {"focus": depth, "margin": margin}
     result = reconstruct_folder(run, calibration, output, strength, method, overwrite, **place)
-    payload = {**result.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    payload = {**result.summary(), "memory_bytes": memory_since(held)}
     lines = [payload["status"]]
     if result.quality is not None:
         lines.append(str(result.quality))

@@ -201,13 +201,27 @@ def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool)
         return False
     if overwrite:
         return True
-    result = read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}
-    earlier = result.get("inputs") if isinstance(result, dict) else None
+    check_same_inputs(folder, read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}, asked)
+    return True
+
+
+def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | float]) -> None:
+    """MitsimError where the image in a folder is of other inputs.
+
+    Parameters
+    ----------
+    folder
+        that holds it.
+    head
+        JSON beside it, whose ``inputs`` are its own.
+    asked
+        inputs of the new image.
+    """
+    earlier = head.get("inputs") if isinstance(head, dict) else None
     earlier = earlier if isinstance(earlier, dict) else {}
     changed = [name for name, value in asked.items() if earlier.get(name) != value]
     if changed:
         raise MitsimError(
-            f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); "
-            "choose another folder, or replace it with overwrite=True"
+            f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); choose another folder, or "
+            "replace it with overwrite=True"
         )
-    return True

@@ -16,14 +16,13 @@ from pydantic import TypeAdapter, ValidationError
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
-from mitsim.core.output import whole_file
 from mitsim.core.resources import workers
 from mitsim.core.versions import versions
 from mitsim.study import ALL, EXPERIMENTS, PAPER, find_experiment
 from mitsim.study.experiment import HEADS, Claim, Experiment, Found, Point, Scope
 from mitsim.study.folder import POINTS, check_study_folder, study_folder
 from mitsim.study.points import Shard, Store, batches
-from mitsim.study.runner import DPI
+from mitsim.study.runner import write_figures
 from mitsim.study.workers import in_processes, on_cluster
 
 # What draws is imported where it is used: a study that cannot be is refused without it.
@@ -228,9 +227,7 @@ class _Campaign:
         results = replace(store.results(self.points), measures=self.scope.measures)
         claims, figures = tuple(experiment.claims(results)), experiment.figures(results)
         results.table.write(folder / f"{experiment.name}.csv")
-        for file, figure in figures.items():
-            with whole_file(folder / file) as part:
-                figure.savefig(part, dpi=DPI, format="png")
+        write_figures(folder, figures)
         section = Section.of(experiment, self.study, self.scope, claims, figures, results)
         build_page([section], folder / f"{experiment.name}.html", experiment.title)
         rows = tuple(dict(row) for row in results.table.rows)

@@ -25,6 +25,13 @@ DPI = 150
 """Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
 
 
+def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
+    """Write ``figures``, by file name, to a ``folder``; MitsimError when one cannot be written."""
+    for file, figure in figures.items():
+        with whole_file(folder / file) as part:
+            figure.savefig(part, dpi=DPI, format="png")
+
+
 class Findings(Protocol):
     """What a study measured."""
 
@@ -108,9 +115,7 @@ def run_study(
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = findings.figures()
-        for file, figure in figures.items():
-            with whole_file(folder / file) as part:
-                figure.savefig(part, dpi=DPI, format="png")
+        write_figures(folder, figures)
         if isinstance(findings, Paged):
             from mitsim.study.page import build_findings
 
