@@ -219,7 +219,7 @@ def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | floa
     """
     earlier = head.get("inputs") if isinstance(head, dict) else None
     earlier = earlier if isinstance(earlier, dict) else {}
-    changed = [name for name, value in asked.items() if earlier.get(name) != value]
+    changed = [name for name in {**asked, **earlier} if earlier.get(name) != asked.get(name)]
     if changed:
         raise MitsimError(
             f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); choose another folder, or "
