@@ -23,9 +23,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from skimage import io
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import estimate
 from mitsim.capture.light import Light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.session import LitSession, Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest

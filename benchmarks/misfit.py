@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.capture.bench import open_bench
 from mitsim.capture.light import Light
+from mitsim.capture.opening import open_bench
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED, UNEXPLAINED_TILE
 from mitsim.reconstruct.reconstruction import reconstruct

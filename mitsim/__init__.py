@@ -18,9 +18,10 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench, open_bench
+    from mitsim.capture.bench import Bench
     from mitsim.capture.light import Light
     from mitsim.capture.modelling import calibrate_model
+    from mitsim.capture.opening import open_bench
     from mitsim.capture.plan import Plan
     from mitsim.capture.render import Rendered
     from mitsim.capture.request import Request
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 __version__ = "0.4.0"
 
 _HOMES = {
-    "open_bench": "capture.bench",
+    "open_bench": "capture.opening",
     "load_run": "core.runs",
     "load_mosaic": "core.mosaics",
     "load_calibration": "reconstruct.factors",

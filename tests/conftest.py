@@ -162,7 +162,7 @@ def shipped_bench(variant: str) -> Callable[..., object]:
     No longer: kernels of Dr.Jit hold the surfaces of every scene that is open, so one that stays open makes those of
     all later tests larger, and others than in a process that never had it: they would be compiled anew.
     """
-    from mitsim.capture.bench import open_bench
+    from mitsim.capture.opening import open_bench
 
     @cache
     def load(name: str, **defines: str) -> object:

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 
 import mitsim
+from mitsim.core.configuration import shipped
+from tests.exchanged import made
 
 PACKAGE = Path(mitsim.__file__).parent
 STAGES = {"scene", "transport", "optics", "sensor", "reconstruct"}
@@ -178,54 +180,156 @@ def test_what_checks_a_request_imports_no_numpy() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_a_refusal_imports_no_numpy(tmp_path: Path) -> None:
-    """Of a missing folder, a bad manifest, and words that are not known. (Planted: the name of the patterns read by
-    `parse_patterns`; the manifest of export read by `packed_run`.)"""
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / "manifest.json").write_text("{}")
-    (tmp_path / "bad" / "session.toml").write_text("n = 4")
-    frames = "import bad -o r --camera imx249 --exposure 1"
-    refused = (
-        "export none --format hdf5 -o x.h5",
-        "export bad --format hdf5 -o x.h5",
-        "export bad --format hdf6 -o x.h5",
-        "import none -o r",
-        "import none.mat -o r",
-        "import none.h5 -o r",
-        f"{frames} --patterns dots:3 --calibration bad",
-        f"{frames} --patterns dotz:3 --projector-pixels 8",
-        f"{frames} --patterns dots:3 --projector-pixels 8",
-        f"{frames} --patterns none.json --projector-pixels 8",
-        "calibrate --frames none -o c",
-        "calibrate --frames bad -o c",
-        "calibrate photograph --model wave --frames bad -o c",
-        "reconstruct bad --calibration bad",
-        "patterns dotz:3 -o p",
-        "study sweep photograph -o s --over x=1:2:3",
-        "study sweep photograph -o s --over patterns=dots:3,dotz:3",
-        "study sweep photograph -o s --over sheet_z=1:2:3 --measure speed",
-        "study sweep -o s",
-        "study drift -o s --over x=1",
-        "study all photograph -o s -D x=1",
-        "study all photograph -o s --shard 2/1",
-        "study patterns -o s --camera none",
-        "study accuracy photograph -o s -D x=1",
-        "study merge bad -o s",
+WITHOUT_NUMPY = (
+    "export none --format hdf5 -o x.h5",
+    "export bad --format hdf5 -o x.h5",
+    "export bad --format hdf6 -o x.h5",
+    "import none -o r",
+    "import none.mat -o r",
+    "import none.h5 -o r",
+    "import bad -o r --camera imx249 --exposure 1 --patterns dots:3 --calibration bad",
+    "import bad -o r --camera imx249 --exposure 1 --patterns dotz:3 --projector-pixels 8",
+    "import bad -o r --camera imx249 --exposure 1 --patterns dots:3 --projector-pixels 8",
+    "import bad -o r --camera imx249 --exposure 1 --patterns none.json --projector-pixels 8",
+    "calibrate --frames none -o c",
+    "calibrate --frames bad -o c",
+    "calibrate photograph --model wave --frames bad -o c",
+    "calibrate photograph --model wave -o full",
+    "calibrate photograph -o full",
+    "calibrate photograph -o full --resume",
+    "calibrate photograph -o none/c",
+    "calibrate photograph -o c --write-frames full",
+    "calibrate photograph -o c --write-frames f --recipe depths.toml",
+    "calibrate photograph -o c --colour mosaic",
+    "calibrate photograph -o c --camera endless.toml",
+    "calibrate photograph -o c --camera imx249_rggb",
+    "calibrate photograph --plan --psnr 35 --camera endless.toml",
+    "capture photograph --patterns dots:3 -o full",
+    "capture photograph --patterns dots:3 -o full --resume",
+    "capture photograph --patterns dots:3 -o none/r",
+    "capture photograph --patterns dots:3 -o x.txt",
+    "capture photograph --patterns dots:3 -o full --colour auto",
+    "capture photograph --patterns dots:3 -o full --colour lines",
+    "calibrate photograph -o full --colour lines",
+    "capture photograph --patterns dots:3 -o full --colour mosaic --camera imx249_rggb",
+    "capture photograph --patterns dots:3 -o r --colour auto --seconds 5",
+    "capture photograph --patterns dots:3 -o r --colour auto --variant llvm_ad_spectral",
+    "capture photograph --patterns dots:3 -o r --colour lines --seconds 5",
+    "capture photograph --patterns dots:3 -o r --camera endless.toml",
+    "capture photograph --patterns dots:3 -o r --camera slip.toml",
+    "capture photograph --patterns hadamard:7 -o r",
+    "plan photograph --colour auto --seconds 5",
+    "plan photograph --colour bands:2 --seconds 5",
+    "demo -o full",
+    "demo -o r --camera endless.toml",
+    "render photograph -o x.exr --estimator fast",
+    "render photograph -o x.exr --spp 0",
+    "transport photograph -o x.txt",
+    "sense x.npy --camera imx249 -o y.png",
+    "sense x.txt --camera imx249 -o y.png",
+    "sense x.txt --camera imx249 -o y.jpg",
+    "sense x.txt --camera imx249 -o y.png --wavelength 0",
+    "sense x.txt --camera imx249 -o y.png --f-number 0.1",
+    "characterise imx249 -o full",
+    "characterise imx249 -o r --pixels 3",
+    "characterise imx249 -o r --seed -1",
+    "reconstruct bad --calibration bad",
+    "reconstruct made/run --calibration made/cal -o r --lambda -1",
+    "reconstruct made/run --calibration made/cal -o r --method wiener",
+    "reconstruct made/run --calibration made/cal -o r --focus map --method tv",
+    "reconstruct made/run --calibration made/cal -o full",
+    "reconstruct made/run --calibration made/cal -o none/r",
+    "patterns dotz:3 -o p",
+    "study weather -o s",
+    "study sweep photograph -o s --over x=1:2:3",
+    "study sweep photograph -o s --over patterns=dots:3,dotz:3",
+    "study sweep photograph -o s --over seed=-1",
+    "study sweep photograph -o s --over accuracy=0,1",
+    "study sweep photograph -o s --over sheet_z=1:2:3 --measure speed",
+    "study sweep -o s",
+    "study drift -o s --over x=1",
+    "study all photograph -o s -D x=1",
+    "study all photograph -o s --shard 2/1",
+    "study patterns -o s --camera none",
+    "study patterns -o s --camera slip.toml",
+    "study patterns -o s --seed -1",
+    "study accuracy photograph -o s -D x=1",
+    "study accuracy photograph -o s --over x=1:2:3",
+    "study accuracy photograph -o full",
+    "study calibration photograph -o s --camera endless.toml",
+    "study solver -o full",
+    "study merge bad -o s",
+)
+"""Of a folder that is missing or holds something, a bad manifest, and words that are not known."""
+WITHOUT_RENDERER = (
+    "study sweep photograph -o full --over sheet_z=1:2:3",
+    "study drift -o full",
+    "study colour -o full",
+    "study all -o full",
+    "study patterns -o full",
+    "plan photograph --projector slip.toml",
+    "study patterns -o s --projector slip.toml",
+    "plan photograph --camera imx249_rggb",
+    "capture photograph --patterns dots:3 -o r --colour bands:4",
+    "capture photograph --patterns dots:3 -o r --colour lines --projector rainbow.toml",
+    "calibrate photograph -o c --colour lines --projector rainbow.toml",
+    "calibrate photograph -o c -D mask=flatcam --camera masked.toml",
+)
+"""The same of models that count in numpy's arrays."""
+
+
+@pytest.fixture(scope="module")
+def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with inputs that cannot be used, a run and its calibration."""
+    folder = tmp_path_factory.mktemp("refusing")
+    (folder / "x.txt").write_text("mine")
+    (folder / "full").mkdir()
+    (folder / "full" / "letter.txt").write_text("mine")
+    (folder / "bad").mkdir()
+    (folder / "bad" / "manifest.json").write_text("{}")
+    (folder / "bad" / "session.toml").write_text("n = 4")
+    camera = shipped("calibration", "imx249.toml").read_text()
+    (folder / "endless.toml").write_text(re.sub(r"(?m)^full_well_e = .*", "full_well_e = inf", camera))
+    (folder / "slip.toml").write_text(re.sub(r"(?m)^bits = .*", "bits = 5", camera))
+    (folder / "masked.toml").write_text(f'{camera}\n[mask]\nkind = "separable"\nfeature_mm = 0.03\n')
+    waves = range(450, 651, 50)
+    (folder / "rainbow.toml").write_text(
+        f'name = "x"\neffective_wavelength_nm = 550\nwavelengths_nm = {[float(wave) for wave in waves]}\n'
+        f"radiant_shares = {[0.2 for _ in waves]}\n"
     )
+    recipe = shipped("calibration", "session.toml").read_text()
+    (folder / "depths.toml").write_text(f"depths = [350.0, 400.0]\n{recipe}")
+    made(folder / "made")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("lines", "heavy"),
+    [
+        (WITHOUT_NUMPY, {"numpy"}),
+        (WITHOUT_RENDERER, {"mitsuba", "drjit", "scipy", "matplotlib", "skimage"}),
+    ],
+    ids=["numpy", "renderer"],
+)
+def test_a_refusal_imports_nothing_heavy(refusing: Path, lines: tuple[str, ...], heavy: set[str]) -> None:
+    """And leaves nothing behind. (Planted: the name of the patterns read by `parse_patterns`; the manifest of export
+    read by `packed_run`; outputs looked at once the bench is open; a check of an output that leaves its folder.)"""
+    before = sorted(refusing.rglob("*"))
     program = f"""
 import sys
 from mitsim.cli import run
-for line in {refused!r}:
+for line in {lines!r}:
     sys.argv = ["mitsim", *line.split()]
     try:
         run()
     except SystemExit as ended:
         assert ended.code == 2, line
-    assert 'numpy' not in sys.modules, line
+    assert not {heavy!r} & set(sys.modules), line
 """
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", program], cwd=refusing, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("mitsim: ") == len(refused)
+    assert done.stderr.count("mitsim: ") == len(lines)
+    assert sorted(refusing.rglob("*")) == before
 
 
 def test_importing_every_module_selects_no_variant_and_touches_no_global_state() -> None:

@@ -183,7 +183,7 @@ def measured_responses() -> dict[str, object]:
 
 def exchanged_file() -> dict[str, object]:
     """The files that docs/exchange.md reads."""
-    from mitsim.capture.bench import open_bench
+    from mitsim.capture.opening import open_bench
     from mitsim.exchange.export import export_run
 
     bench = made(Path())

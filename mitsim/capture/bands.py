@@ -26,11 +26,11 @@ import numpy as np
 from mitsim.capture.colour import ColourBench, line_alone, plan_lines
 from mitsim.capture.evidence import Settings
 from mitsim.capture.plan import ColourCandidate, ColourChoice, Plan
+from mitsim.capture.request import check_untimed
 from mitsim.capture.run import plan_request
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colours import BANDS, LINES, MONO, MOST_LINES, RUN, bands_of, spectral_of
-from mitsim.core.errors import ArgumentError
+from mitsim.core.colours import BANDS, LINES, MONO, MOST_LINES, RUN, bands_of, check_undecided, spectral_of
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Lines
@@ -88,14 +88,8 @@ def choose_colour(bench: Bench, request: Request) -> Coloured:
     MitsimError
         as there.
     """
-    if request.seconds is not None:
-        raise ArgumentError(
-            "seconds", f"{request.seconds:g}: colours are chosen by an accuracy; give one, or say which colour"
-        )
-    if bench.variant.endswith("_spectral"):
-        raise ArgumentError(
-            "variant", f"{bench.variant}: open the bench with a mono variant; colours are looked at too"
-        )
+    check_untimed(request.seconds)
+    check_undecided(bench.variant)
     started, runs = time.perf_counter(), _runs(bench)
     if _in_greys(bench):
         errors, spectral = {name: 0.0 for name in runs if name in (MONO, LINES)}, None

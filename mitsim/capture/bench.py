@@ -1,4 +1,4 @@
-"""An optical bench, ready to use: scene, camera and projector files in, one object that holds them all out."""
+"""An optical bench, ready to use: a loaded scene, camera and projector in; plans, light, frames and factors out."""
 
 from __future__ import annotations
 
@@ -8,13 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-# What needs numpy, or the renderer, is imported where it is used: a misspelt name is refused without them.
-from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
-from mitsim.core.environment import DEFAULT_VARIANT, load_variant
-from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.files import SceneFiles
-from mitsim.scene.guard.outline import Outline
-
+# What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
     from mitsim.capture.bands import Coloured
     from mitsim.capture.glint import Glint
@@ -36,9 +30,6 @@ if TYPE_CHECKING:
     from mitsim.rig.sensor import SensorModel
     from mitsim.scene.load import LoadedScene
     from mitsim.transport.projector import ProjectorOptics
-
-_PITCH_TOLERANCE = 1e-3
-"""Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
 
 _SPECKLED_SHOTS = 8
 """Shots whose contrast stands for a family's: those of dots differ by less than a percent, by where the window ends."""
@@ -219,13 +210,10 @@ class Bench:
 
     def in_variant(self, variant: str) -> Bench:
         """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
-        not be used with it. MitsimError as :func:`open_bench`."""
-        from mitsim.rig.profile import load_mask
+        not be used with it. MitsimError as :func:`mitsim.open_bench`."""
+        from mitsim.capture.opening import reopened
 
-        loaded, camera = _loaded(variant, self.loaded.path, self.defines, outside=True), Path(self.rig.camera_file)
-        if (mask := load_mask(camera)) is not None:
-            loaded.camera.wear(mask.worn(loaded.camera.geometry, camera.parent))
-        return replace(self, loaded=loaded, variant=variant)
+        return reopened(self, variant)
 
     def in_bands(self, count: int) -> Bench:
         """The same bench whose projector has ``count`` bands of its lines as lines; MitsimError as
@@ -672,118 +660,3 @@ class Bench:
         bare = replace(self.loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False)
         alone = replace(bare, unfit=Unfit(), shapes=(), coloured=())
         return replace(self, loaded=alone)
-
-
-def check_scene(scene: Path | str, defines: Mapping[str, str], outside: bool = False) -> Path:
-    """Where a scene lies, which is refused without the renderer where that is possible.
-
-    Parameters
-    ----------
-    scene
-        as of :func:`open_bench`.
-    defines
-        values of its parameters by name.
-    outside
-        as ``allow_outside_files`` there.
-
-    Raises
-    ------
-    MitsimError
-        for a scene that there is not, a parameter that it does not have, and XML that is not well-formed.
-    """
-    path = locate(scene, "scenes", "scene.xml")
-    Outline(path, defines, SceneFiles(path, outside))
-    return path
-
-
-def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
-    """Files of a ``camera`` and a ``projector``, as of :func:`open_bench`; MitsimError for one that there is not."""
-    found = ((camera, DEFAULT_CAMERA), (projector, "mp_cl1"))
-    first, second = (locate(default if name is None else name, "calibration", ".toml") for name, default in found)
-    return first, second
-
-
-def open_bench(
-    scene: Path | str,
-    variant: str = DEFAULT_VARIANT,
-    camera: Path | str | None = None,
-    projector: Path | str | None = None,
-    allow_outside_files: bool = False,
-    for_render: bool = False,
-    **parameters: object,
-) -> Bench:
-    """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
-
-    Parameters
-    ----------
-    scene
-        name of a shipped scene, or path of a scene XML or of the folder that holds it (``./name`` for a folder that is
-        called like a shipped scene).
-    variant
-        of Mitsuba.
-    camera, projector
-        name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1.
-    allow_outside_files
-        whether the scene may read files outside its folder.
-    for_render
-        only light matters: the camera's electronics need not fit, and the scene needs no projector.
-    **parameters
-        values of the scene's ``<default>`` parameters, text or numbers.
-
-    Raises
-    ------
-    MitsimError
-        for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
-        scene's where the camera file has one.
-    """
-    defines = {name: _text(value) for name, value in parameters.items()}
-    path = check_scene(scene, defines, allow_outside_files)
-    sensor_path, projector_path = check_devices(camera, projector)
-    from mitsim.rig.profile import load_mask
-    from mitsim.rig.projector import ProjectorModel
-    from mitsim.rig.rig import Rig
-    from mitsim.rig.sensor import load_sensor
-
-    sensor, mask = load_sensor(sensor_path), load_mask(sensor_path)
-    light = load_model(projector_path, ProjectorModel)
-    # All lines at once behind colour filters are for variants that tell them apart.
-    if not for_render and not (sensor.mosaic and variant.endswith("_spectral")):
-        try:
-            sensor.efficiency(light.effective_wavelength_nm)
-        except MitsimError as error:
-            raise MitsimError(f"camera {sensor_path}: {error}") from None
-    # Only now, with all else checked: the renderer takes a second to import.
-    loaded = _loaded(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
-    row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning
-    of_rows, of_columns = zip((row_um, sensor.superpixel_pitch_um), loaded.camera.geometry.pitches, strict=True)
-    for name, (um, stated) in (("pixel_pitch", of_columns), ("row_pitch", of_rows)):
-        if not for_render and abs(um * 1e-3 - stated) > _PITCH_TOLERANCE * stated:
-            raise MitsimError(
-                f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {um:g} um, but {scene} has "
-                f"{stated * 1e3:g} um; use the camera of that scene, or change {name}, or binning"
-            )
-    if mask is not None:
-        if "mask" in defines:
-            raise MitsimError(
-                f"camera {sensor_path}: has a table [mask], and the scene's mask was set to {defines['mask']!r} as "
-                "well; give one of the two"
-            )
-        loaded.camera.wear(mask.worn(loaded.camera.geometry, sensor_path.parent))
-    rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
-    return Bench(loaded, rig, variant, defines)
-
-
-def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:
-    """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
-    mitsuba = load_variant(variant)
-    from mitsim.scene.load import load_scene
-    from mitsim.transport import plugins
-
-    mitsuba.set_log_level(mitsuba.LogLevel.Error)
-    plugins.register()
-    return load_scene(path, defines, **options)
-
-
-def _text(value: object) -> str:
-    """A parameter as a scene spells it."""
-    return str(value).lower() if isinstance(value, bool) else str(value)

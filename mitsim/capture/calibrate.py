@@ -31,7 +31,7 @@ from mitsim.core.output import output_folder, whole_folder
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
-from mitsim.core.versions import DECIDING, versions
+from mitsim.core.versions import deciding_versions, versions
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
@@ -71,18 +71,8 @@ def calibrate(
     MitsimError
         as there.
     """
-    session = Session(bench, of_one_depth(recipe or load_recipe()), seed)
+    session = Session(bench, (recipe or load_recipe()).of_one_depth(), seed)
     return calibrate_session(session, accuracy, output, resume, job or Job())
-
-
-def of_one_depth(recipe: SessionRecipe) -> SessionRecipe:
-    """The ``recipe`` of one calibration; MitsimError where it has depths."""
-    if recipe.depths:
-        raise MitsimError(
-            f"recipe: has {len(recipe.depths)} depths, and this makes one calibration; use calibrate_depths, or leave "
-            "depths out"
-        )
-    return recipe
 
 
 def calibrate_depths(
@@ -148,7 +138,7 @@ def write_session(
     MitsimError
         as there, for a recipe with depths, a folder that holds something, and a disk without room.
     """
-    session = Session(bench, of_one_depth(recipe or load_recipe()), seed)
+    session = Session(bench, (recipe or load_recipe()).of_one_depth(), seed)
     with whole_folder(frames) as folder:
         number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
         size = Cost(disk_bytes=float(session.shots * math.prod(bench.geometry.frame_shape) * number_bytes))
@@ -171,7 +161,7 @@ def calibrate_session(
         folder that its frames are written to.
     """
     bench, recipe = session.bench, session.recipe
-    Exposure(None, recipe.exposure_fraction).check(bench.rig)
+    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
     configuration = {
         **bench.provenance(),
         **bench.identity(),
@@ -179,7 +169,7 @@ def calibrate_session(
         "seed": session.seed,
         **({} if session.depth is None else {"depth_mm": session.depth}),
         "recipe": recipe.model_dump(exclude_defaults=True, exclude={"depths"}),
-        "versions": {name: version for name, version in versions().items() if name in DECIDING},
+        "versions": deciding_versions(),
     }
     if session.depth is not None and resume and output is not None and is_finished(output, configuration):
         return load_calibration(output)

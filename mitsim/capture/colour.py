@@ -21,11 +21,12 @@ from mitsim.capture.evidence import Settings
 from mitsim.capture.lamplight import lit_by_lamps
 from mitsim.capture.light import Light, trace_lines
 from mitsim.capture.plan import Plan
+from mitsim.capture.request import check_untimed
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
 from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import trace_truths
-from mitsim.core.colours import MOST_LINES, RUN, ColourManifest, Line, spectral_of, write_colours
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.colours import RUN, ColourManifest, Line, spectral_of, write_colours
+from mitsim.core.errors import ArgumentError
 from mitsim.core.job import Job
 from mitsim.core.output import output_folder
 from mitsim.core.seeds import integer
@@ -65,12 +66,7 @@ class ColourBench:
         if not bench.variant.endswith("_spectral"):
             needed = spectral_of(bench.variant)
             raise ArgumentError("variant", f"{bench.variant}: knows no wavelengths; open the bench with {needed}")
-        lines = bench.projector.lines
-        if len(lines.shares) > MOST_LINES:
-            raise MitsimError(
-                f"colour: projector {bench.projector.name} has {len(lines.shares)} lines, and a path carries "
-                f"{MOST_LINES}; give bands, bands:{MOST_LINES} at most, or leave colour out"
-            )
+        lines = bench.projector.traced_lines
         named = [
             Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
             for wavelength, share in zip(lines.wavelengths_nm, lines.shares, strict=True)
@@ -159,7 +155,7 @@ def capture_lines(
     """
     job = job or Job()
     colours = ColourBench.of(bench, RUN)
-    refuse(request)
+    check_untimed(request.seconds)
     colours = colours.lit_by_lamps(request.effects, request.seed)
     with claimed(output, colours.manifest, resume) as places:
         for each, place in zip(colours.benches, places, strict=True):
@@ -178,7 +174,7 @@ def line_alone(bench: Bench, line: Lines) -> Bench:
 def plan_lines(colours: ColourBench, request: Request) -> Plan:
     """The plan of all lines of ``colours`` together, which is that of the roughest, for a ``request``. MitsimError for
     what is not simulated in colour."""
-    refuse(request)
+    check_untimed(request.seconds)
     lighting = colours.whole.family(request.patterns, request.seed).lighting
     roughest = colours.lit_by_lamps(request.effects, request.seed).roughest(request.seed, _lit(lighting))
     plan = plan_request(roughest, request)
@@ -222,12 +218,6 @@ def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | 
 def _lit(lighting: Lighting) -> float:
     """Part of the projector's pixels that a shot of a ``lighting`` lights, in the mean."""
     return float(np.mean(lighting.weights.mean(axis=0)[lighting.labels]))
-
-
-def refuse(request: Request) -> None:
-    """MitsimError where a ``request`` asks for what is not simulated in colour."""
-    if request.seconds is not None:
-        raise ArgumentError("seconds", f"{request.seconds:g}: runs in colour are not planned by time; give an accuracy")
 
 
 @contextmanager

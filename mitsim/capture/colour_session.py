@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsim.capture.calibrate import calibrate_session, of_one_depth
+from mitsim.capture.calibrate import calibrate_session
 from mitsim.capture.colour import ColourBench, claimed
 from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
@@ -49,7 +49,7 @@ def calibrate_lines(
         as there.
     """
     colours = ColourBench.of(bench, CALIBRATION)
-    sessions = line_sessions(colours, of_one_depth(recipe or load_recipe()), seed)
+    sessions = line_sessions(colours, (recipe or load_recipe()).of_one_depth(), seed)
     return run_sessions(colours, sessions, accuracy, output, resume, job or Job())
 
 

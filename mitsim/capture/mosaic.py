@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.colour import ColourBench, refuse, traced_lines
+from mitsim.capture.colour import ColourBench, traced_lines
 from mitsim.capture.light import Light
+from mitsim.capture.request import check_untimed
 from mitsim.capture.run import capture, check_run
 from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import Truth
@@ -220,7 +221,7 @@ def capture_mosaic(
     job, whole = job or Job(), MosaicBench.of(bench)
     colours = ColourBench.of(whole, MOSAIC)
     manifest = _manifest(whole, colours)
-    refuse(request)
+    check_untimed(request.seconds)
     _refuse_lamps(whole, request)
     _refuse_speckle(whole, request)
     place = None if output is None else Path(output)
@@ -275,10 +276,9 @@ def calibrate_mosaic(
         )
     passed = behind(weights, bench.geometry.frame_shape)
     recipe = recipe or load_recipe().model_copy(update={"repeats": _REPEATS})
-    from mitsim.capture.calibrate import of_one_depth  # captures need neither
     from mitsim.capture.colour_session import line_sessions, run_sessions
 
-    sessions = line_sessions(colours, of_one_depth(recipe), seed, list(passed))
+    sessions = line_sessions(colours, recipe.of_one_depth(), seed, list(passed))
     return run_sessions(colours, sessions, accuracy, output, resume, job or Job())
 
 

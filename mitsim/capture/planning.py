@@ -13,8 +13,9 @@ from mitsim.capture.affordable import FIRST_LOOK, affordable, told
 from mitsim.capture.bench import Bench
 from mitsim.capture.choice import Candidates, cheapest, doubt
 from mitsim.capture.cost import frame_seconds
+from mitsim.capture.decision import SceneFacts, decide
 from mitsim.capture.evidence import GROUPS, Evidence
-from mitsim.capture.plan import Plan, SceneFacts, decide
+from mitsim.capture.plan import Plan
 from mitsim.capture.request import check_accuracy
 from mitsim.capture.simulation import AT_ANCHORS, Simulation, Stage
 from mitsim.core.arrays import Labels

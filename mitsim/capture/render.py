@@ -16,8 +16,9 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.planning import make_plan
+from mitsim.capture.request import FEWEST_PASSES, REFERENCE, check_samples
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.job import Job
 from mitsim.core.resources import Cost
@@ -28,16 +29,11 @@ from mitsim.rig.patterns import Lighting
 if TYPE_CHECKING:
     from mitsim.scene.load import LoadedScene
 
-ESTIMATORS = ("reference", "factored")
 _SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
 """The others of Mitsuba 3.9.1 order their strata by a hash that is no random permutation of few of them: some two of a
 path's numbers correlate, over 2^19 paths by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 a pixel."""
 _SAMPLES_A_PASS = 64
 """Samples a pixel of one pass: 2^24 paths of a 512 x 512 sensor, which fit in memory."""
-_FEWEST_PASSES = 4
-"""Passes are compared to tell the noise; four tell it to 40 %."""
-_MOST_SAMPLES = 2**20
-"""An error of a thousandth of one sample's: an hour a pixel row, beyond use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +122,9 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
 
     if loaded.unfit.reference is not None:
         raise loaded.unfit.reference
-    if not _FEWEST_PASSES <= spp <= _MOST_SAMPLES:
-        raise ArgumentError("spp", f"{spp}: give at least {_FEWEST_PASSES} samples a pixel, at most {_MOST_SAMPLES}")
+    check_samples(REFERENCE, spp)
     job = job or Job()
-    passes = max(_FEWEST_PASSES, math.ceil(spp / _SAMPLES_A_PASS))
+    passes = max(FEWEST_PASSES, math.ceil(spp / _SAMPLES_A_PASS))
     each = math.ceil(spp / passes)
     total: FloatArray | float = 0.0
     squares: FloatArray | float = 0.0
@@ -212,11 +207,10 @@ def render(
         as there.
     """
     job = job or Job()
-    if estimator not in ESTIMATORS:
-        raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
+    check_samples(estimator, spp)
     warnings: tuple[str, ...] = ()
     started = time.perf_counter()
-    if estimator == "reference":
+    if estimator == REFERENCE:
         mean, error = reference(bench.loaded, spp, seed, job)
         warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
         warnings += _of_sampler(bench.loaded)
@@ -233,7 +227,7 @@ def render(
         warnings += ("the frame is wholly dark; check the scene's light, the mask and the field stop",)
     facts = {
         "estimator": estimator,
-        "spp": spp if estimator == "reference" else None,
+        "spp": spp if estimator == REFERENCE else None,
         "seconds": time.perf_counter() - started,
         "variant": bench.variant,
         "seed": seed,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -13,7 +14,7 @@ from mitsim.core.configuration import validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
 from mitsim.rig.families import NAMES, check_patterns
-from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S
+from mitsim.rig.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
 if TYPE_CHECKING:
     from mitsim.rig.rig import Rig
@@ -25,6 +26,12 @@ LONGEST_S = 1e6
 """Seconds that may be asked for: eleven days, far beyond what any accuracy takes."""
 PSNR_DB = 1.0, 100.0
 """PSNR that may be asked of an image: below, its error is its whole range; above, the truth is not known."""
+REFERENCE, FACTORED = ESTIMATORS = ("reference", "factored")
+"""Of the expected irradiance."""
+FEWEST_PASSES = 4
+"""Passes of the reference are compared to tell the noise; four tell it to 40 %."""
+MOST_SAMPLES = 2**20
+"""An error of a thousandth of one sample's: an hour a pixel row, beyond use."""
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
 
@@ -46,17 +53,17 @@ class Exposure:
                 "exposure_fraction", f"{self.fraction:g}: give a part of the full well, {least:g} to {most:g}"
             )
 
-    def check(self, rig: Rig) -> None:
-        """MitsimError when the camera of ``rig`` sees through colour filters, whose frames are captured otherwise, or
-        the time is to follow from a full well that it does not have."""
-        if rig.sensor.mosaic is not None:
+    def check(self, sensor: SensorModel, camera_file: Path | str) -> None:
+        """MitsimError when the ``sensor``, of a ``camera_file``, sees through colour filters, whose frames are captured
+        otherwise, or the time is to follow from a full well that it does not have."""
+        if sensor.mosaic is not None:
             raise MitsimError(
-                f"camera {rig.camera_file}: has a mosaic {rig.sensor.mosaic}, whose frames show all lines at once; "
+                f"camera {camera_file}: has a mosaic {sensor.mosaic}, whose frames show all lines at once; "
                 "capture and calibrate it with --colour mosaic, in Python capture_mosaic and calibrate_mosaic"
             )
-        if self.seconds is None and not math.isfinite(rig.sensor.full_well_e):
+        if self.seconds is None and not math.isfinite(sensor.full_well_e):
             raise MitsimError(
-                f"camera {rig.camera_file}: full_well_e is inf, so there is no full well to fill; "
+                f"camera {camera_file}: full_well_e is inf, so there is no full well to fill; "
                 "give a finite one, or an exposure in seconds"
             )
 
@@ -84,6 +91,23 @@ def check_psnr(psnr: float) -> float:
     if not PSNR_DB[0] <= psnr <= PSNR_DB[1]:
         raise ArgumentError("psnr", f"{psnr:g}: give {PSNR_DB[0]:g} to {PSNR_DB[1]:g} dB")
     return psnr
+
+
+def check_samples(estimator: str, spp: int) -> None:
+    """ArgumentError for an ``estimator`` that there is not, or too few or too many samples ``spp`` a pixel of the
+    reference."""
+    if estimator not in ESTIMATORS:
+        raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
+    if estimator == REFERENCE and not FEWEST_PASSES <= spp <= MOST_SAMPLES:
+        raise ArgumentError("spp", f"{spp}: give at least {FEWEST_PASSES} samples a pixel, at most {MOST_SAMPLES}")
+
+
+def check_untimed(seconds: float | None) -> None:
+    """ArgumentError where a run in colour is to take so many ``seconds``."""
+    if seconds is not None:
+        raise ArgumentError(
+            "seconds", f"{seconds:g}: runs in colour are not planned by time; give an accuracy, or leave colour out"
+        )
 
 
 class Request(BaseModel):

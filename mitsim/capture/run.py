@@ -31,7 +31,7 @@ from mitsim.core.output import FRAMES
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.recorders import AMBIENT, Recorder, RunMemory, check_same, claimed, frame_name
 from mitsim.core.runs import Capture
-from mitsim.core.versions import DECIDING, versions
+from mitsim.core.versions import deciding_versions, versions
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import Lighting, PatternFamily
@@ -147,7 +147,7 @@ def capture(
     job = job or Job()
     spent = job.clock.seconds()
     starting = spent["total"] - spent.get("plan", 0.0)  # a plan that was made already has its own seconds
-    request.timing.check(bench.rig)
+    request.timing.check(bench.sensor, bench.rig.camera_file)
     family = bench.family(request.patterns, request.seed)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     lighting = family.lighting
@@ -228,15 +228,14 @@ def check_run(bench: Bench, request: Request, output: Path | None, resume: bool)
     MitsimError
         for another configuration, and an exposure that the camera cannot have.
     """
-    request.timing.check(bench.rig)
+    request.timing.check(bench.sensor, bench.rig.camera_file)
     if output is not None and resume and (output / MANIFEST).is_file():
         check_same(output, RunHead.of(_configuration(bench, request)))
 
 
 def _configuration(bench: Bench, request: Request) -> dict[str, Any]:
     """All that decides the frames."""
-    deciding = {name: version for name, version in versions().items() if name in DECIDING}
-    return {**bench.provenance(), **bench.identity(), **request.deciding, "versions": deciding}
+    return {**bench.provenance(), **bench.identity(), **request.deciding, "versions": deciding_versions()}
 
 
 @contextmanager

@@ -15,24 +15,18 @@ from typing import Any
 import numpy as np
 
 from mitsim.capture.request import Exposure
+from mitsim.capture.sensing import check_ending, check_f_number, check_image, check_wavelength
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.output import whole_file
-from mitsim.core.plainfile import check_plain
 from mitsim.core.seeds import stream
 from mitsim.core.versions import versions
 from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak
 
-ENDINGS = (".png", ".exr", ".npy")
-"""Files that digital numbers are written to."""
 _LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
 """Weights of linear RGB in luminance (ITU-R BT.709)."""
-_LARGEST_PNG = 2**16 - 1
-"""What 16 bits of grey hold."""
-_WAVELENGTHS_NM = 1.0, 1e6
-"""As a projector's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +89,7 @@ class Sensed:
         MitsimError for another ending, for a PNG of numbers that 16 bits do not hold, or where nothing can be written.
         """
         path = Path(path)
-        check_ending(path)
+        check_ending(path, self.sensor)
         if path.suffix.lower() == ".exr":
             whole = self.digital.dtype == np.uint32
             numbers: Channel = self.digital.astype(np.uint32) if whole else self.digital.astype(np.float32)
@@ -107,7 +101,6 @@ class Sensed:
             with whole_file(path) as part, open(part, "wb") as file:
                 np.save(file, self.digital, allow_pickle=False)
             return path
-        _check_png(path, self.sensor)
         from PIL import Image
 
         with whole_file(path) as part:
@@ -146,9 +139,7 @@ def sense(
         for an image that is no frame of numbers from 0, no light where the exposure is to follow from it, or a camera
         whose file has no quantum efficiency.
     """
-    low, high = _WAVELENGTHS_NM
-    if not low <= wavelength_nm <= high:
-        raise ArgumentError("wavelength", f"{wavelength_nm:g}: give {low:g} to {high:g} nm")
+    check_wavelength(wavelength_nm)
     light = np.asarray(irradiance, dtype=np.float64)
     if light.ndim != 2 or not light.size or not (light.min() >= 0 and light.max() < np.inf):
         shown = f"the range is {light.min()} to {light.max()}" if light.size else "it is empty"
@@ -173,15 +164,13 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
     missing, damaged or of another kind, or a channel that is not there.
     """
     path = Path(path)
+    check_image(path)
     if path.suffix.lower() == ".npy":
-        check_plain(path, "image")
         try:
             values = np.load(path, allow_pickle=False)
             return np.asarray(values, dtype=np.float64), ()
         except (ValueError, TypeError, EOFError) as error:
             raise MitsimError(f"image {path}: not an array of numbers ({error}); save one by numpy.save") from error
-    if path.suffix.lower() != ".exr":
-        raise MitsimError(f"image {path}: give an OpenEXR (.exr) or NumPy (.npy) file")
     channels = {name: values for name, values in read_frame(path)[0].items() if not name.startswith("error.")}
     return _light_of(channels, channel, path)
 
@@ -207,22 +196,5 @@ def irradiance_behind_lens(radiance: FloatArray, f_number: float) -> FloatArray:
     f_number
         N, 0.5 or more; ArgumentError otherwise.
     """
-    if not 0.5 <= f_number < math.inf:
-        raise ArgumentError("f_number", f"{f_number:g}: no lens in air is below 0.5; give its f-number")
+    check_f_number(f_number)
     return np.asarray(radiance * (math.pi / (4 * f_number**2)))
-
-
-def check_ending(path: Path, sensor: SensorModel | None = None) -> None:
-    """MitsimError for a ``path`` that no frame is written to, or whose kind cannot hold a ``sensor``'s numbers."""
-    if path.suffix.lower() not in ENDINGS:
-        raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")
-    if sensor is not None and path.suffix.lower() == ".png":
-        _check_png(path, sensor)
-
-
-def _check_png(path: Path, sensor: SensorModel) -> None:
-    if sensor.largest_dn is None or sensor.largest_dn > _LARGEST_PNG:
-        numbers = "real numbers" if sensor.largest_dn is None else f"numbers up to {sensor.largest_dn}"
-        raise MitsimError(
-            f"output {path}: sensor {sensor.name!r} gives {numbers}, 16 bits end at {_LARGEST_PNG}; use .exr"
-        )

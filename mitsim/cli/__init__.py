@@ -22,6 +22,7 @@ from mitsim.cli.colour import (
     NO,
     Colour,
     by_line,
+    check_colour,
     chosen_of,
     in_colour,
     of_capture,
@@ -50,6 +51,8 @@ from mitsim.cli.options import (
     Seed,
     Variant,
     bench_of,
+    check_camera,
+    check_work,
     job_of,
     number_of,
     request_of,
@@ -141,7 +144,11 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
+    from mitsim.study.folder import check_study_folder
+
     request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
+    check_study_folder(output, "demo")
+    check_camera(camera, request.timing)
     with job_of(quiet or as_json) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
@@ -172,6 +179,7 @@ def plan(
     from mitsim.core.resources import running_seconds
 
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
+    check_colour(colour, variant, projector, seconds)
     bench = bench_of(scene, variant_for(colour, variant, camera), camera, projector, define, outside)
     starting = running_seconds()
     plan = plan_of(bench, colour, request).taking(start=starting)
@@ -213,7 +221,7 @@ def capture(
     quiet: Quiet = False,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.core.resources import memory_from_here, memory_since
 
     request = request_of(
         patterns=patterns,
@@ -228,6 +236,10 @@ def capture(
         ambient_shots=ambient_shots,
     )
     traced_in = variant_for(colour, variant, camera)
+    check_work(output, resume, several=by_line(colour) or colour == AUTO)
+    check_colour(colour, variant, projector, seconds)
+    if colour != MOSAIC:
+        check_camera(camera, mitsim.Request.of(**request).timing)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
@@ -236,19 +248,19 @@ def capture(
         if colour == MOSAIC:
             seen = bench.capture_mosaic(request.pop("patterns"), output, resume, job, **request)
             payload, lines = of_mosaic(seen)
-            payload["memory_bytes"] = max(peak_memory() - held, 0.0)
+            payload["memory_bytes"] = memory_since(held)
             return finish(as_json, payload, lines, seen.warnings)
         what, more = request.pop("patterns"), request
         if colour == AUTO:
-            bench, what, colour = chosen_of(bench, {"patterns": what, **request}, job, output, resume)
+            bench, what, colour = chosen_of(bench, {"patterns": what, **request}, job)
             more = {}
         if by_line(colour):
             runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **more)
             payload, lines = of_capture(runs, output)
-            payload["memory_bytes"] = max(peak_memory() - held, 0.0)
+            payload["memory_bytes"] = memory_since(held)
             return finish(as_json, payload, lines, payload["warnings"])
         shots = bench.capture(what, output, resume, job, **more)
-    payload = {**shots.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    payload = {**shots.summary(), "memory_bytes": memory_since(held)}
     taken = payload["seconds"]
     lines = [
         f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {taken['total']:.1f} s "
@@ -296,11 +308,13 @@ def render(
     quiet: Quiet = False,
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
+    from mitsim.capture.request import check_samples
     from mitsim.core.output import prepare_output
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
     request = request_of(accuracy=accuracy, seed=seed, effects=effects)
+    check_samples(estimator, spp)
     method: Any = estimator
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         place = prepare_output(output, overwrite=True, kind="file")

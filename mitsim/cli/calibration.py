@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.cli.colour import MOSAIC, NO, Colour, in_colour, of_calibration, variant_for
+from mitsim.cli.colour import MOSAIC, NO, Colour, check_colour, in_colour, of_calibration, variant_for
 from mitsim.cli.modelling import calibrate_model, modelling_of
 from mitsim.cli.options import (
     DAY,
@@ -28,6 +28,8 @@ from mitsim.cli.options import (
     Seed,
     Variant,
     bench_of,
+    check_camera,
+    check_work,
     is_given,
     job_of,
     request_of,
@@ -112,11 +114,16 @@ def calibrate(
         return _calibrate_frames(frames, check_no_plan(None, None, output), camera, others, as_json, quiet)
     if scene is None:
         raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.capture.request import Exposure
+    from mitsim.core.output import check_output
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.rig.recipe import load_recipe
 
     request = request_of(accuracy=accuracy, seed=seed)
     session = load_recipe(recipe)
+    exposure = Exposure(None, session.exposure_fraction)
+    if planning or write_frames is not None or colour != NO:
+        session.of_one_depth()
     if write_frames is not None and resume:
         raise MitsimError("--write-frames: a resumed session shows its finished patterns no more; leave out --resume")
     if colour != NO and write_frames is not None:
@@ -129,11 +136,18 @@ def calibrate(
         if colour != NO:
             raise MitsimError(f"--colour {colour}: --plan is for light that is not told apart; leave one of them out")
         wanted = Wanted.of(psnr, patterns, output, resume)
+        check_camera(camera, exposure)
         with job_of(quiet or as_json, max_seconds, max_memory) as job:
             with job.clock.stage("open scene"):
                 bench = bench_of(scene, variant, camera, projector, define, outside)
             return wanted.planned(bench, session, request, job, as_json)
     folder, traced_in = check_no_plan(psnr, patterns, output), variant_for(colour, variant, camera)
+    check_work(folder, resume, several=colour != NO or bool(session.depths))
+    if write_frames is not None:
+        check_output(write_frames)
+    check_colour(colour, variant, projector)
+    if colour != MOSAIC:
+        check_camera(camera, exposure)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
@@ -145,7 +159,7 @@ def calibrate(
             shown = None if recipe is None else session
             colours = by_line(**request, recipe=shown, output=folder, resume=resume, job=job)
             payload, lines = of_calibration(colours, folder)
-            payload["memory_bytes"] = max(peak_memory() - held, 0.0)
+            payload["memory_bytes"] = memory_since(held)
             return finish(as_json, payload, lines, payload["warnings"])
         whole: dict[str, Any] = {**request, "recipe": session, "output": folder, "job": job}
         if write_frames is not None:
@@ -154,7 +168,7 @@ def calibrate(
             found = [*bench.calibrate_depths(**whole, resume=resume).values()]
         else:
             found = [bench.calibrate(**whole, resume=resume)]
-    taken = max(peak_memory() - held, 0.0)
+    taken = memory_since(held)
     places = [str(folder / f"{depth:g}") for depth in session.depths] or [str(folder)]
     payloads = [
         {**factors.manifest.result, "memory_bytes": taken, "output": place}
@@ -204,7 +218,7 @@ def _calibrate_frames(
     if others:
         name = _SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
         raise MitsimError(f"--frames {folder}: frames and their list decide; leave out {name}")
-    from mitsim.core.resources import memory_from_here, peak_memory
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.rig.framelist import load_frames
 
     session = load_frames(folder)  # refused before the estimator is imported
@@ -215,7 +229,7 @@ def _calibrate_frames(
         factors = calibrate_frames(session, output, job, camera)
     payload = {
         **factors.manifest.result,
-        "memory_bytes": max(peak_memory() - held, 0.0),
+        "memory_bytes": memory_since(held),
         "output": str(output),
     }
     residual, error, condition = (

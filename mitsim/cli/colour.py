@@ -16,7 +16,9 @@ from mitsim.core.colours import (
     LINES,
     RUN,
     bands_of,
+    check_undecided,
     check_way,
+    is_coloured,
     is_mosaic,
     read_colours,
     read_mosaic,
@@ -76,10 +78,10 @@ def variant_for(colour: str, variant: str, camera: str | None) -> str:
     """
     if colour == NO:
         return variant
-    from mitsim.core.configuration import DEFAULT_CAMERA, locate
+    from mitsim.capture.opening import check_devices
     from mitsim.rig.sensor import load_sensor
 
-    path = locate(camera or DEFAULT_CAMERA, "calibration", ".toml")
+    path, _ = check_devices(camera, None)
     mosaic = load_sensor(path).mosaic
     if colour == MOSAIC and mosaic is None:
         raise MitsimError(
@@ -92,6 +94,41 @@ def variant_for(colour: str, variant: str, camera: str | None) -> str:
             "--colour mosaic"
         )
     return variant if colour == AUTO else spectral_of(variant)
+
+
+def check_colour(colour: str, variant: str, projector: str | None, seconds: float | None = None) -> None:
+    """Refuse colour that a bench would refuse, before the renderer is imported.
+
+    Parameters
+    ----------
+    colour, variant
+        as asked for.
+    projector
+        name or file; None: the default one.
+    seconds
+        that a capture is to take; None: not said.
+
+    Raises
+    ------
+    MitsimError
+        for seconds, a variant that colours cannot be weighed from, and lines or bands that the projector does not have.
+    """
+    if colour == NO:
+        return
+    from mitsim.capture.opening import check_devices
+    from mitsim.capture.request import check_untimed
+    from mitsim.core.configuration import load_model
+
+    check_untimed(seconds)
+    _, path = check_devices(None, projector)
+    if colour == AUTO:
+        check_undecided(variant)
+        return
+    from mitsim.rig.projector import ProjectorModel
+
+    model = load_model(path, ProjectorModel)
+    lit = model.in_bands(bands_of(colour)) if colour.startswith(BANDS) else model
+    lit.traced_lines  # noqa: B018 - checks itself
 
 
 def by_line(colour: str) -> bool:
@@ -122,23 +159,19 @@ def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     return plan_lines(ColourBench.of(in_colour(bench, colour), RUN), Request.of(**request))
 
 
-def chosen_of(bench: Bench, request: dict[str, Any], job: Job, output: Path, resume: bool) -> tuple[Bench, Plan, str]:
+def chosen_of(bench: Bench, request: dict[str, Any], job: Job) -> tuple[Bench, Plan, str]:
     """What ``--colour auto`` of `mitsim capture` is captured with: a bench, its plan, and :data:`NO` or lines.
 
     Parameters
     ----------
-    bench, request, job, output, resume
+    bench, request, job
         what the command line names.
 
     Raises
     ------
     MitsimError
-        for an output that cannot be used, and as :meth:`Bench.choose_colour`.
+        as :meth:`Bench.choose_colour`.
     """
-    from mitsim.core.output import prepare_output
-
-    if output.exists():
-        prepare_output(output, overwrite=resume)  # before work
     with job.clock.stage("plan"):
         chosen = bench.choose_colour(**request)
     return chosen.bench, chosen.plan, NO if chosen.mono else LINES
@@ -149,7 +182,10 @@ def mosaic_options(options: Mapping[str, Any], way: str) -> dict[str, Any]:
 
     MitsimError for a way that there is not, and for options that these images have not.
     """
+    from mitsim.reconstruct.asked import check_joint
+
     check_way(way)
+    check_joint(options["lam"])
     for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0)):
         if options[name] != neutral:
             raise MitsimError(
@@ -221,6 +257,7 @@ def reconstruct_lines(
         those that every line is solved with.
     """
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+    from mitsim.core.output import check_output
     from mitsim.rig.chart import load_chart
 
     # Refused before the solver and colour-science are imported.
@@ -233,12 +270,14 @@ def reconstruct_lines(
     for name in read_colours(calibration, CALIBRATION).names:
         read_manifest(calibration / name, CalibrationManifest)
     place = None if chart is None else load_chart(chart)
-    from mitsim.core.resources import memory_from_here, peak_memory
+    # What it holds is looked into later: an image of the same inputs may be replaced.
+    check_output(output, overwrite=is_coloured(output))
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.study.colour.by_line import reconstruct_colours
 
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)
-    payload = {**found.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    payload = {**found.summary(), "memory_bytes": memory_since(held)}
     return finish(as_json, payload, [*found.sentences, found.output], found.warnings)
 
 

@@ -63,31 +63,35 @@ def reconstruct(
     """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
     from mitsim.core.colours import JOINT, is_coloured, is_mosaic
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+    from mitsim.core.output import check_output
+    from mitsim.reconstruct.asked import IMAGE_FILE, check_asked
 
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
+    output = output or run / "reconstruction"
+    if not is_mosaic(run):
+        check_asked(strength, method, depth, margin)
     if is_coloured(run):
         options = {"lam": strength, "method": method, "overwrite": overwrite, "focus": depth, "margin": margin}
         if is_mosaic(run):
             options = mosaic_options(options, mosaic or JOINT)
         elif mosaic is not None:
             raise MitsimError(f"--mosaic {mosaic}: {run} has a run for each line; leave out --mosaic")
-        return reconstruct_lines(run, calibration, output or run / "reconstruction", chart, options, as_json)
+        return reconstruct_lines(run, calibration, output, chart, options, as_json)
     for option, value in (("--chart", chart), ("--mosaic", mosaic)):
         if value is not None:
             raise MitsimError(f"{option} {value}: {run} is not coloured; leave out {option}")
     # Refused before the solver is imported, which takes half a second.
     read_manifest(run, RunManifest)
     read_manifest(calibration, CalibrationManifest)
-    from mitsim.core.resources import memory_from_here, peak_memory
+    check_output(output, overwrite=(output / IMAGE_FILE).is_file())
+    from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
     held = memory_from_here()
     place: dict[str, Any] = {"focus": depth, "margin": margin}
-    result = reconstruct_folder(
-        run, calibration, output or run / "reconstruction", strength, method, overwrite, **place
-    )
-    payload = {**result.summary(), "memory_bytes": max(peak_memory() - held, 0.0)}
+    result = reconstruct_folder(run, calibration, output, strength, method, overwrite, **place)
+    payload = {**result.summary(), "memory_bytes": memory_since(held)}
     lines = [payload["status"]]
     if result.quality is not None:
         lines.append(str(result.quality))

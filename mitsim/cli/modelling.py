@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mitsim.cli.options import bench_of, is_given, job_of, request_of
+from mitsim.cli.options import bench_of, check_camera, is_given, job_of, request_of
 from mitsim.cli.screen import finish
 from mitsim.core.errors import MitsimError
 
@@ -46,6 +46,8 @@ def calibrate_model(context: typer.Context, modelling: Modelling, output: Path) 
     MitsimError
         for a missing scene, options that a fit does not have, and whatever it refuses.
     """
+    from mitsim.capture.request import Exposure
+    from mitsim.core.output import check_output
     from mitsim.rig.framelist import load_frames
     from mitsim.rig.recipe import load_recipe
 
@@ -59,6 +61,9 @@ def calibrate_model(context: typer.Context, modelling: Modelling, output: Path) 
             raise MitsimError(f"--{name.replace('_', '-')}: is of no use with --model{other}; leave it out")
     request_of(accuracy=asked["accuracy"], seed=asked["seed"])
     recipe, frames = load_recipe(asked["recipe"]), asked["frames"] and load_frames(asked["frames"])
+    check_output(output)
+    if frames is None:
+        check_camera(asked["camera"], Exposure(None, recipe.exposure_fraction))
     bench_words = (asked[name] for name in ("scene", "variant", "camera", "projector", "define", "outside"))
     with job_of(asked["quiet"] or asked["as_json"], asked["max_seconds"], asked["max_memory"]) as job:
         with job.clock.stage("open scene"):

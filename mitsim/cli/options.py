@@ -17,6 +17,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
+    from mitsim.capture.request import Exposure
     from mitsim.core.job import Job
     from mitsim.rig.recipe import SessionRecipe
     from mitsim.study.experiment import Scope
@@ -60,7 +61,7 @@ MaxMemory = Annotated[
         "--max-memory", help="refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
     ),
 ]
-_MAIN_PATTERNS, _MAIN_MEASURE = "dots:7", "psnr"
+MAIN_PATTERNS, MAIN_MEASURE = "dots:7", "psnr"
 """What `mitsim study` takes where nothing is said."""
 DAY = 86400.0
 """Work that would take longer is a mistake, unless it is asked for."""
@@ -140,26 +141,32 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
         check_sweep(varied, len(scope.pictures))
         read_name(patterns, None)
         return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
-    if name == "drift" and measure == _MAIN_MEASURE:
+    if name == "drift" and measure == MAIN_MEASURE:
         check_drifts(varied)
         read_name(patterns, None)
         return replace(scope, sweep=varied, patterns=patterns)
-    if over or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
+    if over or patterns != MAIN_PATTERNS or measure != MAIN_MEASURE:
         others = "--measure is for sweep, --over and --patterns for drift and sweep"
         raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
 
 
 def check_setup(scope: Scope, scene: str | None) -> None:
-    """MitsimError where the files that a ``scope`` names cannot be, before the renderer is imported; a study without a
-    ``scene`` of its own may take others."""
-    from mitsim.capture.bench import check_devices, check_scene
+    """MitsimError where the files that a ``scope`` names cannot be used, before the renderer is imported; a study
+    without a ``scene`` of its own may take others."""
+    from mitsim.capture.opening import check_devices, check_scene
+    from mitsim.core.configuration import load_model
+    from mitsim.rig.sensor import load_sensor
     from mitsim.study.asked import NO_SCENE
 
-    check_devices(scope.setup.camera, scope.setup.projector)
+    camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
+    load_sensor(camera)
     if scene or scope.measures:
         varied = {name: values[0] for name, values in scope.sweep if scope.measures and name not in NO_SCENE}
         check_scene(scope.setup.scene, {**dict(scope.setup.parameters), **varied}, scope.setup.outside)
+    from mitsim.rig.projector import ProjectorModel  # last: it imports numpy
+
+    load_model(projector, ProjectorModel)
 
 
 def recipe_for(name: str, recipe: Path | None) -> SessionRecipe | None:
@@ -174,6 +181,31 @@ def recipe_for(name: str, recipe: Path | None) -> SessionRecipe | None:
     if name not in ("calibration", "drift"):
         raise MitsimError(f"study {name}: has no session of its own; --recipe is for calibration and drift")
     return load_recipe(recipe)
+
+
+def check_work(output: Path, resume: bool, several: bool = False) -> None:
+    """MitsimError, before the renderer is imported, where a RUN or CAL folder cannot be written.
+
+    Parameters
+    ----------
+    output, resume
+        the folder, and whether work in it is to go on.
+    several
+        whether it is to hold several such folders.
+    """
+    from mitsim.core.manifests import MANIFEST
+    from mitsim.core.output import check_output
+
+    check_output(output, overwrite=resume and (several or (output / MANIFEST).is_file()))
+
+
+def check_camera(camera: str | None, exposure: Exposure) -> None:
+    """MitsimError, before the renderer is imported, for a ``camera`` that cannot have an ``exposure``."""
+    from mitsim.capture.opening import check_devices
+    from mitsim.rig.sensor import load_sensor
+
+    path, _ = check_devices(camera, None)
+    exposure.check(load_sensor(path), path)
 
 
 def bench_of(

@@ -34,13 +34,18 @@ def characterise(
     """Measure a camera after EMVA 1288 on simulated frames; figures found beside those that its file sets."""
     from mitsim.core.configuration import locate
     from mitsim.rig.sensor import load_sensor
+    from mitsim.study.emva import Procedure, capacity_of, efficiency_of
+    from mitsim.study.folder import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    procedure = Procedure(pixels, steps, frames, seed, wavelength)
+    capacity_of(sensor)
+    efficiency_of(sensor, procedure)
+    check_study_folder(output, "characterise")
     from mitsim.study.characterise import characterise as run_characterise
-    from mitsim.study.procedure import Procedure
 
     with job_of(quiet or as_json) as job:
-        done = run_characterise(sensor, Procedure(pixels, steps, frames, seed, wavelength), output, job)
+        done = run_characterise(sensor, procedure, output, job)
     return finish(as_json, done.payload(), done.lines(), done.warnings)
 
 
@@ -63,23 +68,30 @@ def sense(
     quiet: Quiet = False,
 ) -> int:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
+    from mitsim.capture.request import Exposure
+    from mitsim.capture.sensing import check_ending, check_f_number, check_image, check_wavelength
     from mitsim.core.configuration import locate
     from mitsim.core.output import prepare_output
+    from mitsim.core.seeds import check_root
     from mitsim.rig.sensor import load_sensor
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
-    from mitsim.capture.request import Exposure
-    from mitsim.capture.sense import check_ending, irradiance_behind_lens, read_image
-    from mitsim.capture.sense import sense as run_sense
-
     seconds = number_of("exposure", exposure)
     asked = Exposure(None if seconds == "auto" else seconds, exposure_fraction)
     if not 0 < scale < math.inf:
         raise MitsimError(f"--scale {scale:g}: give a finite number above 0")
     check_ending(output, sensor)
+    check_wavelength(wavelength)
+    if f_number is not None:
+        check_f_number(f_number)
+    check_root(seed)
+    check_image(image)
+    place = prepare_output(output, overwrite=True, kind="file")
+    from mitsim.capture.sense import irradiance_behind_lens, read_image
+    from mitsim.capture.sense import sense as run_sense
+
     light, notes = read_image(image, channel)
     light = light * scale if f_number is None else irradiance_behind_lens(light * scale, f_number)
-    place = prepare_output(output, overwrite=True, kind="file")
     frame = run_sense(light, sensor, asked, seed, wavelength, notes)
     payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [

@@ -10,6 +10,8 @@ import typer
 
 import mitsim
 from mitsim.cli.options import (
+    MAIN_MEASURE,
+    MAIN_PATTERNS,
     Camera,
     Defines,
     Json,
@@ -20,6 +22,7 @@ from mitsim.cli.options import (
     Seed,
     Variant,
     bench_of,
+    check_camera,
     check_setup,
     job_of,
     recipe_for,
@@ -32,6 +35,9 @@ from mitsim.core.errors import MitsimError
 
 app = typer.Typer()
 
+_WHOLE = "1/1"
+"""The only part of a study that is not shared."""
+
 
 @app.command()
 def study(
@@ -41,20 +47,20 @@ def study(
         typer.Argument(help="scene XML, or the name of a shipped scene; of merge, folders", metavar="[SCENE]"),
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of the study")] = Path("study-output"),
-    patterns: Patterns = "dots:7",
+    patterns: Patterns = MAIN_PATTERNS,
     seed: Seed = 0,
     camera: Camera = None,
     projector: Projector = None,
     define: Defines = None,
     outside: Outside = False,
     quick: Annotated[bool, typer.Option("--quick", help="a few points, for a first look")] = False,
-    shard: Annotated[str, typer.Option(help="measure part I of N of the points", metavar="I/N")] = "1/1",
+    shard: Annotated[str, typer.Option(help="measure part I of N of the points", metavar="I/N")] = _WHOLE,
     jobs: Annotated[int | None, typer.Option(help="processes; one a processor if not given")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler that measures the points")] = None,
     over: Annotated[
         list[str] | None, typer.Option(help="what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT")
     ] = None,
-    measure: Annotated[str, typer.Option(help="what sweep shows: psnr, ssim, misfit, ...")] = "psnr",
+    measure: Annotated[str, typer.Option(help="what sweep shows: psnr, ssim, misfit, ...")] = MAIN_MEASURE,
     recipe: Annotated[
         Path | None, typer.Option(help="of calibration and drift: session recipe", metavar="FILE.toml")
     ] = None,
@@ -67,9 +73,10 @@ def study(
     knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
     how good a `calibration` session is, and why; `merge` joins the parts of --shard.
     """
-    from mitsim.study import OF_NO_SCENE, find_study, is_experiment
+    from mitsim.study import EXPOSED, OF_NO_SCENE, find_study, is_experiment
+    from mitsim.study.folder import check_study_folder
 
-    session = recipe_for(name, recipe)
+    session, request = recipe_for(name, recipe), mitsim.Request.of(patterns=patterns, seed=seed)
     with job_of(quiet or as_json) as job:
         if name == "merge":
             from mitsim.study.campaign import merge
@@ -87,12 +94,18 @@ def study(
             result = run_experiment(name, scope, output, job, where)
         else:
             run_study = find_study(name, **({"recipe": session} if session else {}))
-            request = mitsim.Request.of(patterns=patterns, seed=seed)
+            if over or measure != MAIN_MEASURE or (shard, jobs, scheduler) != (_WHOLE, None, None):
+                raise MitsimError(
+                    f"study {name}: is measured whole, here; leave out --over, --measure, --shard, --jobs, --scheduler"
+                )
             bench = None
             if name in OF_NO_SCENE:
                 if scenes:
                     raise MitsimError(f"study {name} {' '.join(scenes)}: it is of no scene; leave the scene out")
             else:
+                check_study_folder(output, name)
+                if name in EXPOSED:
+                    check_camera(camera, request.timing)
                 with job.clock.stage("open scene"):
                     bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
             result = run_study(bench, output, request, job)

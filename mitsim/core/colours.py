@@ -49,6 +49,12 @@ def spectral_of(variant: str) -> str:
     return f"{variant.rpartition('_')[0]}_spectral"
 
 
+def check_undecided(variant: str) -> None:
+    """ArgumentError for a ``variant`` that colours cannot be weighed from."""
+    if variant.endswith("_spectral"):
+        raise ArgumentError("variant", f"{variant}: open the bench with a mono variant; colours are looked at too")
+
+
 class Line(BaseModel):
     """One spectral line and the folder that holds it."""
 

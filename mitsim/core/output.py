@@ -79,6 +79,28 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
     return path
 
 
+def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> None:
+    """Refuse a place that :func:`prepare_output` would refuse, before what is slow to import; nothing is left behind.
+
+    Parameters
+    ----------
+    path, overwrite, kind
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    new = not os.path.lexists(path)
+    try:
+        prepare_output(path, overwrite, kind)
+    finally:
+        if new and kind == "folder":
+            with suppress(OSError):
+                os.rmdir(path)
+
+
 @contextmanager
 def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """The folder ``path`` for the time of a work, in which no other process may claim it; ``overwrite`` allows one that

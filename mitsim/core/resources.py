@@ -128,6 +128,11 @@ def peak_memory() -> float:
         return peak if sys.platform == "darwin" else peak * 1024
 
 
+def memory_since(held: float) -> float:
+    """Bytes of memory taken at most beyond those ``held`` at :func:`memory_from_here`."""
+    return max(peak_memory() - held, 0.0)
+
+
 def running_seconds() -> float:
     """Seconds since this process began: what its start took, when asked for at the beginning of work."""
     try:

@@ -18,6 +18,11 @@ def versions() -> dict[str, str]:
     return dict(_installed())
 
 
+def deciding_versions() -> dict[str, str]:
+    """Of :func:`versions` those of the packages that decide frames: a manifest's configuration holds them."""
+    return {name: version for name, version in versions().items() if name in DECIDING}
+
+
 @cache
 def _installed() -> tuple[tuple[str, str], ...]:
     """Read once: it takes 8 ms, and a coloured run states them nine times."""

@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError
 from mitsim.core.measurement import Measurement
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.asked import check_asked
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.cost import BYTES_A_NUMBER, is_kept, predicted, slab_numbers
 from mitsim.reconstruct.depth import Depth, best_depth
@@ -31,8 +31,6 @@ from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Verdict
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
-
-METHODS = ("tikhonov", "tv")
 
 
 @single_threaded_blas()
@@ -252,18 +250,7 @@ def inputs(
     lam, method, focus, margin
         as asked for; ArgumentError for an unknown method, or another lambda, focus or margin than reconstruct takes.
     """
-    if method not in METHODS:
-        raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
-    if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < np.inf):
-        raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
-    if focus is not None and focus not in ("auto", "map") and (isinstance(focus, str) or not 0 < focus < np.inf):
-        raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
-    if focus == "map" and method != "tikhonov":
-        raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
-    if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
-        raise ArgumentError("margin", f"{margin}: give a whole number of cells, at least 0")
-    if margin and (focus is not None or method != "tikhonov"):
-        raise ArgumentError("margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus")
+    check_asked(lam, method, focus, margin)
     asked: dict[str, str | float] = {
         "run": shots.fingerprint,
         "calibration": factors.fingerprint,

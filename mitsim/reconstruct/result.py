@@ -15,6 +15,7 @@ from mitsim.core.framefile import write_frame
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.pictures import card, png, scaled, span
+from mitsim.reconstruct.asked import IMAGE_FILE
 from mitsim.reconstruct.cost import Predicted
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depthmap import DepthMap
@@ -22,7 +23,7 @@ from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty
 
-IMAGE_FILE, UNCERTAINTY_FILE, DEPTH_FILE = "image.exr", "uncertainty.exr", "depth.exr"
+UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 RESULT_FILE = "result.json"
 
 
@@ -200,13 +201,27 @@ def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool)
         return False
     if overwrite:
         return True
-    result = read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}
-    earlier = result.get("inputs") if isinstance(result, dict) else None
+    check_same_inputs(folder, read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}, asked)
+    return True
+
+
+def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | float]) -> None:
+    """MitsimError where the image in a folder is of other inputs.
+
+    Parameters
+    ----------
+    folder
+        that holds it.
+    head
+        JSON beside it, whose ``inputs`` are its own.
+    asked
+        inputs of the new image.
+    """
+    earlier = head.get("inputs") if isinstance(head, dict) else None
     earlier = earlier if isinstance(earlier, dict) else {}
-    changed = [name for name, value in asked.items() if earlier.get(name) != value]
+    changed = [name for name in {**asked, **earlier} if earlier.get(name) != asked.get(name)]
     if changed:
         raise MitsimError(
-            f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); "
-            "choose another folder, or replace it with overwrite=True"
+            f"output {folder}: holds an image of other inputs ({', '.join(changed)} differ); choose another folder, or "
+            "replace it with overwrite=True"
         )
-    return True

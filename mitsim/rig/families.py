@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from mitsim.core.errors import MitsimError
+from mitsim.rig.hadamard import way_to
 
 _FAMILIES = ("uniform", "dots", "hadamard", "random")
 NAMES = "uniform, dots:K, dots:RxC, hadamard:K or random:K"
 """How families are called."""
+_MOST_ORDER = 4096
+"""Hadamard orders that are looked up before the projector's pixels are known; patterns have no more a side."""
 _MOST_DIGITS = 9
 """Digits of K that are read; no projector has 1e9 pixels a side."""
 
@@ -24,14 +27,18 @@ def read_name(text: str, n: int | None) -> tuple[str, list[int]]:
     Raises
     ------
     MitsimError
-        for an unknown family, a K that is not a whole number, or K outside 1..n.
+        for an unknown family, a K that is not a whole number, or K outside 1..n, and a Hadamard matrix of an order
+        that is not known.
     """
     name, colon, size = text.partition(":")
     if name not in _FAMILIES or (name == "uniform") == bool(colon) or bool(colon) != bool(size):
         raise MitsimError(f"patterns {text!r}: use {NAMES}")
     rows, _, columns = size.partition("x")
     both = [rows, columns] if name == "dots" and rows and columns else [size or "1"]
-    return name, [_period(text, period, n) for period in both]
+    periods = [_period(text, period, n) for period in both]
+    if name == "hadamard" and periods[0] <= _MOST_ORDER:
+        way_to(periods[0])
+    return name, periods
 
 
 def _period(text: str, size: str, n: int | None) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.colours import MOST_LINES
 from mitsim.core.errors import MitsimError
 
 _ROUNDING = 1e-6
@@ -255,6 +256,17 @@ class ProjectorModel(BaseModel):
         """The same projector that shows one line of ``wavelength_nm`` alone."""
         alone = {"wavelengths_nm": (wavelength_nm,), "radiant_shares": (1.0,), "effective_wavelength_nm": wavelength_nm}
         return self.model_copy(update=alone)
+
+    @property
+    def traced_lines(self) -> Lines:
+        """Its lines, which paths carry together; MitsimError for more than they can."""
+        lines = self.lines
+        if len(lines.shares) > MOST_LINES:
+            raise MitsimError(
+                f"colour: projector {self.name} has {len(lines.shares)} lines, and a path carries {MOST_LINES}; give "
+                f"bands, bands:{MOST_LINES} at most, or leave colour out"
+            )
+        return lines
 
     def in_bands(self, count: int) -> ProjectorModel:
         """The same projector whose lines are ``count`` bands of its own, each at its mean wavelength, as

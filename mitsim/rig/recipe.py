@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from mitsim.core.configuration import load_model, shipped
+from mitsim.core.errors import MitsimError
 from mitsim.rig.board import BoardShape
 from mitsim.rig.drift import Drift
 from mitsim.rig.order import Order
@@ -77,6 +78,15 @@ class SessionRecipe(BaseModel):
             raise ValueError(
                 f"dark_frames: got {self.dark_frames}, but a pair's difference has no dark signal; set 0, or "
                 "signed_capture 'uniform'"
+            )
+        return self
+
+    def of_one_depth(self) -> SessionRecipe:
+        """Itself, as the recipe of one calibration; MitsimError where it has depths."""
+        if self.depths:
+            raise MitsimError(
+                f"recipe: has {len(self.depths)} depths, and this makes one calibration; use calibrate_depths, or "
+                "leave depths out"
             )
         return self
 

@@ -29,6 +29,8 @@ STUDIES: Mapping[str, str] = MappingProxyType(
 :class:`mitsim.study.runner.Findings`."""
 OF_NO_SCENE = ("solver",)
 """Those whose bench is None."""
+EXPOSED = ("calibration", "diffraction")
+"""Those whose frames fill a part of the camera's full well."""
 PAPER = (
     "patterns",
     "distance",

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import prod
 
+from mitsim.capture.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.rig.drift import Drift
 from mitsim.rig.families import read_name
@@ -82,7 +83,7 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
         read_name(text, None)
     for name, kind in (("seed", int), ("accuracy", float)):
         for text in knobs.get(name, ()):
-            number_of(name, text, kind)
+            Request.of(**{name: number_of(name, text, kind)})
 
 
 def check_drifts(sweep: Sweep) -> None:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.calibrate import of_one_depth
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.foreseen import Foreseen
 from mitsim.capture.request import Exposure, check_psnr
@@ -198,8 +197,8 @@ def plan_calibration(
         for another PSNR than 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.capture.bench.Bench.capture`.
     """
     check_psnr(psnr)
-    recipe, job = _foreseeable(of_one_depth(recipe or load_recipe())), job or Job()
-    Exposure(None, recipe.exposure_fraction).check(bench.rig)
+    recipe, job = _foreseeable((recipe or load_recipe()).of_one_depth()), job or Job()
+    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
         shots = bench.capture(patterns, seed=seed, accuracy=accuracy)

@@ -16,13 +16,13 @@ from pydantic import TypeAdapter, ValidationError
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
-from mitsim.core.output import whole_file
 from mitsim.core.resources import workers
 from mitsim.core.versions import versions
-from mitsim.study import ALL, PAPER, find_experiment
+from mitsim.study import ALL, EXPERIMENTS, PAPER, find_experiment
 from mitsim.study.experiment import HEADS, Claim, Experiment, Found, Point, Scope
-from mitsim.study.points import FOLDER, Shard, Store, batches
-from mitsim.study.runner import DPI, study_folder
+from mitsim.study.folder import POINTS, check_study_folder, study_folder
+from mitsim.study.points import Shard, Store, batches
+from mitsim.study.runner import write_figures
 from mitsim.study.workers import in_processes, on_cluster
 
 # What draws is imported where it is used: a study that cannot be is refused without it.
@@ -120,7 +120,7 @@ def run_experiment(
         with tempfile.TemporaryDirectory(prefix="mitsim-study-") as shared:
             together = replace(where or Where(), shared=shared)
             return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, together))
-    campaign, job, where = _Campaign(study, scope), job or Job(), where or Where()
+    campaign, job, where = _Campaign.of(study, scope, output), job or Job(), where or Where()
     own, started = where.shard.part(campaign.points), time.perf_counter()
     with campaign.folder(output) as (folder, store):
         todo = [point for point in own if not store.has(point)]
@@ -147,23 +147,23 @@ def merge(parts: Sequence[Path | str], output: Path | str) -> CampaignResult:
     study, scope = heads[0]["study"], _scope(heads[0]["scope"], parts[0])
     if study == ALL:
         return _all(scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder))
-    campaign = _Campaign(study, scope)
+    campaign = _Campaign.of(study, scope, output)
     with campaign.folder(output) as (folder, store):
         for part in parts:
-            store.take(Store(Path(part) / FOLDER))
+            store.take(Store(Path(part) / POINTS))
         return campaign.finished(folder, store, time.perf_counter() - started)
 
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], CampaignResult]) -> CampaignResult:
     """Every experiment of the paper, made by ``each`` in a folder of its own, and one page of all claims."""
-    from mitsim.study.page import build_page
-
-    with study_folder(output, ALL, (*PAPER, "*.html")) as folder:
+    with study_folder(output, ALL) as folder:
         head = {"kind": ALL, "study": ALL, "scope": asdict(scope), "versions": versions()}
         write_json(folder / f"{ALL}.json", {**head, "status": "incomplete"})
         found = [each(name, folder / name) for name in PAPER]
         sections = [one.section for one in found if one.section]
         if len(sections) == len(found):
+            from mitsim.study.page import build_page
+
             build_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
         result = CampaignResult(
             ALL,
@@ -185,6 +185,14 @@ class _Campaign:
     study: str
     scope: Scope
 
+    @classmethod
+    def of(cls, study: str, scope: Scope, output: Path | str) -> _Campaign:
+        """Of a ``study`` and its ``scope``; MitsimError, before the module of a shipped one is imported, for an
+        ``output`` that it cannot be written to."""
+        if study in EXPERIMENTS:
+            check_study_folder(output, study)
+        return cls(study, scope)
+
     @cached_property
     def experiment(self) -> Experiment:
         return find_experiment(self.study)
@@ -197,14 +205,14 @@ class _Campaign:
     def folder(self, output: Path | str) -> Iterator[tuple[Path, Store]]:
         """The folder ``output`` and its store, held; an earlier run of the same code goes on."""
         name = self.experiment.name
-        with study_folder(output, name, ("*.png", "*.csv", "*.html", FOLDER)) as folder:
+        with study_folder(output, name) as folder:
             head = folder / f"{name}.json"
             if head.exists() and (made := read_json(head).get("versions")) != versions():
                 raise MitsimError(
                     f"output {folder}: its points were measured by other versions ({made}); choose another folder"
                 )
-            (folder / FOLDER).mkdir(exist_ok=True)
-            store = Store(folder / FOLDER)
+            (folder / POINTS).mkdir(exist_ok=True)
+            store = Store(folder / POINTS)
             store.tidy()
             self._write(folder, status="incomplete")
             yield folder, store
@@ -219,9 +227,7 @@ class _Campaign:
         results = replace(store.results(self.points), measures=self.scope.measures)
         claims, figures = tuple(experiment.claims(results)), experiment.figures(results)
         results.table.write(folder / f"{experiment.name}.csv")
-        for file, figure in figures.items():
-            with whole_file(folder / file) as part:
-                figure.savefig(part, dpi=DPI, format="png")
+        write_figures(folder, figures)
         section = Section.of(experiment, self.study, self.scope, claims, figures, results)
         build_page([section], folder / f"{experiment.name}.html", experiment.title)
         rows = tuple(dict(row) for row in results.table.rows)
@@ -239,7 +245,7 @@ def _head(folder: Path) -> dict[str, Any]:
     for file in sorted(folder.glob("*.json")):
         head = read_json(file)
         whole = isinstance(head, dict) and {"study", "scope", "versions"} <= head.keys()
-        if whole and (head["study"] == ALL or (folder / FOLDER).is_dir()):
+        if whole and (head["study"] == ALL or (folder / POINTS).is_dir()):
             return dict(head)
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
 

@@ -19,14 +19,15 @@ from matplotlib.figure import Figure
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.jsonfile import write_json
-from mitsim.core.output import whole_file
 from mitsim.core.versions import versions
 from mitsim.rig.sensor import SensorModel
 from mitsim.sensor.emva import SPLIT, Session, figures
 from mitsim.sensor.specimen import mean_dark_current
 from mitsim.study.characterise_plots import MOST_OFF, figures_of
-from mitsim.study.procedure import Frames, Procedure, capacity_of, drawn, efficiency_of
-from mitsim.study.runner import DPI, study_folder
+from mitsim.study.emva import Procedure, capacity_of, efficiency_of
+from mitsim.study.folder import study_folder
+from mitsim.study.procedure import Frames, drawn
+from mitsim.study.runner import write_figures
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
@@ -167,12 +168,10 @@ def characterise(
     efficiency_of(sensor, procedure)
     if output is None:
         return _characterised(sensor, procedure, capacity, job)
-    with study_folder(output, "characterise", ("*.png",)) as folder:
+    with study_folder(output, "characterise") as folder:
         done = _characterised(sensor, procedure, capacity, job, str(folder))
         write_json(folder / "characterise.json", {**done.payload(), "kind": "characterise", "versions": versions()})
-        for file, figure in done.figures().items():
-            with whole_file(folder / file) as part:
-                figure.savefig(part, dpi=DPI, format="png")
+        write_figures(folder, done.figures())
     return done
 
 

@@ -28,10 +28,9 @@ from mitsim.core.versions import versions
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.recipe import load_recipe
 from mitsim.study.compare import Comparison, label
+from mitsim.study.folder import DEMO_FOLDERS, DEMO_PAGE, study_folder
 from mitsim.study.report import BudgetRow, FamilyResult, ReportData, build_report, verdict
-from mitsim.study.runner import study_folder
 
-_PAGE, _FOLDERS = "report.html", ("run", "calibration")
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
 """Families that the main one stands between in the report: the paper's, from the fewest frames to the most."""
 
@@ -85,13 +84,13 @@ def demo(bench: Bench, output: Path | str, request: Request | None = None, job: 
         the main family, its accuracy and seed; it is compared with those of the paper that fit the projector.
     """
     request, job = request or Request.of(), job or Job()
-    Exposure().check(bench.rig)
+    Exposure().check(bench.sensor, bench.rig.camera_file)
     names = _fitting(bench, request)
     # Only now, with nothing left to refuse, is an earlier demo taken away.
-    with study_folder(output, "demo", (*_FOLDERS, _PAGE)) as folder:
-        for part in _FOLDERS:
+    with study_folder(output, "demo") as folder:
+        for part in DEMO_FOLDERS:
             shutil.rmtree(folder / part, ignore_errors=True)
-        (folder / _PAGE).unlink(missing_ok=True)
+        (folder / DEMO_PAGE).unlink(missing_ok=True)
         write_json(folder / "demo.json", {"kind": "demo", "status": "incomplete"})
         result = _run(bench, folder, request, names, job)
         write_json(folder / "demo.json", {"kind": "demo", **result.payload()})
@@ -130,7 +129,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
     evidence = _Evidence(light, shots, factors, families, request.patterns)
     with job.clock.stage("report"):
         page = replace(_page(evidence), render=view, frames=frames, seconds=job.clock.seconds())
-        report = build_report(page, folder / _PAGE)
+        report = build_report(page, folder / DEMO_PAGE)
     psnr = {name: f.rendered.quality.psnr_db for name, f in families.items() if f.rendered}
     return DemoResult(
         psnr=psnr,

@@ -160,7 +160,7 @@ def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
     bench, request, job
         the scene, patterns, seed and accuracy (diffraction is on, whatever it is worth), progress and limits.
     """
-    Exposure().check(bench.rig)
+    Exposure().check(bench.sensor, bench.rig.camera_file)
     request = request.changed(effects={**request.effects, "diffraction": True})
     families = [bench.family(name, request.seed) for name in dict.fromkeys((request.patterns, "uniform"))]
     light = bench.light(job=job, **request.model_dump())

@@ -11,10 +11,11 @@ import numpy as np
 from mitsim.capture import pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.choice import counted
+from mitsim.capture.decision import SceneFacts, decide
 from mitsim.capture.effects import names, present
 from mitsim.capture.evidence import COUNTED, Evidence, Part, Settings
 from mitsim.capture.light import Light, Sampling, Target, trace_light
-from mitsim.capture.plan import Plan, SceneFacts, decide
+from mitsim.capture.plan import Plan
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError

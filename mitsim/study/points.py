@@ -14,7 +14,6 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.output import sweep, whole_file
 from mitsim.study.experiment import Found, Point, Results
 
-FOLDER = "points"
 _ROWS = "rows"
 
 

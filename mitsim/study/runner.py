@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.request import Request
 from mitsim.core.job import Job
-from mitsim.core.jsonfile import read_json, write_json
-from mitsim.core.output import output_folder, sweep, whole_file
+from mitsim.core.jsonfile import write_json
+from mitsim.core.output import whole_file
 from mitsim.core.versions import versions
+from mitsim.study.folder import study_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,6 +23,13 @@ if TYPE_CHECKING:
 
 DPI = 150
 """Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
+
+
+def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
+    """Write ``figures``, by file name, to a ``folder``; MitsimError when one cannot be written."""
+    for file, figure in figures.items():
+        with whole_file(folder / file) as part:
+            figure.savefig(part, dpi=DPI, format="png")
 
 
 class Findings(Protocol):
@@ -102,16 +108,14 @@ def run_study(
         new or empty folder, or one with an earlier study of that name, which is replaced.
     """
     request = request or Request.of()
-    with study_folder(output, name, ("*.png", "*.csv", f"{name}.html")) as folder:
+    with study_folder(output, name) as folder:
         findings = measure(bench, request, job or Job())
         scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
         result = StudyResult(findings, scene, patterns, str(folder))
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = findings.figures()
-        for file, figure in figures.items():
-            with whole_file(folder / file) as part:
-                figure.savefig(part, dpi=DPI, format="png")
+        write_figures(folder, figures)
         if isinstance(findings, Paged):
             from mitsim.study.page import build_findings
 
@@ -122,26 +126,3 @@ def run_study(
         for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():
             table.write(folder / file)
         return result
-
-
-@contextmanager
-def study_folder(output: Path | str, name: str, parts: Sequence[str]) -> Iterator[Path]:
-    """The folder of a study, held while the context lasts.
-
-    MitsimError when the folder holds anything else, or cannot be written.
-
-    Parameters
-    ----------
-    output
-        new or empty, or with an earlier study of that name alone; nothing of it is removed.
-    name, parts
-        of the study, whose NAME.json says ``"kind": NAME``, and of what else it writes, with wildcards.
-    """
-    place, head, names = Path(output), None, (f"{name}.json", ".*", *parts)
-    if (place / names[0]).is_file():
-        head = read_json(place / names[0])
-    earlier = isinstance(head, dict) and head.get("kind") == name
-    earlier = earlier and all(any(fnmatch(item.name, known) for known in names) for item in place.iterdir())
-    with output_folder(place, overwrite=earlier) as folder:
-        sweep(folder)
-        yield folder

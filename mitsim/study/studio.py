@@ -14,7 +14,8 @@ import numpy as np
 from filelock import FileLock
 from skimage import io
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError

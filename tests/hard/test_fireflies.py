@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.frames import ExpectedFrames, Filed

@@ -344,8 +344,8 @@ def test_a_saturated_session_is_flagged(
 
     (That no frame is counted without cause: tests/unit/capture/test_session.py::test_the_folder.)
     """
-    from mitsim.capture.bench import open_bench
     from mitsim.capture.effects import EFFECTS
+    from mitsim.capture.opening import open_bench
     from mitsim.capture.planning import make_plan
 
     def simple_plan(*arguments: object) -> object:

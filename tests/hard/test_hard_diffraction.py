@@ -169,8 +169,8 @@ def test_features_from_a_micrometre_to_a_millimetre(measured: Recorder, feature:
 def test_a_mask_below_the_wavelength_warns(
     small_scene: Callable[..., Path], variant: str, feature: float, warned: bool
 ) -> None:
-    from mitsim.capture.bench import open_bench
-    from mitsim.capture.plan import SceneFacts
+    from mitsim.capture.decision import SceneFacts
+    from mitsim.capture.opening import open_bench
 
     found = [w for w in SceneFacts.of(open_bench(small_scene(mask_feature=feature))).warnings if "wavelength" in w]
     assert len(found) == warned and all("mask_feature 0.0005 mm" in w and "\n" not in w for w in found)

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
+from mitsim.capture.opening import open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.rig.patterns import Lighting

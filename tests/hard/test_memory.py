@@ -12,7 +12,7 @@ pytestmark = pytest.mark.robustness("Faults")
 PROGRAM = """
 import sys
 from pathlib import Path
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.capture.cost import frames_cost
 from mitsim.core.configuration import shipped
 

@@ -17,9 +17,10 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from mitsim.capture import light
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Part, Settings
 from mitsim.capture.light import trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.pilot import direct, looks
 from mitsim.capture.planning import make_plan
 from mitsim.core import parallel
@@ -39,7 +40,7 @@ LAMP_AND_BOX = """
 CHILD = """
 import sys
 import drjit as dr
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.core import parallel
 dr.set_thread_count(3)
 parallel.workers = lambda: 3

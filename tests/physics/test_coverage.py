@@ -32,8 +32,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import estimate
+from mitsim.capture.opening import open_bench
 from mitsim.capture.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest

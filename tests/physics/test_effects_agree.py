@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.capture.render import projected
 from mitsim.capture.simulation import Simulation

@@ -406,7 +406,7 @@ def test_the_estimators_agree_on_a_scene_with_depth(shared_scene: Callable[..., 
 
     The sensor is small (0.75 mm), so one depth for all light leaves a shift of 0.4 um, next to 60 um features.
     """
-    from mitsim.capture.bench import open_bench
+    from mitsim.capture.opening import open_bench
 
     ball = """<shape type="sphere"><point name="center" x="-10" y="12" z="330"/> <float name="radius" value="25"/>
         <bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></shape>"""

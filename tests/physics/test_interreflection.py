@@ -55,7 +55,7 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
     """Mitsuba's ``path``. Runs of one seed share each path's first reflection, so it cancels in total - direct."""
     import mitsuba as mi
 
-    from mitsim.capture.bench import open_bench
+    from mitsim.capture.opening import open_bench
     from mitsim.capture.render import projected
 
     bench = open_bench(scene, for_render=True)
@@ -80,8 +80,8 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
 
     Light of one reflection is traced apart from light of more.
     """
-    from mitsim.capture.bench import open_bench
     from mitsim.capture.evidence import Settings
+    from mitsim.capture.opening import open_bench
     from mitsim.capture.simulation import Simulation
 
     bench = open_bench(scene, for_render=True)

@@ -125,7 +125,7 @@ ONE_VARIANT = """
 import json, sys
 import numpy as np
 from pathlib import Path
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 bench = open_bench(Path(sys.argv[2]), sys.argv[1])
 import mitsuba as mi
 from mitsim.transport.direct import DirectTracer
@@ -181,8 +181,8 @@ def centroid(frame: np.ndarray) -> tuple[float, float]:
 
 def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     """Frame of the factored estimator when projector pixel (r, c) emits ``light[r, c]`` of its power."""
-    from mitsim.capture.bench import open_bench
     from mitsim.capture.evidence import Settings
+    from mitsim.capture.opening import open_bench
     from mitsim.capture.simulation import Simulation
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.optics.diffraction import wave_terms
 from mitsim.optics.samplers import SeparableTerm, geometric_samplers, wave_samplers
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
@@ -21,6 +21,7 @@ from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import Mask
 from mitsim.rig.projector import Spectrum
+from tests.physics.slopes import slope_of_reference
 
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))
 CAMERA = CameraGeometry(pixels=40, pixel_pitch=0.017, mask_order=5, scene_distance=30.0)
@@ -112,12 +113,8 @@ def test_the_reference_moves_its_mask_alike(small_scene: Callable[..., Path], va
     path.write_text(path.read_text().replace('<float name="fov"', f'{offsets} <float name="fov"', 1))
     bench = open_bench(path, variant)
     assert bench.geometry.mask_offset == (0.3, -0.54)
-    factored = bench.render("factored", effects={"diffraction": False, "black-level": False}).mean
-    contrast = factored - factored.mean()
-    seeds = [bench.render("reference", spp=128, seed=seed).mean for seed in range(8)]
-    slopes = np.array([np.vdot(frame, contrast) / np.vdot(contrast, contrast) for frame in seeds])
-    error = slopes.std(ddof=1) / 8**0.5
-    assert error < 0.05 and abs(slopes.mean() - 1) < 5 * error
+    slope, error, _, _ = slope_of_reference(bench)
+    assert error < 0.05 and abs(slope - 1) < 5 * error
 
 
 def test_calibrations_of_cameras_without_an_offset_fit_on(small_scene: Callable[..., Path], variant: str) -> None:

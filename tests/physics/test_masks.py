@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.decision import SceneFacts
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.modelling import model_of
-from mitsim.capture.plan import SceneFacts
+from mitsim.capture.opening import open_bench
 from mitsim.capture.session import Session
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
@@ -31,6 +31,7 @@ from mitsim.rig.mask import mls_mask
 from mitsim.rig.plate import Plate
 from mitsim.rig.projector import Spectrum
 from mitsim.rig.recipe import load_recipe
+from tests.physics.slopes import slope_of_reference
 
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))
 
@@ -297,10 +298,6 @@ def test_the_reference_sees_the_same_random_grey_mask(
     standard errors of their mean."""
     values = np.random.default_rng(5).random((511, 511)) * (np.random.default_rng(6).random((511, 511)) < 0.4)
     bench = open_bench(small_scene(), variant, camera_file(tmp_path, "grey", values))
-    factored = bench.render("factored", effects={"diffraction": False, "black-level": False}).mean
-    contrast = factored - factored.mean()
-    seeds = [bench.render("reference", spp=128, seed=seed).mean for seed in range(8)]
-    slopes = np.array([np.vdot(frame, contrast) / np.vdot(contrast, contrast) for frame in seeds])
-    error = slopes.std(ddof=1) / 8**0.5
-    assert error < 0.05 and abs(slopes.mean() - 1) < 5 * error
-    assert np.mean(seeds) == pytest.approx(factored.mean(), rel=0.02)
+    slope, error, reference, factored = slope_of_reference(bench)
+    assert error < 0.05 and abs(slope - 1) < 5 * error
+    assert reference == pytest.approx(factored, rel=0.02)

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.rig.patterns import Lighting
 from tests.physics.plan_property import Effort, answer, planned, total_error

@@ -15,9 +15,9 @@ import pytest
 from PIL import Image
 from scipy.special import fresnel
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.decision import SceneFacts
 from mitsim.capture.effects import EFFECTS, Physics
-from mitsim.capture.plan import SceneFacts
+from mitsim.capture.opening import open_bench
 from mitsim.capture.rasters import cells_to_choose
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError

@@ -14,8 +14,9 @@ import pytest
 from scipy import stats
 
 from mitsim import psnr, reconstruct
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.core.configuration import shipped

@@ -13,8 +13,9 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.light import Light, Sampling, trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.rig.patterns import Lighting
 from tests.hard.hard_light import GLINT, PLACE, SCALE, gauss, glossy, lobe

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy.special import fresnel
 
-from mitsim.capture.bench import open_bench
-from mitsim.capture.plan import SceneFacts
+from mitsim.capture.decision import SceneFacts
+from mitsim.capture.opening import open_bench
 from mitsim.core.configuration import shipped
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms

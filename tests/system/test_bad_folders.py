@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.core.framefile import checksum, read_frame, write_frame
 from tests.system.refusals import Refused, mentions
 

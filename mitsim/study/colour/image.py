@@ -17,8 +17,8 @@ from mitsim.core.framefile import write_frame
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.output import whole_file
 from mitsim.core.pictures import card, colour_png
+from mitsim.reconstruct.asked import IMAGE_FILE
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
-from mitsim.reconstruct.result import IMAGE_FILE
 from mitsim.rig.chart import ChartPlace
 from mitsim.study.metrics import psnr
 

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.colour import ColourBench
 from mitsim.capture.light import trace_lines
+from mitsim.capture.opening import open_bench
 from mitsim.capture.request import Request
 from mitsim.capture.run import plan_request
 from mitsim.core.arrays import FloatArray

@@ -22,16 +22,16 @@ from mitsim.core.colours import (
     read_colours,
     write_colours,
 )
-from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
 from mitsim.core.jsonfile import read_json
 from mitsim.core.mosaics import MosaicCapture, load_mosaic
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.pictures import png
+from mitsim.reconstruct.asked import IMAGE_FILE, check_joint
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.reconstruct.result import IMAGE_FILE
+from mitsim.reconstruct.result import check_same_inputs
 from mitsim.rig.chart import ChartPlace
 from mitsim.study.colour.image import ColourImage, board_of
 from mitsim.study.colour.page import PAGE, write_page
@@ -163,8 +163,7 @@ def reconstruct_mosaic(
     """
     started = time.perf_counter()
     check_way(way)
-    if lam != "auto" and not 0 < lam < np.inf:
-        raise MitsimError(f"lambda is {lam}; behind colour filters give a finite number above 0, or auto")
+    check_joint(lam)
     run, calibration = Path(run), Path(calibration)
     shots = load_mosaic(run)
     factors = fitting_factors(shots, calibration)
@@ -293,15 +292,9 @@ def _may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool
     if not (folder / COLOUR).is_file():
         return False
     read_colours(folder, IMAGE)
-    data = read_json(folder / COLOUR)
-    earlier = data.get("inputs") if isinstance(data, dict) else None
-    if overwrite or earlier == asked:
-        return True
-    differ = [name for name, value in asked.items() if not isinstance(earlier, dict) or earlier.get(name) != value]
-    raise MitsimError(
-        f"output {folder}: holds an image of other inputs ({', '.join(differ)} differ); choose another folder, or "
-        "replace it with overwrite=True"
-    )
+    if not overwrite:
+        check_same_inputs(folder, read_json(folder / COLOUR), asked)
+    return True
 
 
 def _write(found: JudgedMosaic, folder: Path, asked: Mapping[str, str | float]) -> None:

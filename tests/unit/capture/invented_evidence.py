@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from mitsim.capture.decision import SceneFacts, decide
 from mitsim.capture.effects import parse_switches
 from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Evidence, Forming, Noise, Part, Settings
-from mitsim.capture.plan import Plan, PlanRow, SceneFacts, decide
+from mitsim.capture.plan import Plan, PlanRow
 from mitsim.capture.prices import (
     Numbers,
     Paces,

@@ -16,9 +16,10 @@ import pytest
 
 import mitsim as ms
 from mitsim.capture.ambient import shots_for
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import Light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import checksum, read_frame, write_frame

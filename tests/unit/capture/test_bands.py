@@ -115,7 +115,7 @@ def test_light_of_too_many_lines_is_flagged(chosen: Callable[..., bands.Coloured
 
 
 def test_what_has_no_answer_is_refused() -> None:
-    with pytest.raises(MitsimError, match="seconds 5: colours are chosen by an accuracy"):
+    with pytest.raises(MitsimError, match="seconds 5: runs in colour are not planned by time"):
         bands.choose_colour(bench(), Request.of(seconds=5.0))
     spectral = SimpleNamespace(variant="llvm_ad_spectral")
     with pytest.raises(MitsimError, match="variant llvm_ad_spectral: open the bench with a mono variant"):
@@ -134,8 +134,8 @@ def test_errors_are_rounded_up_to_two_digits(error: float, said: float) -> None:
 
 def test_a_plan_says_of_which_tag_mono_knows_no_colours(small_scene: Callable[..., Path]) -> None:
     """Without tracing: the error of a scene in greys is 0, that of another is not known."""
-    from mitsim.capture.bench import open_bench
-    from mitsim.capture.plan import SceneFacts
+    from mitsim.capture.decision import SceneFacts
+    from mitsim.capture.opening import open_bench
 
     scene = small_scene()
     grey, red = (SceneFacts.of(open_bench(scene, albedo=a)).spectrum for a in ("0.5", "400:0.2, 700:0.5"))

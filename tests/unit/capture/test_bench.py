@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
+from mitsim.capture.opening import open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError

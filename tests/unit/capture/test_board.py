@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.board import missed_pixels
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.light import trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.capture.session import Session
 from mitsim.rig.board import CELLS, BoardShape

@@ -16,9 +16,10 @@ import pytest
 
 import mitsim
 from mitsim.capture import effects
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS, Effect, Physics, _registry, _value
 from mitsim.capture.evidence import Settings
+from mitsim.capture.opening import open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import ArgumentError
 from mitsim.rig.patterns import Lighting

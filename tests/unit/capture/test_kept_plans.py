@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.rig.patterns import Lighting, parse_patterns
 from tests.kept_plans import question
 

@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 
 from mitsim.capture import colour
-from mitsim.capture.bench import open_bench
 from mitsim.capture.colour import ColourBench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.filing import Tray
+from mitsim.capture.opening import open_bench
 from mitsim.capture.request import Request
 from mitsim.capture.run import _of_unknown_light
 from mitsim.capture.simulation import Simulation

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.losses import known_losses
+from mitsim.capture.opening import open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame

@@ -12,11 +12,13 @@ import pytest
 
 from mitsim.capture import light as module
 from mitsim.capture import planning
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.decision import SceneFacts
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.light import Sampling, trace_light
-from mitsim.capture.plan import Plan, SceneFacts
+from mitsim.capture.opening import open_bench
+from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation
 from mitsim.core.errors import MitsimError

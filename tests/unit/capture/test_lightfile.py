@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Settings, SharpPixels
 from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.light import Light, Sampling, trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.capture.simulation import Simulation

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.capture.mosaic import MosaicBench, MosaicFrames
+from mitsim.capture.opening import open_bench
 from mitsim.capture.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job

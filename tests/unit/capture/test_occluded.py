@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from mitsim.capture import pilot
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings, SharpPixels
+from mitsim.capture.opening import open_bench
 from mitsim.capture.pilot.looks import Sample
 from mitsim.capture.pilot.occluded import occluded_pixels
 from mitsim.capture.planning import make_plan

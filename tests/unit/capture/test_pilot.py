@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from mitsim.capture import effects, pilot
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Evidence, Settings
+from mitsim.capture.opening import open_bench
 from mitsim.capture.pilot import direct, followed, looks
 from mitsim.capture.pilot.switched import SwitchedEffects
 from mitsim.capture.simulation import AT_ANCHORS, Simulation

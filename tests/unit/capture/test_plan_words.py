@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.decision import SceneFacts, decide
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Evidence, Part, Settings
-from mitsim.capture.plan import SceneFacts, decide
 from mitsim.capture.prices import paces_of
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.outline import Tag
@@ -49,7 +49,7 @@ def test_devices_are_flagged_where_their_model_ends(
     monkeypatch: pytest.MonkeyPatch, device: Bench, words: list[str]
 ) -> None:
     """At a wall's shift of one feature, and a feature of the longest wavelength."""
-    monkeypatch.setattr("mitsim.capture.plan.EFFECTS", {})
+    monkeypatch.setattr("mitsim.capture.decision.EFFECTS", {})
     facts = SceneFacts.of(device)
     assert facts.keystone == 2.5 and len(facts.warnings) == len(words)
     for warning, part in zip(facts.warnings, words, strict=True):

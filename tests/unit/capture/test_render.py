@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.core.errors import MitsimError
 
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from mitsim.capture import run
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.light import trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Exposure, Request
 from mitsim.core.errors import ArgumentError, MitsimError

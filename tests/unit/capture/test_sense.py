@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from mitsim.capture.request import Exposure
-from mitsim.capture.sense import check_ending, irradiance_behind_lens, read_image, sense
+from mitsim.capture.sense import irradiance_behind_lens, read_image, sense
+from mitsim.capture.sensing import check_ending
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame, write_frame
@@ -118,4 +119,4 @@ def test_a_png_holds_16_bits(tmp_path: Path) -> None:
         with pytest.raises(MitsimError, match="16 bits end"):
             check_ending(tmp_path / "x.png", model)
     with pytest.raises(MitsimError, match="ends in"):
-        check_ending(tmp_path / "x.jpg")
+        check_ending(tmp_path / "x.jpg", sensor())

@@ -13,13 +13,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import calibrate
 from mitsim.capture.checkpoint import Checkpoint
 from mitsim.capture.cost import frame_seconds
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
+from mitsim.capture.opening import open_bench
 from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan
 from mitsim.capture.session import Session

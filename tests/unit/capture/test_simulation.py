@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Settings
+from mitsim.capture.opening import open_bench
 from mitsim.capture.simulation import AT_ANCHORS, Simulation
 from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.shadow import Directions

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from mitsim.capture import truth as module
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import Settings
 from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.rig.patterns import parse_patterns

@@ -20,6 +20,7 @@ from mitsim.core.runs import Capture, load_run
 from mitsim.reconstruct.cost import Predicted, predicted
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.result import may_replace
 from mitsim.reconstruct.status import Status, Verdict
 from mitsim.rig.patterns import parse_patterns
 from mitsim.study.quality import reconstruct as reconstruct_folders
@@ -203,6 +204,20 @@ def test_another_image_is_not_overwritten(shots: Capture, factors: Factors, tmp_
     )
     result = json.loads((tmp_path / "image" / "result.json").read_text())
     assert result["lambda"] == 2.0 and result["status"] == str(others[0].status)
+
+
+def test_an_image_at_another_depth_is_another_image(tmp_path: Path) -> None:
+    """One by ``focus`` gave way to one without. (Planted: only what is asked for now is compared.)"""
+    asked: dict[str, str | float] = {"run": "a", "lambda": "auto"}
+    (tmp_path / "image.exr").write_text("an image")
+    for earlier in (asked, {**asked, "focus": 350.0}):
+        (tmp_path / "result.json").write_text(json.dumps({"inputs": earlier}))
+        if earlier == asked:
+            assert may_replace(tmp_path, asked, overwrite=False)
+            continue
+        with pytest.raises(MitsimError, match=r"other inputs \(focus differ\)"):
+            may_replace(tmp_path, asked, overwrite=False)
+        assert may_replace(tmp_path, asked, overwrite=True)
 
 
 def test_the_folders_are_refused_before_work(

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.capture.bench import open_bench
 from mitsim.capture.losses import known_losses
+from mitsim.capture.opening import open_bench
 from mitsim.core.errors import MitsimError
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -10,10 +10,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.choice import counted
 from mitsim.capture.evidence import GROUPS
 from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
 from mitsim.capture.request import Request
 from mitsim.core.job import Clock, Job

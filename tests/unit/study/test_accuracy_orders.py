@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from mitsim.capture.bench import open_bench
 from mitsim.capture.evidence import Part
+from mitsim.capture.opening import open_bench
 from mitsim.core.job import Job
 from mitsim.study.accuracy import PARENT, figures
 from mitsim.study.accuracy.findings import PartCost

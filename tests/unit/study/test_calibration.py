@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import open_bench
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimate, estimates
+from mitsim.capture.opening import open_bench
 from mitsim.capture.request import Request
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import shipped

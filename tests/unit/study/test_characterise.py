@@ -11,7 +11,7 @@ from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.rig.sensor import SensorModel, load_sensor
 from mitsim.study.characterise import characterise
-from mitsim.study.procedure import Procedure
+from mitsim.study.emva import Procedure
 from tests.invented import sensor
 
 SMALL = Procedure(pixels=64, steps=25, frames=16)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mitsim.capture import light, run
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.capture.request import Request
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError

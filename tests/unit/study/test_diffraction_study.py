@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.capture.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.optics.separable import best_term, centred

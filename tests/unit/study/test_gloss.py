@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.study.exposures import EQUAL_PEAK, LitScene, Unexposed
 from mitsim.study.gloss import CAUSES, INTERREFLECTION, PIXELS, REST, SATURATION, SENSOR, Split, split
 from mitsim.study.ideal import IdealCamera

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from mitsim.capture.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.study import STUDIES, find_study, plots
-from mitsim.study.runner import StudyResult, run_study, study_folder
+from mitsim.study.folder import study_folder
+from mitsim.study.runner import StudyResult, run_study
 
 BENCH: Any = SimpleNamespace(loaded=SimpleNamespace(path=Path("scene.xml")))
 
@@ -64,7 +65,7 @@ def test_a_study_replaces_an_earlier_one_of_its_name_alone(tmp_path: Path) -> No
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"kind": "recipe"}', '{"rows": []}'])
 def test_a_json_of_something_else_is_no_earlier_study(tmp_path: Path, text: str) -> None:
     (tmp_path / "toy.json").write_text(text)
-    with pytest.raises(MitsimError, match=r"toy\.json|holds files"), study_folder(tmp_path, "toy", ("*.png",)):
+    with pytest.raises(MitsimError, match=r"toy\.json|holds files"), study_folder(tmp_path, "toy"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["toy.json"]
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.transport.aimed import AimedTracer
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.lobes import sharp_light

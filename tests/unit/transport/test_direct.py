@@ -11,7 +11,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.optics.anchors import anchor_positions
 from mitsim.rig.camera import CameraGeometry

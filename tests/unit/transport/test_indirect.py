@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport import paths
 from mitsim.transport.cells import aligned_grid

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from mitsim.capture import effects
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import Settings
+from mitsim.capture.opening import open_bench
 from mitsim.capture.simulation import Simulation
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.paths import Tracer

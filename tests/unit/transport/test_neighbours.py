@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport.cells import aligned_grid
 from mitsim.transport.histogram import INDIRECT, Bundle, Deposits
@@ -206,7 +207,7 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
 
 _PRINT = """
 import hashlib, sys, drjit as dr, numpy as np
-from mitsim.capture.bench import open_bench
+from mitsim.capture.opening import open_bench
 from mitsim.transport.cells import aligned_grid
 from mitsim.transport.histogram import Bundle
 from mitsim.transport.ledger import Ledger

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench, open_bench
+from mitsim.capture.bench import Bench
+from mitsim.capture.opening import open_bench
 from mitsim.transport.cells import aligned_grid
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits

@@ -1,0 +1,158 @@
+"""Opening a bench: names or files of a scene, a camera and a projector in; a bench, or a refusal, out.
+
+What can be refused without numpy or the renderer is refused before they are imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mitsim.capture.bench import Bench
+from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
+from mitsim.core.environment import DEFAULT_VARIANT, load_variant
+from mitsim.core.errors import MitsimError
+from mitsim.scene.guard.files import SceneFiles
+from mitsim.scene.guard.outline import Outline
+
+if TYPE_CHECKING:
+    from mitsim.rig.profile import MaskProfile
+    from mitsim.scene.load import LoadedScene
+
+_PITCH_TOLERANCE = 1e-3
+"""Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
+
+
+def check_scene(scene: Path | str, defines: Mapping[str, str], outside: bool = False) -> Path:
+    """Where a scene lies, which is refused without the renderer where that is possible.
+
+    Parameters
+    ----------
+    scene
+        as of :func:`open_bench`.
+    defines
+        values of its parameters by name.
+    outside
+        as ``allow_outside_files`` there.
+
+    Raises
+    ------
+    MitsimError
+        for a scene that there is not, a parameter that it does not have, and XML that is not well-formed.
+    """
+    path = locate(scene, "scenes", "scene.xml")
+    Outline(path, defines, SceneFiles(path, outside))
+    return path
+
+
+def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
+    """Files of a ``camera`` and a ``projector``, as of :func:`open_bench`; MitsimError for one that there is not."""
+    found = ((camera, DEFAULT_CAMERA), (projector, "mp_cl1"))
+    first, second = (locate(default if name is None else name, "calibration", ".toml") for name, default in found)
+    return first, second
+
+
+def open_bench(
+    scene: Path | str,
+    variant: str = DEFAULT_VARIANT,
+    camera: Path | str | None = None,
+    projector: Path | str | None = None,
+    allow_outside_files: bool = False,
+    for_render: bool = False,
+    **parameters: object,
+) -> Bench:
+    """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
+
+    Parameters
+    ----------
+    scene
+        name of a shipped scene, or path of a scene XML or of the folder that holds it (``./name`` for a folder that is
+        called like a shipped scene).
+    variant
+        of Mitsuba.
+    camera, projector
+        name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1.
+    allow_outside_files
+        whether the scene may read files outside its folder.
+    for_render
+        only light matters: the camera's electronics need not fit, and the scene needs no projector.
+    **parameters
+        values of the scene's ``<default>`` parameters, text or numbers.
+
+    Raises
+    ------
+    MitsimError
+        for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
+        scene's where the camera file has one.
+    """
+    defines = {name: _text(value) for name, value in parameters.items()}
+    path = check_scene(scene, defines, allow_outside_files)
+    sensor_path, projector_path = check_devices(camera, projector)
+    from mitsim.rig.sensor import load_sensor
+
+    sensor = load_sensor(sensor_path)
+    # What imports numpy comes after what does not.
+    from mitsim.rig.profile import load_mask
+    from mitsim.rig.projector import ProjectorModel
+    from mitsim.rig.rig import Rig
+
+    mask = load_mask(sensor_path)
+    if mask is not None and "mask" in defines:
+        raise MitsimError(
+            f"camera {sensor_path}: has a table [mask], and the scene's mask was set to {defines['mask']!r} as well; "
+            "give one of the two"
+        )
+    light = load_model(projector_path, ProjectorModel)
+    # All lines at once behind colour filters are for variants that tell them apart.
+    if not for_render and not (sensor.mosaic and variant.endswith("_spectral")):
+        try:
+            sensor.efficiency(light.effective_wavelength_nm)
+        except MitsimError as error:
+            raise MitsimError(f"camera {sensor_path}: {error}") from None
+    # Only now, with all else checked: the renderer takes a second to import.
+    loaded = _loaded(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
+    row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning
+    of_rows, of_columns = zip((row_um, sensor.superpixel_pitch_um), loaded.camera.geometry.pitches, strict=True)
+    for name, (um, stated) in (("pixel_pitch", of_columns), ("row_pitch", of_rows)):
+        if not for_render and abs(um * 1e-3 - stated) > _PITCH_TOLERANCE * stated:
+            raise MitsimError(
+                f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {um:g} um, but {scene} has "
+                f"{stated * 1e3:g} um; use the camera of that scene, or change {name}, or binning"
+            )
+    _wear(loaded, mask, sensor_path)
+    rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
+    return Bench(loaded, rig, variant, defines)
+
+
+def reopened(bench: Bench, variant: str) -> Bench:
+    """The ``bench`` loaded anew into a ``variant``, which is set from then on. MitsimError as :func:`open_bench`."""
+    from mitsim.rig.profile import load_mask
+
+    camera = Path(bench.rig.camera_file)
+    loaded = _loaded(variant, bench.loaded.path, bench.defines, outside=True)
+    _wear(loaded, load_mask(camera), camera)
+    return replace(bench, loaded=loaded, variant=variant)
+
+
+def _wear(loaded: LoadedScene, mask: MaskProfile | None, camera: Path) -> None:
+    """Put a ``mask`` of the file of a ``camera``, where it has one, before the sensor of a ``loaded`` scene."""
+    if mask is not None:
+        loaded.camera.wear(mask.worn(loaded.camera.geometry, camera.parent))
+
+
+def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:
+    """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
+    mitsuba = load_variant(variant)
+    from mitsim.scene.load import load_scene
+    from mitsim.transport import plugins
+
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    plugins.register()
+    return load_scene(path, defines, **options)
+
+
+def _text(value: object) -> str:
+    """A parameter as a scene spells it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)

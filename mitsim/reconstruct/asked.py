@@ -1,0 +1,40 @@
+"""How an image is asked for: method, lambda, focus and margin in; a refusal out, before the solver is imported."""
+
+from __future__ import annotations
+
+import math
+
+from mitsim.core.errors import ArgumentError
+
+METHODS = ("tikhonov", "tv")
+"""Of solving."""
+IMAGE_FILE = "image.exr"
+"""By which a folder is known to hold an image."""
+
+
+def check_asked(lam: float | str, method: str, focus: float | str | None, margin: int) -> None:
+    """ArgumentError for what :func:`mitsim.reconstruct.reconstruction.reconstruct` does not take.
+
+    Parameters
+    ----------
+    lam, method, focus, margin
+        as there.
+    """
+    if method not in METHODS:
+        raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
+    if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < math.inf):
+        raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
+    if focus is not None and focus not in ("auto", "map") and (isinstance(focus, str) or not 0 < focus < math.inf):
+        raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
+    if focus == "map" and method != "tikhonov":
+        raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
+    if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
+        raise ArgumentError("margin", f"{margin}: give a whole number of cells, at least 0")
+    if margin and (focus is not None or method != "tikhonov"):
+        raise ArgumentError("margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus")
+
+
+def check_joint(lam: float | str) -> None:
+    """ArgumentError for a lambda ``lam`` that runs behind colour filters are not solved with."""
+    if lam != "auto" and (isinstance(lam, str) or not 0 < lam < math.inf):
+        raise ArgumentError("lam", f"{lam}: behind colour filters give a finite number above 0, or auto")
