@@ -474,6 +474,11 @@ class Bench:
         return self.rig.sensor
 
     @property
+    def counting(self) -> SensorModel:
+        """The electronics whose efficiency counts lamps' light, with their colour filters."""
+        return self.sensor
+
+    @property
     def projector(self) -> ProjectorModel:
         """The projector's light and lens."""
         return self.rig.projector
@@ -640,7 +645,7 @@ class Bench:
             "defines": self.defines,
             "variant": self.variant,
             **({} if self.lines is None else {"lines": asdict(self.lines)}),
-            **({} if self.lamplight is None else {"lamps_nm": list(self.lamplight.response.range_nm)}),
+            **({} if self.lamplight is None else {"lamps_nm": list(self.lamplight.range_nm)}),
             "projector_model": {
                 **self.projector.model_dump(mode="json", exclude={"contrast_ratio"}),
                 "black_level": self.projector.black_level,

@@ -232,7 +232,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
     lamp = '<emitter type="constant"/>'
     bench = open_bench(small_scene(extra=lamp), variant, None, "mp_cl1")
     response = Response.of(bench.sensor)
-    bench = replace(bench, lamplight=Lamplight(response, response.bands(4), spectra, np.full(4, 0.25)))
+    bench = replace(bench, lamplight=Lamplight((response,), response.bands(4), spectra, np.full(4, 0.25)))
     settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
     simulation, labels = Simulation(bench, settings), np.zeros(bench.n**2, dtype=np.int64)
     frames = []
@@ -254,7 +254,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
 @pytest.mark.parametrize(("part", "flagged"), [(0.5, True), (0.02, False)])
 def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool) -> None:
     """Where it is more of all light than the accuracy."""
-    lamplight = Lamplight(Response(np.ones(2), (400.0, 700.0)), (), unknown=0.04)
+    lamplight = Lamplight((Response(np.ones(2), (400.0, 700.0)),), (), unknown=0.04)
     light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), plan=SimpleNamespace(accuracy=1e-3))
     said = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
     assert bool(said) is flagged and all("4.0% of the lamps' light is in no frame" in sentence for sentence in said)
