@@ -290,8 +290,7 @@ class Bench:
         ------
         MitsimError
             as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
-            odd number of pixels, and a projector with speckle or a scene with lamps, which are not simulated behind
-            filters.
+            odd number of pixels, and a projector with speckle, which is not simulated behind filters.
         """
         from mitsim.core.job import Job
 

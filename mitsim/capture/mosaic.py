@@ -13,6 +13,7 @@ irradiance c / lambda. The lines share their paths, for plan and sampling; here 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
@@ -25,7 +26,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.colour import ColourBench, plan_lines, refuse, traced_lines
 from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
-from mitsim.capture.run import capture, check_run
+from mitsim.capture.run import capture, check_run, sampling_of
 from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import Truth
 from mitsim.core.arrays import FloatArray
@@ -159,7 +160,7 @@ class MosaicLight(Light):
         """
         assert self.passed is not None, "made by of()"
         lines = [light.frames(lighting, seed, leaking).of_projector for light in self.by_line]
-        return MosaicFrames(lines, self.passed, self._lamps(seed))
+        return MosaicFrames(lines, self.passed, self._lamps(seed), self.by_line[0].simulation.lamps_apart)
 
     def _lamps(self, seed: int) -> Frame | None:
         """Lamps' light behind the filters, with its error by probes of a ``seed``; None without lamps."""
@@ -169,11 +170,9 @@ class MosaicLight(Light):
         each = [lamplight.units_of(light.bench.projector.lines)[0] for light in self.by_line]
         unit, line = max((unit, line) for line, unit in enumerate(each))
         light = self.by_line[line]
-        first = light.groups[0].fine.shape[0] - len(lamplight.bands)
         frames, counted = list[Frame](), np.zeros((len(PLANES), len(lamplight.responses)))
         for number, response in enumerate(lamplight.responses):
-            filed = light.simulation.of_lamps(light.groups, first, lamplight.rows(number))
-            frames += ExpectedFrames(filed, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
+            frames += _lamps_alone(light, lamplight.rows(number), seed)
             # Filed is the mean over all pixels, of which the response's have it all.
             counted[list(response.planes), number] = 1 / (
                 response.part * unit * self.bench.projector.effective_wavelength_nm
@@ -190,11 +189,39 @@ class MosaicLight(Light):
         return 0.0
 
 
+def _lamps_alone(light: Light, bands: slice, seed: int) -> ExpectedFrames:
+    """One frame of lamps of a ``light``, of some ``bands`` of theirs; a ``seed`` of its probes."""
+    lamplight = light.bench.lamplight
+    assert lamplight is not None, "asked before"
+    filed = light.simulation.of_lamps(light.groups, light.groups[0].fine.shape[0] - len(lamplight.bands), bands)
+    return ExpectedFrames(filed, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
+
+
+def _excess(lights: Sequence[Light]) -> float:
+    """By how much the error of lamps' light behind filters exceeds that of their mean over all pixels, which is in
+    every line's light; 1 without ``lights`` of lamps.
+
+    A filter's few wavelengths are sampled worse than all. Its frames weigh by their energy, which for the same scene is
+    that of what a pixel counts.
+    """
+    light, lamplight = lights[0], lights[0].bench.lamplight
+    if lamplight is None or lamplight.shares is None:
+        return 1.0
+    whole, _ = _lamps_alone(light, slice(None), light.seed).sampling_error()
+    energy = variance = 0.0
+    for number, response in enumerate(lamplight.responses):
+        rows = lamplight.rows(number)
+        error, _ = _lamps_alone(light, rows, light.seed).sampling_error()
+        own = float(lamplight.shares[rows].sum()) ** 2 / response.part
+        energy, variance = energy + own, variance + own * error**2
+    return max(1.0, math.sqrt(variance / energy) / whole) if whole else 1.0
+
+
 class MosaicFrames(ExpectedFrames):
     """Frames of every shot behind the filters; iterate as often as needed.
 
     Lines are traced on the same paths, so their errors go together: that of the sum is at most the sum of theirs.
-    Lamps' paths may be those of light in mirrors, and their error is added up alike.
+    So do they with that of lamps' light, but where no other light is on lamps' paths.
 
     Parameters
     ----------
@@ -204,10 +231,14 @@ class MosaicFrames(ExpectedFrames):
         (lines, m, m') part of its irradiance that counts.
     lamps
         their light, as it counts, which is in every frame.
+    apart
+        whether no other light is on their paths.
     """
 
-    def __init__(self, lines: Sequence[ExpectedFrames], passed: FloatArray, lamps: Frame | None = None) -> None:
-        self._lines, self._passed, self._lamps = tuple(lines), passed, lamps
+    def __init__(
+        self, lines: Sequence[ExpectedFrames], passed: FloatArray, lamps: Frame | None = None, apart: bool = False
+    ) -> None:
+        self._lines, self._passed, self._lamps, self._apart = tuple(lines), passed, lamps, apart
         self._spread = np.sqrt(np.square(passed).mean(axis=(1, 2)))
 
     def __len__(self) -> int:
@@ -224,14 +255,13 @@ class MosaicFrames(ExpectedFrames):
         return self._lines[0].projector_off if self._lamps is None else replace(self._lamps, variance=0.0, by_group=())
 
     def __iter__(self) -> Iterator[Frame]:
-        spread = self._spread if self._lamps is None else np.append(self._spread, 1.0)
         always = () if self._lamps is None else (self._lamps,)
         for shot in zip(*self._lines, strict=True):
             light = np.einsum("lij,lij->ij", self._passed, np.stack([frame.irradiance for frame in shot]))
             if self._lamps is not None:
                 light += self._lamps.irradiance
             groups = zip(*(frame.by_group or (frame.variance,) for frame in (*shot, *always)), strict=True)
-            parts = [float(spread @ np.sqrt(each)) ** 2 for each in groups]
+            parts = [self._added(each) for each in groups]
             variance = sum(parts)
             yield Frame(
                 light,
@@ -240,6 +270,12 @@ class MosaicFrames(ExpectedFrames):
                 max(parts) / variance if variance else 0.0,
                 tuple(parts) if shot[0].by_group else (),
             )
+
+    def _added(self, variances: Sequence[float]) -> float:
+        """Variance of the sum of all lines' light and lamps', from a group's of each."""
+        lines, lamps = variances[: len(self._lines)], sum(variances[len(self._lines) :])
+        own = float(self._spread @ np.sqrt(lines))
+        return own**2 + lamps if self._apart else (own + math.sqrt(lamps)) ** 2
 
 
 def capture_mosaic(
@@ -266,7 +302,8 @@ def capture_mosaic(
         all_lines = colours.whole
         assert isinstance(all_lines, MosaicBench)
         check_run(all_lines, request, place, resume)
-        lights = traced_lines(colours, request, job)
+        sampling = replace(sampling_of(all_lines, request), excess=_excess)
+        lights = traced_lines(colours, request, job, sampling=sampling)
         light = MosaicLight.of(all_lines, lights, manifest.wavelengths_nm)
         shots = capture(all_lines, request, job, place, resume, light=light)
     board = load_recipe().board_reflectance

@@ -132,6 +132,15 @@ class Simulation(Trays):
     def _mean_points(self) -> SensorPoints:
         return self._points(1, self.settings.followed_anchors > 1)
 
+    @property
+    def lamps_apart(self) -> bool:
+        """Whether lamps' paths are followed for no light of the projector."""
+        return not self._from_camera_of_projector
+
+    @property
+    def _from_camera_of_projector(self) -> bool:
+        return self.physics.mirrors or (self.physics.interreflection and self.bench.loaded.glossy)
+
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
 
@@ -145,7 +154,7 @@ class Simulation(Trays):
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
         loaded, physics, lamplight = self.bench.loaded, self.physics, self.bench.lamplight
-        of_projector = physics.mirrors or (physics.interreflection and loaded.glossy)
+        of_projector = self._from_camera_of_projector
         if not (physics.lamps or of_projector):
             return None
         paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
