@@ -271,6 +271,20 @@ def test_a_number_is_the_efficiency_at_every_wavelength() -> None:
     assert line_units(sensor(quantum_efficiency=0.5), Lines((600.0, 400.0), (0.5, 0.5))) == (1 / 300, 1 / 200)
 
 
+def test_lines_behind_filters_share_a_count_as_their_power() -> None:
+    """Together they make as many electrons of a pixel in the mean. (Planted: each line all of it.)"""
+    ends = {"R": 0.0, "G": 0.2, "B": 0.4}
+    curves = {name: {"wavelengths_nm": [390.0, 610.0], "efficiency": [0.4, last]} for name, last in ends.items()}
+    change = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": curves, "binning": 1}
+    behind, lines = sensor(**change), Lines((600.0, 400.0), (0.75, 0.25))
+    units, mean = line_units(behind, lines), np.mean(behind.planes(lines.wavelengths_nm), axis=0)
+    assert units[0] / units[1] == pytest.approx(3)
+    assert sum(mean * units * np.array(lines.wavelengths_nm)) == pytest.approx(1)
+    blind = {name: {"wavelengths_nm": [390.0, 395.0, 610.0], "efficiency": [0.4, 0, 0]} for name in "RGB"}
+    with pytest.raises(MitsimError, match="is blind to all lines of the projector"):
+        line_units(sensor(**{**change, "mosaic_curves": blind}), Lines((600.0, 500.0), (0.75, 0.25)))
+
+
 def test_bands_are_even_and_so_are_their_parts() -> None:
     response = Response(np.ones(2), (400.0, 800.0))
     assert response.bands(4) == ((400, 500), (500, 600), (600, 700), (700, 800))

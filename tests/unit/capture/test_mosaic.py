@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.capture import mosaic
 from mitsim.capture.bench import Bench, open_bench
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.capture.evidence import Settings
@@ -84,6 +85,26 @@ def test_lamps_are_in_every_frame_and_alone_in_the_dark_one(apart: bool) -> None
     assert lit.irradiance == pytest.approx(dark.irradiance + lamps.irradiance)
     both = np.array(dark.by_group) + theirs, np.square(spread.sum() * np.sqrt(own) + np.sqrt(theirs))
     assert lit.by_group == pytest.approx(both[0 if apart else 1])
+
+
+def test_sampling_looks_at_lamps_behind_each_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors of 1, 2 and 3 % beside 1 % of the mean, of pixels that count 4, 2 and 1. (Planted: a mean of errors.)"""
+    responses = [Response(np.ones(2), (400.0, 700.0), planes=planes) for planes in ((0,), (1, 2), (3,))]
+    shares = np.repeat([4 / 9, 2 * 2 / 9, 1 / 9], 4) / 4
+    lamplight = Lamplight(tuple(responses), ((400.0, 700.0),) * 12, shares=shares)
+    errors: dict[int | None, float] = {0: 0.01, 4: 0.02, 8: 0.03, None: 0.01}
+
+    def alone(light: Any, bands: slice, seed: int) -> Any:
+        return SimpleNamespace(sampling_error=lambda: (errors[bands.start], 0.0))
+
+    monkeypatch.setattr(mosaic, "_lamps_alone", alone)
+    light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), seed=0)
+    energy = np.array([16.0, 2 * 4.0, 1.0])
+    expected = np.sqrt(np.dot(energy, [1, 4, 9]) / energy.sum())
+    assert mosaic._excess([light, light]) == pytest.approx(expected)
+    errors[None] = 0.05
+    dark: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=None))
+    assert mosaic._excess([light]) == mosaic._excess([dark]) == 1
 
 
 @pytest.fixture(scope="module")
