@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.colours import MosaicManifest
-from mitsim.core.manifests import Digital, Patterns, RunManifest
+from mitsim.core.manifests import AmbientFile, Digital, Patterns, RunManifest
 from mitsim.core.mosaics import LineTruth, MosaicCapture
-from mitsim.core.recorders import RunMemory, frame_name
+from mitsim.core.recorders import AMBIENT, RunMemory, frame_name
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.colour import chart
 from mitsim.rig.chart import ChartPlace
@@ -63,8 +63,15 @@ WEIGHTS = ((0.10, 0.15, 0.50), (0.06, 0.45, 0.05), (0.06, 0.45, 0.05), (0.36, 0.
 """Electrons per photon of blue, green, green and red pixels at the lines."""
 
 
-def mosaic_folders(place: Path, patterns: str = "dots:4", peak: float = 3e4, truths: bool = True) -> tuple[Path, Path]:
-    """A run of the same chart behind filters BGGR, all lines at once, and its calibration, in ``place``.
+LAMP = 0.02, 0.06, 0.06, 0.04
+"""Of blue, green, green and red pixels: a lamp's part of the brightest pixel under the projector."""
+
+
+def mosaic_folders(
+    place: Path, patterns: str = "dots:4", peak: float = 3e4, truths: bool = True, lamp: bool = False
+) -> tuple[Path, Path]:
+    """A run of the same chart behind filters BGGR, all lines at once, and its calibration, in ``place``; under an even
+    ``lamp`` where that is asked for, with its ambient frame.
 
     Each line has a shadow of its own, a third of a pixel from the next.
     """
@@ -81,17 +88,26 @@ def mosaic_folders(place: Path, patterns: str = "dots:4", peak: float = 3e4, tru
             for weights, (a, b) in zip(WEIGHTS, ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True):
                 light[a::2, b::2] += weights[number] * seen[a::2, b::2]
         lights.append(light)
+    always = np.tile(np.reshape(LAMP, (2, 2)), np.array(lights[0].shape) // 2) * max(light.max() for light in lights)
+    lights = [light + lamp * always for light in lights]
     gain, memory = peak / max(light.max() for light in lights), RunMemory()
-    for index, light in enumerate(lights):
+
+    def exposed(light: np.ndarray) -> np.ndarray:
         electrons = rng.poisson(gain * light) + ideal_sessions.READ * rng.standard_normal(light.shape)
-        dn = np.clip(np.rint(ideal_sessions.GAIN * electrons + ideal_sessions.BLACK), 0, 2**13 - 1).astype(np.uint32)
-        memory.write_frame(index, {"DN": dn}, {})
+        return np.clip(np.rint(ideal_sessions.GAIN * electrons + ideal_sessions.BLACK), 0, 2**13 - 1).astype(np.uint32)
+
+    for index, light in enumerate(lights):
+        memory.write_frame(index, {"DN": exposed(light)}, {})
+    if lamp:
+        memory.write(AMBIENT, {"DN": np.mean([exposed(always) for _ in range(16)], axis=0, dtype=np.float32)}, {})
     digital = Digital(
         exposure_s=gain, gain_dn_per_e=ideal_sessions.GAIN, black_level_dn=ideal_sessions.BLACK,
         dark_current_e_per_s=0.0, read_noise_e=ideal_sessions.READ, step_dn=1.0,
     )  # fmt: skip
     files = [frame_name(index) for index in range(len(lights))]
-    shots = Capture.recorded(memory, RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files)))
+    ambient = AmbientFile(file=AMBIENT, shots=16) if lamp else None
+    held = RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files), ambient_frame=ambient)
+    shots = Capture.recorded(memory, held)
     named = MosaicManifest.model_validate({**manifest("mosaic-run"), "mosaic": "BGGR", "weights": WEIGHTS})
     known = {name: LineTruth(image, np.full(image.shape, 1e-4), 0.99) for name, image in images.items()}
     run, calibration = place / "run", place / "cal"

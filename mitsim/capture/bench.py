@@ -278,8 +278,7 @@ class Bench:
         ------
         MitsimError
             as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
-            odd number of pixels, and a projector with speckle or a scene with lamps, which are not simulated behind
-            filters.
+            odd number of pixels, and a projector with speckle, which is not simulated behind filters.
         """
         from mitsim.core.job import Job
 
@@ -462,6 +461,11 @@ class Bench:
         return self.rig.sensor
 
     @property
+    def counting(self) -> SensorModel:
+        """The electronics whose efficiency counts lamps' light, with their colour filters."""
+        return self.sensor
+
+    @property
     def projector(self) -> ProjectorModel:
         """The projector's light and lens."""
         return self.rig.projector
@@ -628,7 +632,7 @@ class Bench:
             "defines": self.defines,
             "variant": self.variant,
             **({} if self.lines is None else {"lines": asdict(self.lines)}),
-            **({} if self.lamplight is None else {"lamps_nm": list(self.lamplight.response.range_nm)}),
+            **({} if self.lamplight is None else {"lamps_nm": list(self.lamplight.range_nm)}),
             "projector_model": {
                 **self.projector.model_dump(mode="json", exclude={"contrast_ratio"}),
                 "black_level": self.projector.black_level,

@@ -19,7 +19,7 @@ import numpy as np
 
 from mitsim.capture.evidence import Settings
 from mitsim.capture.lamplight import lit_by_lamps
-from mitsim.capture.light import Light, trace_lines
+from mitsim.capture.light import Light, Sampling, trace_lines
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import check_untimed
 from mitsim.capture.run import capture, check_run, plan_request, sampling_of
@@ -184,7 +184,9 @@ def plan_lines(colours: ColourBench, request: Request) -> Plan:
     return plan
 
 
-def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | None = None) -> list[Light]:
+def traced_lines(
+    colours: ColourBench, request: Request, job: Job, plan: Plan | None = None, sampling: Sampling | None = None
+) -> list[Light]:
     """Light of each line with its truth, traced on the same paths.
 
     Parameters
@@ -195,6 +197,8 @@ def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | 
         what is asked for; clock, progress and limits.
     plan
         made already.
+    sampling
+        other than the request's.
 
     Raises
     ------
@@ -207,7 +211,7 @@ def traced_lines(colours: ColourBench, request: Request, job: Job, plan: Plan | 
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
     with job.clock.stage("transport"):
-        sampling = sampling_of(colours.whole, request)
+        sampling = sampling or sampling_of(colours.whole, request)
         lights = trace_lines(colours.whole, colours.benches, plan, lighting, request.seed, sampling, job.progress)
     with job.clock.stage("truth"):
         errors = np.stack([light.flux_error for light in lights])

@@ -182,7 +182,7 @@ def _diffraction(bench: Bench) -> str:
 
 
 def _lamps(bench: Bench) -> str:
-    counted = ", counted from {:g} to {:g} nm".format(*bench.lamplight.response.range_nm) if bench.lamplight else ""
+    counted = ", counted from {:g} to {:g} nm".format(*bench.lamplight.range_nm) if bench.lamplight else ""
     return f"{len(bench.loaded.lamps)} emitter(s) beside the projector{counted}"
 
 

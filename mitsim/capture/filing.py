@@ -192,12 +192,12 @@ class Trays:
         self.sharp = self._tray(self._apart(pixels))
         whole = lamplight.whole if lamplight else _bands(*_AMBIENT_NM, _AMBIENT_BANDS)
 
-        def of_lamps(spectrum: Spectrum) -> tuple[Tray, Tray]:
+        def pair(spectrum: Spectrum) -> tuple[Tray, Tray]:
             return self._tray(fine, spectrum), self._tray(several, spectrum)
 
-        self.ambient, self.followed_ambient = of_lamps(whole)
+        self.ambient, self.followed_ambient = pair(whole)
         bands = lamplight.spectra if lamplight else ()
-        self.by_band = tuple(map(of_lamps, bands)) or ((self.ambient, self.followed_ambient),)
+        self.by_band = tuple(map(pair, bands)) or ((self.ambient, self.followed_ambient),)
 
     def _bundle(self, grid: CellGrid, anchors: int, depths: tuple[float, ...]) -> Bundle:
         return Bundle(grid, anchors, depths, lamps=self._lamp_rows)
@@ -357,7 +357,10 @@ class Trays:
         groups, first
             independent estimates of the light, and the first row of ambient light in them.
         """
-        lights, ambient = [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))], []
+        lights, ambient = (
+            [Filed(self.fine.optics, tuple(_rows(group.fine, 0, first) for group in groups))],
+            list[Filed](),
+        )
         if self.settings.anchors > 1:
             lights.append(Filed(self.coarse.optics, tuple(_rows(group.coarse, 0, first) for group in groups)))
         if self.settings.with_own_anchors:
@@ -369,11 +372,25 @@ class Trays:
         if self.physics.interreflection:
             lights.append(Filed(self.smooth.optics, tuple(_rows(group.smooth, 0, first) for group in groups)))
         if self.physics.lamps:
-            for row, (tray, beyond) in enumerate(self.by_band, first):
-                ambient.append(Filed(tray.optics, tuple(_rows(group.fine, row, row + 1) for group in groups)))
-                if self.settings.followed_anchors > 1:
-                    ambient.append(Filed(beyond.optics, tuple(_rows(group.followed, row, row + 1) for group in groups)))
+            ambient = self.of_lamps(groups, first)
         return lights, ambient
+
+    def of_lamps(self, groups: Sequence[FiledLight], first: int, bands: slice = slice(None)) -> list[Filed]:
+        """Lamps' light with the optics that form its frames.
+
+        Parameters
+        ----------
+        groups, first
+            as for :meth:`filed`.
+        bands
+            of which it is, where not of all.
+        """
+        found = []
+        for row, (tray, beyond) in list(enumerate(self.by_band, first))[bands]:
+            found.append(Filed(tray.optics, tuple(_rows(group.fine, row, row + 1) for group in groups)))
+            if self.settings.followed_anchors > 1:
+                found.append(Filed(beyond.optics, tuple(_rows(group.followed, row, row + 1) for group in groups)))
+        return found
 
 
 def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:

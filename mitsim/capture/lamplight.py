@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.colours import MOST_LINES
 from mitsim.core.seeds import integer
-from mitsim.rig.lamplight import SPECTRA_NM, Band, Lamplight, Response
+from mitsim.rig.lamplight import SPECTRA_NM, Band, Lamplight, Response, line_units
 from mitsim.rig.projector import Spectrum
 from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.lamps import Counted, LampTracer
@@ -45,35 +45,65 @@ def lit_by_lamps(bench: Bench, effects: Mapping[str, bool], seed: int) -> Bench:
     Raises
     ------
     MitsimError
-        for a camera whose efficiency is not known where lamps' spectra are.
+        for a camera whose efficiency is not known where lamps' spectra are, or that is blind to the projector's lines.
     """
     if not bench.loaded.lamps or not effects.get("ambient", True):
         return bench
-    response = Response.of(bench.sensor)
+    responses = Response.of_each(bench.counting)
     found = frozenset(name for name in present(bench) if effects.get(name, True))
     settings = Settings(bench.geometry.scene_distance, effects=found)
     tracer = Simulation(bench, settings, pixels=min(bench.n, _CELLS)).from_camera
     assert isinstance(tracer, FromCameraTracer), "lamps are followed, not yet apart"
-    first, last = response.range_nm
-    parts = math.ceil((last - first) / MOST_LINES / _STEP_NM)
-    stream = integer(seed, "lamplight")
-
-    def seen(*bands: Band) -> FloatArray:
-        """(bands,) light of each."""
-        light = LampTracer(tracer, Counted(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
-        return np.asarray(np.bincount(light.pixel - bench.n**2, light.value, MOST_LINES) / _SAMPLES)
-
-    # (bands, parts)
-    light = np.stack([seen(*response.bands(MOST_LINES, part, parts)) for part in range(parts)], axis=1)
-    middles = [[(low + high) / 2 for low, high in response.bands(MOST_LINES, part, parts)] for part in range(parts)]
+    looks = [_Look.of(response, tracer, integer(seed, "lamplight")) for response in responses]
+    light = np.concatenate([response.part * look.light for response, look in zip(responses, looks, strict=True)])
+    lines = bench.projector.lines
     lamplight = Lamplight(
-        response,
-        response.bands(MOST_LINES),
-        tuple(map(_spectrum, np.array(middles).T, light)),
-        light.sum(axis=1) / light.sum() if light.any() else np.full(MOST_LINES, 1 / MOST_LINES),
-        _unknown(response, seen((SPECTRA_NM[0], first), (last, SPECTRA_NM[1]), *_ends()), float(light.sum())),
+        responses,
+        tuple(band for response in responses for band in response.bands(MOST_LINES)),
+        tuple(spectrum for look in looks for spectrum in look.spectra),
+        light / light.sum() if light.any() else np.full(len(light), 1 / len(light)),
+        max(look.unknown for look in looks),
+        tuple(zip(lines.wavelengths_nm, line_units(bench.counting, lines), strict=True)),
     )
     return replace(bench, lamplight=lamplight)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What one response counts: ``light`` (bands,) and ``spectra`` of each of its bands, and the part ``unknown``."""
+
+    light: FloatArray
+    spectra: tuple[Spectrum, ...]
+    unknown: float
+
+    @classmethod
+    def of(cls, response: Response, tracer: FromCameraTracer, stream: int) -> _Look:
+        """By a few paths.
+
+        Parameters
+        ----------
+        response
+            that counts.
+        tracer, stream
+            whose paths they are, and their random numbers.
+        """
+        first, last = response.range_nm
+        parts = math.ceil((last - first) / MOST_LINES / _STEP_NM)
+
+        def seen(*bands: Band) -> FloatArray:
+            """(bands,) light of each."""
+            light = LampTracer(tracer, Counted(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
+            return np.asarray(np.bincount(light.pixel - tracer.projector.n**2, light.value, MOST_LINES) / _SAMPLES)
+
+        # (bands, parts)
+        light = np.stack([seen(*response.bands(MOST_LINES, part, parts)) for part in range(parts)], axis=1)
+        middles = [[(low + high) / 2 for low, high in response.bands(MOST_LINES, part, parts)] for part in range(parts)]
+        unknown = seen((SPECTRA_NM[0], first), (last, SPECTRA_NM[1]), *_ends())
+        return cls(
+            light.sum(axis=1),
+            tuple(map(_spectrum, np.array(middles).T, light)),
+            _unknown(response, unknown, float(light.sum())),
+        )
 
 
 def _spectrum(wavelengths: FloatArray, light: FloatArray) -> Spectrum:

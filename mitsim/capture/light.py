@@ -72,11 +72,15 @@ class Sampling:
         keep the light of every projector pixel apart, for any family; else by the lighting's classes, which is faster.
     target
         error to stop at, where the plan's own is not wanted.
+    excess
+        from lights of all lines, by how much the error of frames that are made of them together exceeds theirs, as a
+        ratio; None: they are frames of their own.
     """
 
     purpose: str = "scene"
     by_pixel: bool = True
     target: Target | None = None
+    excess: Callable[[Sequence[Light]], float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,6 +359,8 @@ def trace_lines(
     sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
     own = [simulation if each is bench else Simulation(each, plan.settings) for each in benches]
+    for each in own[1:]:
+        each.by_band = own[0].by_band  # lamps' light diffracts beside each line alike: its optics are prepared once
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
     followed = bool(simulation.indirect or simulation.from_camera)
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
@@ -366,14 +372,15 @@ def trace_lines(
                 group.sample(rounds, filing)
             filing.wait()
         lights, most, near = list[Light](), 0.0, 1.0
-        for line, each in enumerate(own):
-            light, bound = _looked(_line_of(groups, line, each, plan, seed), lighting, followed)
+        looks = [_looked(_line_of(groups, line, each, plan, seed), lighting, followed) for line, each in enumerate(own)]
+        more = sampling.excess([light for light, _ in looks]) if sampling.excess else 1.0
+        for light, bound in looks:
             # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
             if sampling.target:
                 target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
             else:
                 target = plan.sampling_target
-            seen = light.sampling_error if sampling.target else bound
+            seen = more * (light.sampling_error if sampling.target else bound)
             lights.append(replace(light, reached=seen <= target))
             if seen > target:
                 # Capped before the power as well: a target that was set very low would overflow it.

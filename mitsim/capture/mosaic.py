@@ -6,11 +6,14 @@ p of the 2 x 2 filters makes of a photon of line l, its expected electrons are
     e_p = t A sum_l w_pl E_l lambda_l / (h c),
 
 those of a pixel without a filter, one electron a photon, in an irradiance sum_l w_pl E_l lambda_l / lambda of the
-projector's effective wavelength lambda. Frames of that irradiance go through the sensor as any other's.
+projector's effective wavelength lambda. Frames of that irradiance go through the sensor as any other's. Lamps shine at
+wavelengths of their own, which each colour of filters counts for itself (:mod:`mitsim.rig.lamplight`): a count c is an
+irradiance c / lambda. The lines share their paths, for plan and sampling; here they are taken apart again.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
@@ -20,10 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.colour import ColourBench, traced_lines
+from mitsim.capture.colour import ColourBench, plan_lines, traced_lines
 from mitsim.capture.light import Light
+from mitsim.capture.plan import Plan
 from mitsim.capture.request import check_untimed
-from mitsim.capture.run import capture, check_run
+from mitsim.capture.run import capture, check_run, sampling_of
 from mitsim.capture.simulation import Simulation
 from mitsim.capture.truth import Truth
 from mitsim.core.arrays import FloatArray
@@ -34,7 +38,7 @@ from mitsim.core.manifests import MANIFEST
 from mitsim.core.mosaics import LineTruth, MosaicCapture
 from mitsim.core.output import prepare_output
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.mosaic import behind
+from mitsim.reconstruct.mosaic import PLANES, behind
 from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.rig.sensor import SensorModel
@@ -79,6 +83,11 @@ class MosaicBench(Bench):
         bare = {"mosaic": None, "mosaic_curves": None, "quantum_efficiency": 1.0}
         rig = replace(bench.rig, sensor=sensor.model_copy(update=bare))
         return cls(**{each.name: getattr(bench, each.name) for each in fields(Bench)} | {"rig": rig}, camera=sensor)
+
+    @property
+    def counting(self) -> SensorModel:
+        """:attr:`camera`: lamps' light is counted through its filters."""
+        return self.mosaic
 
     @property
     def mosaic(self) -> SensorModel:
@@ -151,28 +160,86 @@ class MosaicLight(Light):
             as there.
         """
         assert self.passed is not None, "made by of()"
-        return MosaicFrames([light.frames(lighting, seed, leaking) for light in self.by_line], self.passed)
+        lines = [light.frames(lighting, seed, leaking).of_projector for light in self.by_line]
+        return MosaicFrames(lines, self.passed, self._lamps(seed), self.by_line[0].simulation.lamps_apart)
+
+    def _lamps(self, seed: int) -> Frame | None:
+        """Lamps' light behind the filters, with its error by probes of a ``seed``; None without lamps."""
+        lamplight = self.bench.lamplight
+        if lamplight is None:
+            return None
+        each = [lamplight.units_of(light.bench.projector.lines)[0] for light in self.by_line]
+        unit, line = max((unit, line) for line, unit in enumerate(each))
+        light = self.by_line[line]
+        frames, counted = list[Frame](), np.zeros((len(PLANES), len(lamplight.responses)))
+        for number, response in enumerate(lamplight.responses):
+            frames += _lamps_alone(light, lamplight.rows(number), seed)
+            # Filed is the mean over all pixels, of which the response's have it all.
+            counted[list(response.planes), number] = 1 / (
+                response.part * unit * self.bench.projector.effective_wavelength_nm
+            )
+        shape = self.bench.geometry.frame_shape
+        irradiance = np.einsum("fij,fij->ij", behind(counted, shape), np.stack([each.irradiance for each in frames]))
+        parts = np.square(counted).mean(axis=0) @ np.array([each.by_group for each in frames])  # no pixel has two
+        variance = float(parts.sum())
+        heaviest = float(parts.max()) / variance if variance else 0.0
+        return Frame(irradiance, variance, max(each.removed for each in frames), heaviest, tuple(parts))
 
     def speckle(self, family: PatternFamily | None = None) -> float:
         """None, of any ``family``: a projector with speckle is refused."""
         return 0.0
 
 
+def _lamps_alone(light: Light, bands: slice, seed: int) -> ExpectedFrames:
+    """One frame of lamps of a ``light``, of some ``bands`` of theirs; a ``seed`` of its probes."""
+    lamplight = light.bench.lamplight
+    assert lamplight is not None, "asked before"
+    filed = light.simulation.of_lamps(light.groups, light.groups[0].fine.shape[0] - len(lamplight.bands), bands)
+    return ExpectedFrames(filed, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
+
+
+def _excess(lights: Sequence[Light]) -> float:
+    """By how much the error of lamps' light behind filters exceeds that of their mean over all pixels, which is in
+    every line's light; 1 without ``lights`` of lamps.
+
+    A filter's few wavelengths are sampled worse than all. Its frames weigh by their energy, which for the same scene is
+    that of what a pixel counts.
+    """
+    light, lamplight = lights[0], lights[0].bench.lamplight
+    if lamplight is None or lamplight.shares is None:
+        return 1.0
+    whole, _ = _lamps_alone(light, slice(None), light.seed).sampling_error()
+    energy = variance = 0.0
+    for number, response in enumerate(lamplight.responses):
+        rows = lamplight.rows(number)
+        error, _ = _lamps_alone(light, rows, light.seed).sampling_error()
+        own = float(lamplight.shares[rows].sum()) ** 2 / response.part
+        energy, variance = energy + own, variance + own * error**2
+    return max(1.0, math.sqrt(variance / energy) / whole) if whole else 1.0
+
+
 class MosaicFrames(ExpectedFrames):
     """Frames of every shot behind the filters; iterate as often as needed.
 
     Lines are traced on the same paths, so their errors go together: that of the sum is at most the sum of theirs.
+    So do they with that of lamps' light, but where no other light is on lamps' paths.
 
     Parameters
     ----------
     lines
-        frames of each line.
+        frames of each line, of the projector's light alone.
     passed
         (lines, m, m') part of its irradiance that counts.
+    lamps
+        their light, as it counts, which is in every frame.
+    apart
+        whether no other light is on their paths.
     """
 
-    def __init__(self, lines: Sequence[ExpectedFrames], passed: FloatArray) -> None:
-        self._lines, self._passed = tuple(lines), passed
+    def __init__(
+        self, lines: Sequence[ExpectedFrames], passed: FloatArray, lamps: Frame | None = None, apart: bool = False
+    ) -> None:
+        self._lines, self._passed, self._lamps, self._apart = tuple(lines), passed, lamps, apart
         self._spread = np.sqrt(np.square(passed).mean(axis=(1, 2)))
 
     def __len__(self) -> int:
@@ -180,27 +247,36 @@ class MosaicFrames(ExpectedFrames):
 
     @property
     def has_ambient(self) -> bool:
-        """No: lamps are refused."""
-        return False
+        """Whether lamps shine."""
+        return self._lamps is not None
 
     @property
     def projector_off(self) -> Frame:
-        """A dark frame."""
-        return self._lines[0].projector_off
+        """The frame of lamps alone, dark where there are none; its Monte Carlo error is that of all frames."""
+        return self._lines[0].projector_off if self._lamps is None else replace(self._lamps, variance=0.0, by_group=())
 
     def __iter__(self) -> Iterator[Frame]:
+        always = () if self._lamps is None else (self._lamps,)
         for shot in zip(*self._lines, strict=True):
             light = np.einsum("lij,lij->ij", self._passed, np.stack([frame.irradiance for frame in shot]))
-            groups = zip(*(frame.by_group or (frame.variance,) for frame in shot), strict=True)
-            parts = [float(self._spread @ np.sqrt(each)) ** 2 for each in groups]
+            if self._lamps is not None:
+                light += self._lamps.irradiance
+            groups = zip(*(frame.by_group or (frame.variance,) for frame in (*shot, *always)), strict=True)
+            parts = [self._added(each) for each in groups]
             variance = sum(parts)
             yield Frame(
                 light,
                 variance,
-                max(frame.removed for frame in shot),
+                max(frame.removed for frame in (*shot, *always)),
                 max(parts) / variance if variance else 0.0,
                 tuple(parts) if shot[0].by_group else (),
             )
+
+    def _added(self, variances: Sequence[float]) -> float:
+        """Variance of the sum of all lines' light and lamps', from a group's of each."""
+        lines, lamps = variances[: len(self._lines)], sum(variances[len(self._lines) :])
+        own = float(self._spread @ np.sqrt(lines))
+        return own**2 + lamps if self._apart else (own + math.sqrt(lamps)) ** 2
 
 
 def capture_mosaic(
@@ -218,18 +294,17 @@ def capture_mosaic(
     MitsimError
         as there.
     """
-    job, whole = job or Job(), MosaicBench.of(bench)
-    colours = ColourBench.of(whole, MOSAIC)
-    manifest = _manifest(whole, colours)
-    check_untimed(request.seconds)
-    _refuse_lamps(whole, request)
-    _refuse_speckle(whole, request)
+    job, colours = job or Job(), _coloured(bench, request)
+    assert isinstance(colours.whole, MosaicBench)
+    manifest = _manifest(colours.whole, colours)
     place = None if output is None else Path(output)
-    all_lines = colours.whole
-    assert isinstance(all_lines, MosaicBench)
-    check_run(all_lines, request, place, resume)
     with _usable(place, resume):
-        lights = traced_lines(colours, request, job)
+        colours = colours.lit_by_lamps(request.effects, request.seed)
+        all_lines = colours.whole
+        assert isinstance(all_lines, MosaicBench)
+        check_run(all_lines, request, place, resume)
+        sampling = replace(sampling_of(all_lines, request), excess=_excess)
+        lights = traced_lines(colours, request, job, sampling=sampling)
         light = MosaicLight.of(all_lines, lights, manifest.wavelengths_nm)
         shots = capture(all_lines, request, job, place, resume, light=light)
     board = load_recipe().board_reflectance
@@ -241,6 +316,22 @@ def capture_mosaic(
     if shots.folder is not None:
         found.write_lines(shots.folder)
     return found
+
+
+def plan_mosaic(bench: Bench, request: Request) -> Plan:
+    """The plan of a run of all lines at once.
+
+    Parameters
+    ----------
+    bench, request
+        as of :func:`capture_mosaic`.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    return plan_lines(_coloured(bench, request), request)
 
 
 def calibrate_mosaic(
@@ -306,13 +397,14 @@ def _manifest(whole: MosaicBench, colours: ColourBench) -> MosaicManifest:
     return MosaicManifest(kind="mosaic-run", channels=lines, mosaic=whole.mosaic.mosaic, weights=weights)
 
 
-def _refuse_lamps(bench: Bench, request: Request) -> None:
-    """MitsimError for lamps, whose light each filter would count for itself."""
-    if bench.loaded.lamps and request.effects.get("ambient", True):
-        raise MitsimError(
-            f"{bench.loaded.path}: colour mosaic: ambient light is not simulated behind colour filters; switch it off "
-            "with effects -ambient, or use colour lines"
-        )
+def _coloured(bench: Bench, request: Request) -> ColourBench:
+    """A ``bench`` behind its filters, by line. MitsimError for what of a ``request`` is not simulated there."""
+    whole = MosaicBench.of(bench)
+    colours = ColourBench.of(whole, MOSAIC)
+    _manifest(whole, colours)
+    check_untimed(request.seconds)
+    _refuse_speckle(whole, request)
+    return colours
 
 
 def _refuse_speckle(bench: Bench, request: Request) -> None:

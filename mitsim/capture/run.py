@@ -314,10 +314,13 @@ def _foreign(light: Light, totals: Totals, request: Request) -> str:
 def _of_unknown_light(light: Light, shooting: Shooting) -> Iterator[str]:
     lamplight, accuracy = light.bench.lamplight, light.plan.accuracy
     if lamplight is not None and lamplight.unknown * shooting.ambient_part > accuracy:
-        first, last = lamplight.response.range_nm
+        first, last = lamplight.range_nm
+        one = len(lamplight.responses) == 1
+        part = f"{lamplight.unknown:.1%} of the lamps' light"
         yield (
-            f"{lamplight.unknown:.1%} of the lamps' light is in no frame: what would be counted beyond {first:g} to "
-            f"{last:g} nm if the quantum efficiency went on as its curve ends; let it end at 0, as a filter's does"
+            f"{part if one else f'up to {part} behind filters of one colour'} is in no frame: what would be counted "
+            f"beyond {first:g} to {last:g} nm if the quantum efficiency went on as its curve ends; let it end at 0, as "
+            "a filter's does"
         )
 
 

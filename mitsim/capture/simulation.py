@@ -18,7 +18,6 @@ from mitsim.capture.effects import Physics
 from mitsim.capture.filing import FiledLight, Trays
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
-from mitsim.rig.lamplight import line_units
 from mitsim.rig.patterns import Lighting
 from mitsim.transport.aimed import AimedTracer
 from mitsim.transport.direct import DirectTracer
@@ -133,6 +132,15 @@ class Simulation(Trays):
     def _mean_points(self) -> SensorPoints:
         return self._points(1, self.settings.followed_anchors > 1)
 
+    @property
+    def lamps_apart(self) -> bool:
+        """Whether lamps' paths are followed for no light of the projector."""
+        return not self._from_camera_of_projector
+
+    @property
+    def _from_camera_of_projector(self) -> bool:
+        return self.physics.mirrors or (self.physics.interreflection and self.bench.loaded.glossy)
+
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
 
@@ -146,7 +154,7 @@ class Simulation(Trays):
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
         loaded, physics, lamplight = self.bench.loaded, self.physics, self.bench.lamplight
-        of_projector = physics.mirrors or (physics.interreflection and loaded.glossy)
+        of_projector = self._from_camera_of_projector
         if not (physics.lamps or of_projector):
             return None
         paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
@@ -154,15 +162,16 @@ class Simulation(Trays):
         tracer = FromCameraTracer(*parts, self.aim, paths, physics.geometry, points)
         if lamplight is None or not physics.lamps:
             return tracer
-        # Lamps have wavelengths of their own.
-        counted = Counted(
-            lamplight.response, lamplight.bands, line_units(self.bench.sensor, self.bench.projector.lines)
-        )
-        lamps = LampTracer(tracer, counted)
-        if not of_projector:
-            return lamps
-        alone = FromCameraTracer(*parts, self.aim, replace(paths, emitters=()), physics.geometry, points)
-        return Together(alone, lamps)
+        # Lamps have wavelengths of their own, and filters of each colour count them on their own.
+        units = lamplight.units_of(self.bench.projector.lines)
+        lamps: list[FromCameraTracer] = []
+        for number, response in enumerate(lamplight.responses):
+            rows = lamplight.rows(number)
+            own = [unit * response.part for unit in units]
+            lamps.append(LampTracer(tracer, Counted(response, lamplight.bands[rows], own, rows.start)))
+        if of_projector:
+            lamps.insert(0, FromCameraTracer(*parts, self.aim, replace(paths, emitters=()), physics.geometry, points))
+        return lamps[0] if len(lamps) == 1 else Together(*lamps)
 
     def follow(self, seed: int, samples: int) -> Deposits:
         """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``, to be filed."""

@@ -21,6 +21,7 @@ from mitsim.cli.colour import (
     MOSAIC,
     NO,
     Colour,
+    ambient_of,
     by_line,
     check_colour,
     chosen_of,
@@ -276,14 +277,7 @@ def capture(
             f"Asked for {seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken {taken['total']:.1f}: "
             f"accuracy {payload['accuracy']:g}, total error up to {payload['total_error_bound']:.1e}"
         )
-    if payload["ambient_frame"]:
-        ambient = payload["ambient_frame"]
-        lines.append(
-            f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
-            f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
-            f"total error up to {payload['total_error_of_projector']:.1e} of it"
-        )
-    return finish(as_json, payload, lines, shots.warnings)
+    return finish(as_json, payload, [*lines, *ambient_of(payload)], shots.warnings)
 
 
 app.registered_commands += calibration.app.registered_commands + image.app.registered_commands

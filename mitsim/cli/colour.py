@@ -39,9 +39,8 @@ NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 
 def _choice(context: typer.Context, name: str) -> str:
     words = [NO, LINES, f"{BANDS}:K", MOSAIC, AUTO]
-    for word, command in ((MOSAIC, "plan"), (AUTO, "calibrate")):
-        if context.info_name == command:
-            words.remove(word)
+    if context.info_name == "calibrate":
+        words.remove(AUTO)
     if name.startswith(f"{BANDS}:"):
         bands_of(name)
     elif name not in words:
@@ -53,8 +52,8 @@ Colour = Annotated[
     str,
     typer.Option(
         help="lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K "
-        "bands of its lines; mosaic: all lines at once, by a camera under colour filters (not plan); auto: no, bands "
-        "or lines, as the accuracy needs (not calibrate); no: light that is not told apart",
+        "bands of its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or "
+        "lines, as the accuracy needs (not calibrate); no: light that is not told apart",
         metavar="no|lines|bands:K|mosaic|auto",
         callback=_choice,
     ),
@@ -156,6 +155,10 @@ def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     from mitsim.capture.colour import ColourBench, plan_lines
     from mitsim.capture.request import Request
 
+    if colour == MOSAIC:
+        from mitsim.capture.mosaic import plan_mosaic
+
+        return plan_mosaic(bench, Request.of(**request))
     return plan_lines(ColourBench.of(in_colour(bench, colour), RUN), Request.of(**request))
 
 
@@ -226,7 +229,19 @@ def of_mosaic(shots: MosaicCapture) -> tuple[dict[str, Any], list[str]]:
         f"Monte Carlo error at most {payload['mc_error']:.1e}, total error up to {payload['total_error_bound']:.1e}, "
         f"exposure {payload['exposure_s']:.3g} s a frame",
     ]
-    return payload, lines
+    return payload, [*lines, *ambient_of(payload)]
+
+
+def ambient_of(payload: Mapping[str, Any]) -> list[str]:
+    """The line that a capture's ``payload`` says of its ambient frame; none where none was taken."""
+    ambient = payload["ambient_frame"]
+    if not ambient:
+        return []
+    return [
+        f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
+        f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
+        f"total error up to {payload['total_error_of_projector']:.1e} of it"
+    ]
 
 
 def of_calibration(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, Any], list[str]]:

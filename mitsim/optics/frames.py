@@ -6,6 +6,7 @@ The closed form of one light distribution is :mod:`mitsim.optics.closed_form`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -213,6 +214,13 @@ class ExpectedFrames:
         """The frame of ambient light alone, dark where there is none; its Monte Carlo error is that of all frames."""
         light = np.zeros(self._shape) if self._ambient_formed is None else self._ambient_formed[0][0]
         return Frame(np.maximum(light, 0.0), 0.0, 0.0, 0.0)
+
+    @property
+    def of_projector(self) -> ExpectedFrames:
+        """The same shots in a dark room."""
+        dark = copy(self)
+        dark._ambient, dark._always, dark._held = (), None, None
+        return dark
 
     @property
     def _ambient_formed(self) -> tuple[FloatArray, FloatArray] | None:

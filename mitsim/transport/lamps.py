@@ -36,16 +36,19 @@ class Counted:
         one for each wavelength of a path; of no width where less are wanted.
     units
         irradiance [W m^-2] of each line of the projector that a count of 1 stands for.
+    first
+        number of the first band among all that lamps' light is told apart by.
     """
 
     response: Response
     bands: Sequence[Band]
     units: Sequence[float]
+    first: int = 0
 
 
 class LampTracer(FromCameraTracer):
-    """Lamps' light alone, at wavelengths of its own. The light of band b is deposited as that of pixel n^2 + b, as an
-    irradiance of the projector's line, or of each of its lines."""
+    """Lamps' light alone, at wavelengths of its own. The light of band b is deposited as that of pixel n^2 + b, b from
+    the first, as an irradiance of the projector's line, or of each of its lines."""
 
     of_projector = False
     by_line = True
@@ -103,7 +106,7 @@ class LampTracer(FromCameraTracer):
                 name: np.repeat(getattr(found, name), MOST_LINES)
                 for name in ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind")
             },
-            pixel=(found.pixel[:, None] + np.arange(MOST_LINES)).ravel(),
+            pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
             value=light * self.counted.units[0],
             lane=None if found.lane is None else np.repeat(found.lane, MOST_LINES),
         )

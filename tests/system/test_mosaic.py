@@ -13,6 +13,7 @@ import pytest
 from mitsim.core.framefile import read_frame
 from tests.system.conftest import CAMERA, tree
 from tests.system.test_colour import LINES, SHEET, electrons, projector, spectrum
+from tests.unit.capture.test_lamps import POSITION
 
 CURVES = {
     "R": {638: 0.4, 520: 0.1, 445: 0.05},
@@ -20,15 +21,29 @@ CURVES = {
     "B": {638: 0.05, 520: 0.2, 445: 0.4},
 }
 """Electrons per photon of pixels under each filter at the lines."""
+LAMP = {450: 0.0, 480: 2e4, 500: 2e4, 505: 8e4, 510: 2e4, 600: 2e4, 630: 0.0}
+"""Intensity of a lamp by wavelength: a spike between blue and green, nothing that the curves do not hold."""
 COMMON = "--patterns", "dots:2", "--accuracy", "1e-2", "--json"
+
+
+def sheet(path: Path) -> Path:
+    """The scene of a ``path`` with a coloured sheet."""
+    known = f'<default name="albedo" value="{spectrum(SHEET)}"/>'
+    path.write_text(path.read_text().replace('<default name="albedo" value="0.5"/>', known))
+    return path
 
 
 @pytest.fixture(scope="module")
 def scene(shared_scene: Callable[..., Path]) -> Path:
-    path = shared_scene("sheet behind filters")
-    known = f'<default name="albedo" value="{spectrum(SHEET)}"/>'
-    path.write_text(path.read_text().replace('<default name="albedo" value="0.5"/>', known))
-    return path
+    return sheet(shared_scene("sheet behind filters"))
+
+
+@pytest.fixture(scope="module")
+def lit(shared_scene: Callable[..., Path]) -> Path:
+    """The same beside a lamp."""
+    value = ", ".join(f"{nm}:{intensity}" for nm, intensity in LAMP.items())
+    lamp = f'<emitter type="point">{POSITION}<spectrum name="intensity" value="{value}"/></emitter>'
+    return sheet(shared_scene("lit sheet behind filters", extra=lamp))
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +80,31 @@ def test_a_pixel_sees_each_line_through_its_own_filter(
     assert told["mc_error"] < 2e-2 and (run / "truth.exr").is_file()
 
 
+def counted(plane: str) -> float:
+    """Of the lamp's light that comes from the sheet, what pixels of a ``plane`` make electrons of."""
+    at = np.linspace(445, 638, 19301)
+    reflectance = np.interp(at, sorted(SHEET), [SHEET[nm] for nm in sorted(SHEET)])
+    efficiency = np.interp(at, sorted(CURVES[plane]), [CURVES[plane][nm] for nm in sorted(CURVES[plane])])
+    return float(np.trapezoid(np.interp(at, list(LAMP), list(LAMP.values())) * reflectance * efficiency * at, at))
+
+
 @pytest.mark.slow
 def test_a_run_behind_filters_goes_on_and_comes_apart(
-    shell: Callable[..., Any], scene: Path, devices: tuple[str, ...], tmp_path: Path
+    shell: Callable[..., Any], scene: Path, lit: Path, devices: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """Lost frames come back bit for bit; images of the lines are their truths, though all share every frame."""
+    """Lost frames come back bit for bit; images of the lines are their truths, though all share every frame, and a
+    lamp's light: of that each colour's pixels have what its integral says beside the others'.
+    """
     run, cal = tmp_path / "run", tmp_path / "cal"
-    command = "capture", scene, "-o", run, "--colour", "mosaic", *devices, *COMMON
-    shell(*command)
+    command = "capture", lit, "-o", run, "--colour", "mosaic", *devices, *COMMON
+    told = shell(*command)
+    assert told.code == 0 and told.payload["ambient_frame"]["shots"] == 16
+    assert 0.1 < told.payload["ambient_frame"]["part"] < 0.9
+    lamp = read_frame(run / "ambient.exr")[0]["electrons"].astype(float)
+    planes = {name: lamp[a::2, b::2].mean() for name, (a, b) in zip("GBR", ((0, 0), (0, 1), (1, 0)), strict=True)}
+    for name in "BR":
+        # On the same paths: what is left are fringes of other wavelengths at the edges of the frame.
+        assert planes[name] / planes["G"] == pytest.approx(counted(name) / counted("G"), rel=5e-3)
     before = tree(run)
     for lost in ("frame_00002.exr", "445nm/truth.exr", "colour.json"):
         (run / lost).unlink()
@@ -85,6 +117,8 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
     assert told["kind"] == "colour-calibration" and len(told["channels"]) == 3
     found = shell("reconstruct", run, "--calibration", cal, "-o", tmp_path / "image", "--json").payload
     assert all(line["psnr"] > 25 for line in found["channels"]) and found["delta_e"] < 5
+    half = "reconstruct", run, "--calibration", cal, "-o", tmp_path / "half", "--mosaic", "half", "--json"
+    assert all(line["psnr"] > 25 for line in shell(*half).payload["channels"])
     kept = json.loads((tmp_path / "image" / "colour.json").read_text())
     assert kept["mosaic"] == "joint" and kept["psnr"] == pytest.approx(found["psnr"])
     mono = shell("calibrate", scene, "-o", tmp_path / "mono", "--colour", "lines", *devices[2:], *COMMON[2:])
@@ -107,7 +141,7 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
             "imx249.toml has no mosaic of colour filters; give one",
         ),
         ("capture", ("--colour", "lines", "--camera", "ov5647", "--patterns", "dots:2"), "use --colour mosaic"),
-        ("capture", ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"), "or colour mosaic"),
+        ("capture", ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"), "capture and calibrate it with --colour mosaic"),
         (
             "capture",
             ("--colour", "red", "--patterns", "dots:2"),

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -23,11 +24,12 @@ from mitsim.capture import colour
 from mitsim.capture.colour import ColourBench
 from mitsim.capture.evidence import Settings
 from mitsim.capture.filing import Tray
+from mitsim.capture.mosaic import MosaicBench
 from mitsim.capture.opening import open_bench
 from mitsim.capture.request import Request
 from mitsim.capture.run import _of_unknown_light
 from mitsim.capture.simulation import Simulation
-from mitsim.core.colours import RUN
+from mitsim.core.colours import MOSAIC, RUN
 from mitsim.core.errors import MitsimError
 from mitsim.rig.lamplight import SPECTRA_NM, Lamplight, Response, line_units
 from mitsim.rig.patterns import Lighting
@@ -49,9 +51,18 @@ LAMPS = {
 SHEETS = {"grey": "0.5", "coloured": "350:0.2, 550:0.8, 850:0.4"}
 CURVE = {420.0: 0.2, 530.0: 0.8, 700.0: 0.3}
 """A camera's electrons per photon."""
+FILTERS = {
+    "G": {400.0: 0.02, 480.0: 0.1, 530.0: 0.6, 600.0: 0.1, 700.0: 0.05},
+    "B": {390.0: 0.1, 450.0: 0.5, 520.0: 0.1, 600.0: 0.0, 650.0: 0.0},
+    "R": {420.0: 0.0, 560.0: 0.02, 600.0: 0.5, 650.0: 0.4, 750.0: 0.2},
+}
+"""The same behind filters, GBRG."""
 LINES = [638.0, 520.0, 445.0]
+SHARES = [0.5, 0.3, 0.2]
 SEEDS, SAMPLES = 8, 64
 CASES = [("flat", "grey", False), ("coloured", "coloured", True), ("cie_a", "grey", False), ("d65", "coloured", True)]
+FILTERED = ["flat", "coloured", "cie_a", "d65"]
+"""Lamps over a grey sheet that are seen behind filters as well; d65's lights a coloured one."""
 
 
 def spectral(lamp: str, wavelengths: np.ndarray) -> np.ndarray:
@@ -74,12 +85,19 @@ D65_UNIT = 98.99741751876255
 """Mitsuba's D65 has a luminance of 1: MI_CIE_D65_NORMALIZATION."""
 
 
-def counted(lamp: str, sheet: str, curve: bool, low: float = SPECTRA_NM[0], high: float = SPECTRA_NM[1]) -> float:
-    """Integral from ``low`` to ``high`` [nm] of what the camera counts."""
+def counted(
+    lamp: str,
+    sheet: str,
+    curve: bool | dict[float, float],
+    low: float = SPECTRA_NM[0],
+    high: float = SPECTRA_NM[1],
+) -> float:
+    """Integral from ``low`` to ``high`` [nm] of what the camera counts, or pixels of a ``curve``."""
+    known = curve if isinstance(curve, dict) else CURVE
     at = np.linspace(low, high, 2 + int((high - low) * 20))
     pairs = dict(map(float, pair.split(":")) for pair in SHEETS[sheet].split(", ")) if sheet == "coloured" else {}
     albedo = np.interp(at, list(pairs), list(pairs.values())) if pairs else ALBEDO
-    efficiency = np.interp(at, list(CURVE), list(CURVE.values())) if curve else 0.75
+    efficiency = np.interp(at, list(known), list(known.values())) if curve else 0.75
     return float(np.trapezoid(spectral(lamp, at) * albedo * efficiency * at, at) / (SPECTRA_NM[1] - SPECTRA_NM[0]))
 
 
@@ -90,8 +108,14 @@ def traced(folder: str) -> list[dict[str, Any]]:
     table = f"[quantum_efficiency_curve]\nwavelengths_nm = {list(CURVE)}\nefficiency = {list(CURVE.values())}\n"
     (place / "curve.toml").write_text(CAMERA.replace("quantum_efficiency = 0.75\n", "") + table)
     (place / "lines.toml").write_text(
-        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {LINES}\nradiant_shares = [0.5, 0.3, 0.2]\n'
+        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {LINES}\nradiant_shares = {SHARES}\n'
     )
+    single = CAMERA.replace("5.86", "11.72").replace("binning = 2\n", "").replace("quantum_efficiency = 0.75\n", "")
+    tables = "".join(
+        f"[mosaic_curves.{name}]\nwavelengths_nm = {list(curve)}\nefficiency = {list(curve.values())}\n"
+        for name, curve in FILTERS.items()
+    )
+    (place / "filters.toml").write_text(f'{single}mosaic = "GBRG"\n{tables}')
     for lamp, sheet, curve in CASES:
         emitter = f'<emitter type="point">{POSITION}{LAMPS[lamp]}</emitter>'
         path = write_small_scene(place, lamp, mask="open", extra=emitter)
@@ -120,9 +144,27 @@ def traced(folder: str) -> list[dict[str, Any]]:
                 "spectra": [list(each.wavelengths_nm) for each in whole.lamplight.spectra],
                 "weights": [list(each.weights) for each in whole.lamplight.spectra],
                 "unknown": whole.lamplight.unknown,
+                "filtered": through_filters(place, path, lamp) if lamp in FILTERED else {},
             }
         )
     return found
+
+
+def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
+    """Light of a ``lamp`` behind filters: by band and line of all lines, and of the second line alone."""
+    sheet = SHEETS["coloured" if lamp == "d65" else "grey"]
+    bench = open_bench(scene, "llvm_ad_spectral", place / "filters.toml", place / "lines.toml", albedo=sheet)
+    colours = ColourBench.of(MosaicBench.of(bench), MOSAIC).lit_by_lamps({}, 0)
+    lamplight, found = colours.whole.lamplight, {}
+    assert lamplight is not None
+    for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
+        tracer = Simulation(each, Settings(depth=400.0, effects=frozenset({"ambient"}))).from_camera
+        assert isinstance(tracer, Together) and len(tracer.tracers) == 3
+        looks = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
+        lines = [look.by_line(len(LINES) if name == "lines" else 1) for look in looks]
+        found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in look] for look in lines]
+    assert lamplight.shares is not None
+    return {**found, "shares": lamplight.shares.tolist(), "unknown": lamplight.unknown, "range": lamplight.range_nm}
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +211,40 @@ def test_each_band_has_its_light(light: Mapping[Any, dict[str, Any]], case: Any)
         assert np.dot(spectrum, weights) == pytest.approx(mean, abs=3)
 
 
+@pytest.mark.parametrize("lamp", FILTERED)
+def test_pixels_count_the_lamp_each_through_its_filter(light: Mapping[Any, dict[str, Any]], lamp: str) -> None:
+    """And no filter counts for another; lines share a count as their power, each alone as all together.
+
+    (Planted: the red curve for all; red for blue; a line's part of the count as of its photons.)
+    """
+    (case,) = (each for each in CASES if each[0] == lamp)
+    sheet, found, geometry = "coloured" if lamp == "d65" else "grey", light[case]["filtered"], seen("point")
+    planes = {name: "GBRG".count(name) / 4 for name in FILTERS}
+    # Electrons that all lines make, of an even sheet, for one of their power.
+    power = sum(
+        share * part * at * np.interp(at, list(FILTERS[name]), list(FILTERS[name].values()))
+        for at, share in zip(LINES, SHARES, strict=True)
+        for name, part in planes.items()
+    )
+    looks = np.array(found["lines"]).reshape(SEEDS, len(LINES), len(FILTERS), 4) / SAMPLES
+    every = {name: counted(lamp, sheet, curve, min(curve), max(curve)) for name, curve in FILTERS.items()}
+    whole = sum(planes[name] * every[name] for name in FILTERS)
+    for number, (name, curve) in enumerate(FILTERS.items()):
+        edges = np.linspace(min(curve), max(curve), 5)
+        bands = [counted(lamp, sheet, curve, *ends) for ends in pairwise(edges)]
+        assert np.reshape(found["shares"], (3, 4))[number] == pytest.approx(
+            planes[name] * np.array(bands) / whole, abs=0.01
+        )
+        for line, share in enumerate(SHARES):
+            runs = looks[:, line, number].sum(axis=1) * power / share / planes[name]
+            expected, error = geometry / (ALBEDO * 3e4) * every[name], runs.std(ddof=1) / np.sqrt(SEEDS)
+            assert 7 * error < 0.01 * expected
+            assert abs(runs.mean() - expected) < 7 * error + 2e-4 * expected, (lamp, name, line)
+    assert np.array(found["alone"])[0, 0] == pytest.approx(np.array(found["lines"])[0, 1], rel=1e-6)
+    beyond = max(1 - every[name] / counted(lamp, sheet, curve) for name, curve in FILTERS.items())
+    assert found["unknown"] == pytest.approx(beyond, abs=0.01) and found["range"] == [420, 650]
+
+
 def counted_mean(case: tuple[str, str, bool], edges: tuple[float, float]) -> float:
     """Mean wavelength [nm] of what is counted in a band, in steps of a nanometre."""
     middles = np.arange(edges[0], edges[1], 1.0) + 0.5
@@ -193,6 +269,20 @@ def test_a_number_is_the_efficiency_at_every_wavelength() -> None:
     assert response.range_nm == SPECTRA_NM and response.beyond_nm == 0
     assert response.counts == pytest.approx(0.5 * np.linspace(*SPECTRA_NM, len(response.counts)), rel=1e-14)
     assert line_units(sensor(quantum_efficiency=0.5), Lines((600.0, 400.0), (0.5, 0.5))) == (1 / 300, 1 / 200)
+
+
+def test_lines_behind_filters_share_a_count_as_their_power() -> None:
+    """Together they make as many electrons of a pixel in the mean. (Planted: each line all of it.)"""
+    ends = {"R": 0.0, "G": 0.2, "B": 0.4}
+    curves = {name: {"wavelengths_nm": [390.0, 610.0], "efficiency": [0.4, last]} for name, last in ends.items()}
+    change = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": curves, "binning": 1}
+    behind, lines = sensor(**change), Lines((600.0, 400.0), (0.75, 0.25))
+    units, mean = line_units(behind, lines), np.mean(behind.planes(lines.wavelengths_nm), axis=0)
+    assert units[0] / units[1] == pytest.approx(3)
+    assert sum(mean * units * np.array(lines.wavelengths_nm)) == pytest.approx(1)
+    blind = {name: {"wavelengths_nm": [390.0, 395.0, 610.0], "efficiency": [0.4, 0, 0]} for name in "RGB"}
+    with pytest.raises(MitsimError, match="is blind to all lines of the projector"):
+        line_units(sensor(**{**change, "mosaic_curves": blind}), Lines((600.0, 500.0), (0.75, 0.25)))
 
 
 def test_bands_are_even_and_so_are_their_parts() -> None:
@@ -232,7 +322,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
     lamp = '<emitter type="constant"/>'
     bench = open_bench(small_scene(extra=lamp), variant, None, "mp_cl1")
     response = Response.of(bench.sensor)
-    bench = replace(bench, lamplight=Lamplight(response, response.bands(4), spectra, np.full(4, 0.25)))
+    bench = replace(bench, lamplight=Lamplight((response,), response.bands(4), spectra, np.full(4, 0.25)))
     settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
     simulation, labels = Simulation(bench, settings), np.zeros(bench.n**2, dtype=np.int64)
     frames = []
@@ -254,7 +344,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
 @pytest.mark.parametrize(("part", "flagged"), [(0.5, True), (0.02, False)])
 def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool) -> None:
     """Where it is more of all light than the accuracy."""
-    lamplight = Lamplight(Response(np.ones(2), (400.0, 700.0)), (), unknown=0.04)
+    lamplight = Lamplight((Response(np.ones(2), (400.0, 700.0)),), (), unknown=0.04)
     light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), plan=SimpleNamespace(accuracy=1e-3))
     said = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
     assert bool(said) is flagged and all("4.0% of the lamps' light is in no frame" in sentence for sentence in said)

@@ -5,21 +5,33 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from mitsim.capture import mosaic
 from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimates
-from mitsim.capture.mosaic import MosaicBench, MosaicFrames
+from mitsim.capture.evidence import Settings
+from mitsim.capture.filing import Tray
+from mitsim.capture.light import Light
+from mitsim.capture.mosaic import MosaicBench, MosaicFrames, MosaicLight
 from mitsim.capture.opening import open_bench
 from mitsim.capture.session import Session
+from mitsim.capture.simulation import Simulation
+from mitsim.capture.truth import Truth
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.mosaic import behind
 from mitsim.rig.efficiency import EfficiencyCurve, MosaicCurves
+from mitsim.rig.lamplight import Lamplight, Response
+from mitsim.rig.patterns import Lighting
+from mitsim.rig.projector import Spectrum
 from mitsim.rig.recipe import load_recipe
+from mitsim.transport.histogram import AMBIENT, DIRECT, Deposits
 
 WEIGHTS = np.array([[0.4, 0.1], [0.2, 0.3], [0.2, 0.3], [0.1, 0.5]])
 
@@ -57,6 +69,43 @@ def test_errors_of_lines_on_one_path_add_up() -> None:
     assert seen.variance == pytest.approx((spread[0] + 3 * spread[1]) ** 2 * parts.sum())
     assert seen.by_group == pytest.approx((spread[0] + 3 * spread[1]) ** 2 * parts)
     assert seen.heaviest == pytest.approx(parts.max() / parts.sum())
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_lamps_are_in_every_frame_and_alone_in_the_dark_one(apart: bool) -> None:
+    """Their error is its own, or goes together with the lines'. (Planted: lamps in no frame; errors in squares.)"""
+    rng, spread = np.random.default_rng(3), np.sqrt(np.square(WEIGHTS).mean(axis=0))
+    own, theirs = rng.random(8), rng.random(8)
+    lines = [Frame(rng.random((4, 4)), own.sum(), 0.0, 0.0, tuple(own)) for _ in range(2)]
+    lamps = Frame(rng.random((4, 4)), theirs.sum(), 0.0, 0.0, tuple(theirs))
+    passed, given = behind(WEIGHTS, (4, 4)), [Frames([line]) for line in lines]
+    frames = MosaicFrames(given, passed, lamps, apart)  # type: ignore[arg-type]
+    (dark,) = MosaicFrames(given, passed)  # type: ignore[arg-type]
+    (lit,) = frames
+    assert frames.has_ambient and frames.projector_off.irradiance is lamps.irradiance
+    assert lit.irradiance == pytest.approx(dark.irradiance + lamps.irradiance)
+    both = np.array(dark.by_group) + theirs, np.square(spread.sum() * np.sqrt(own) + np.sqrt(theirs))
+    assert lit.by_group == pytest.approx(both[0 if apart else 1])
+
+
+def test_sampling_looks_at_lamps_behind_each_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors of 1, 2 and 3 % beside 1 % of the mean, of pixels that count 4, 2 and 1. (Planted: a mean of errors.)"""
+    responses = [Response(np.ones(2), (400.0, 700.0), planes=planes) for planes in ((0,), (1, 2), (3,))]
+    shares = np.repeat([4 / 9, 2 * 2 / 9, 1 / 9], 4) / 4
+    lamplight = Lamplight(tuple(responses), ((400.0, 700.0),) * 12, shares=shares)
+    errors: dict[int | None, float] = {0: 0.01, 4: 0.02, 8: 0.03, None: 0.01}
+
+    def alone(light: Any, bands: slice, seed: int) -> Any:
+        return SimpleNamespace(sampling_error=lambda: (errors[bands.start], 0.0))
+
+    monkeypatch.setattr(mosaic, "_lamps_alone", alone)
+    light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), seed=0)
+    energy = np.array([16.0, 2 * 4.0, 1.0])
+    expected = np.sqrt(np.dot(energy, [1, 4, 9]) / energy.sum())
+    assert mosaic._excess([light, light]) == pytest.approx(expected)
+    errors[None] = 0.05
+    dark: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=None))
+    assert mosaic._excess([light]) == mosaic._excess([dark]) == 1
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +153,59 @@ def test_only_a_camera_with_filters_has_a_mosaic(bench: Bench) -> None:
     for mono in (lambda: coloured(bench).capture("dots:2"), lambda: coloured(bench).calibrate()):
         with pytest.raises(MitsimError, match="has a mosaic RGGB, whose frames show all lines at once; capture and"):
             mono()
+
+
+def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[..., Path], variant: str) -> None:
+    """A spot of each band of each colour of filters, in every line's light: at pixels of that colour, diffracted by the
+    band's wavelengths, once. (Planted: a filter's light at all pixels; lines' lamps left in; one filter's bands for
+    all.)
+    """
+    scene = shared_scene("lit mosaic", extra='<emitter type="constant"/>')
+    seen = MosaicBench.of(coloured(open_bench(scene, variant)))
+    responses = Response.of_each(seen.counting)
+    assert [response.planes for response in responses] == [(0,), (1, 2), (3,)]
+    spectra = tuple(Spectrum(np.array([nm]), np.ones(1)) for nm in np.linspace(420.0, 690.0, 12))
+    units = ((600.0, 2e-4), (500.0, 5e-4))
+    lamplight = Lamplight(responses, ((400.0, 700.0),) * 12, spectra, np.full(12, 1 / 12), units=units)
+    settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
+    rng, n = np.random.default_rng(4), seen.n
+    counts, none, place = rng.random(12), np.zeros(12, np.int64), np.linspace(-0.03, 0.03, 12)
+    parts = np.repeat([response.part for response in responses], 4)
+    lights = []
+    for nm, unit in units:
+        own = replace(seen, rig=replace(seen.rig, projector=seen.projector.at(nm)), lamplight=lamplight)
+        simulation = Simulation(own, settings)
+        lamps = Deposits(
+            n**2 + np.arange(12), none, none, place, place[::-1], place * 0 + 0.0025, counts * parts * unit,
+            np.full(12, AMBIENT, np.int16),
+        )  # fmt: skip
+        spot = Deposits(
+            none[:1], none[:1], none[:1], place[3:4], place[5:6], place[:1] * 0 + 0.0025, np.array([unit]),
+            np.full(1, DIRECT, np.int16),
+        )  # fmt: skip
+        filed = simulation.file_followed(Deposits.joined([lamps, spot]), none[:1].repeat(n**2), 1)
+        plan: Any = SimpleNamespace(settings=settings)
+        zeros = np.zeros(n**2)
+        truth = Truth(np.zeros((n, n)), np.zeros((n, n)), np.ones(n**2), 1)
+        light = Light((filed,), simulation, plan, 0, none[:1].repeat(n**2), zeros, zeros, 1, 0.0, True)
+        lights.append(replace(light, known_truth=truth))
+    whole = MosaicLight.of(replace(seen, lamplight=lamplight), lights, [nm for nm, _ in units])
+    lighting = Lighting(none[:1].repeat(n**2), np.ones((1, 1)))
+    expected = np.zeros(seen.geometry.frame_shape)
+    for band, spectrum in enumerate(spectra):
+        row = lights[0].groups[0].fine[[1 + band]].tocsr()
+        alone = Tray(lights[0].simulation.fine.bundle, seen.geometry, spectrum).optics.frame(row.indices, row.data)
+        for a, b in [divmod(plane, 2) for plane in responses[band // 4].planes]:
+            # Of unit irradiance of the first line, one electron a photon of the projector's wavelength.
+            scale = 1 / (units[0][1] * parts[band] * seen.projector.effective_wavelength_nm)
+            expected[a::2, b::2] += scale * alone[a::2, b::2]
+    frames = whole.frames(lighting, 0)
+    assert frames.projector_off.irradiance == pytest.approx(expected, rel=1e-9, abs=1e-12 * expected.max())
+    (lit,), off = frames, [light.frames(lighting, 0) for light in lights]
+    lines = [next(iter(each)).irradiance - each.projector_off.irradiance for each in off]
+    weights = np.array(seen.mosaic.planes([nm for nm, _ in units])) * [nm for nm, _ in units]
+    passed = behind(weights / seen.projector.effective_wavelength_nm, expected.shape)
+    assert lit.irradiance - expected == pytest.approx(np.einsum("lij,lij->ij", passed, np.array(lines)), rel=1e-6)
 
 
 @pytest.mark.parametrize("part", [{"rows": 63}, {"roi": (0, 3, 20, 20)}, {"roi": (2, 0, 21, 20)}])

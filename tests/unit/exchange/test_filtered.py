@@ -24,9 +24,10 @@ from tests.unit.exchange.test_coloured import octave, whole
 LINES = "638nm", "520nm", "445nm"
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return mosaic_folders(tmp_path_factory.mktemp("filters"), "dots:2")
+@pytest.fixture(scope="module", params=[False, True], ids=["dark", "lit"])
+def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """In a dark room, and under a lamp that every filter counts for itself."""
+    return mosaic_folders(tmp_path_factory.mktemp("filters"), "dots:2", lamp=request.param)
 
 
 def same_folders(again: Path, first: Path) -> None:
