@@ -20,12 +20,13 @@ import numpy as np
 from mitsim.capture.ambient import is_taken, shots_for
 from mitsim.capture.bench import Bench
 from mitsim.capture.drift import DriftedExposer, drifted, levels, projecting, warmer
+from mitsim.capture.light import Light
 from mitsim.capture.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.perturbation import Changed, Expected, Gains, LinearImage, Noise
+from mitsim.reconstruct.perturbation import Changed, Gains, LinearImage, Noise
 from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.rig.drift import Drift
 from mitsim.rig.order import SIDES
@@ -244,18 +245,24 @@ class DriftStand:
             changed = replace(changed, terms=[*changed.terms, *others])
         return image.expected(self.lit.truth, changed, self._noise).psnr_db(self.lit.truth)
 
-    @property
-    def still(self) -> Expected:
-        """What the image without a drift, any noise and any difference of pixels is expected to be."""
-        return self.linear.expected(self.lit.truth, replace(self._changed(Drift()), response=None, added=None))
-
     @cached_property
-    def fixed(self) -> Mapping[str, float]:
-        """Squared error, mean over the image, that each difference of the sensor's pixels makes."""
+    def fixed(self) -> Mapping[str, FloatArray]:
+        """(n, n) what each difference of the sensor's pixels adds to the image."""
         still = self.linear.expected(self.lit.truth).image
         alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
-        found = {source: self.linear.expected(self.lit.truth, each).image for source, each in alone.items()}
-        return {source: float(np.square(image - still).mean()) for source, image in found.items()}
+        return {name: self.linear.expected(self.lit.truth, each).image - still for name, each in alone.items()}
+
+    def clear(self, factors: Factors, light: Light) -> FloatArray:
+        """(n, n) image of frames without noise, with the lambda of the image without a drift.
+
+        Parameters
+        ----------
+        factors
+            that it is made with.
+        light
+            of the scene.
+        """
+        return LitScene(light).rendered(factors, self.family, self.seed).clear(self.linear.lam)
 
     @cached_property
     def linear(self) -> LinearImage:
