@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,6 +71,7 @@ def study(
     from mitsim.study import OF_NO_SCENE, find_study, is_experiment
 
     session = recipe_for(name, recipe)
+    warnings: Sequence[str] = ()
     with job_of(quiet or as_json) as job:
         if name == "merge":
             from mitsim.study.campaign import merge
@@ -96,7 +98,8 @@ def study(
                 with job.clock.stage("open scene"):
                     bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
             result = run_study(bench, output, request, job)
-    return finish(as_json, result.payload(), result.lines(), ())
+            warnings = result.warnings
+    return finish(as_json, result.payload(), result.lines(), warnings)
 
 
 def _only(scenes: list[str] | None) -> str | None:

@@ -279,7 +279,7 @@ class LinearImage:
         return self._energy(sum((getattr(noise, name) * unit for name, unit in units.items()), np.zeros((1, 1))))
 
     def units(self, scene: FloatArray) -> dict[str, FloatArray]:
-        """(r, r') variance of each number of W by 1 of each :class:`Noise`, by name, of frames of a ``scene`` (n, n')."""
+        """(r, r') variance of each number of W by 1 of each :class:`Noise`, of frames of a ``scene`` (n, n')."""
         left, right = self.axes
         of_left, of_right = np.square(left.basis * left.singular).T, np.square(right.basis * right.singular)
         seen_right = np.square(scene @ (right.basis * right.singular))

@@ -28,11 +28,11 @@ from mitsim.capture.session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.perturbation import LinearImage, Noise
+from mitsim.reconstruct.perturbation import Noise
 from mitsim.reconstruct.scatter import Scatter
-from mitsim.rig.drift import UNITS, WORDS
+from mitsim.rig.drift import UNITS, WORDS, Drift
 from mitsim.rig.order import SIDES
-from mitsim.study.drift import AMBIENT, SESSION, DriftStand, squared_error
+from mitsim.study.drift import AMBIENT, SESSION, DriftStand, Foretold, squared_error
 from mitsim.study.exposures import SPECKLE
 
 CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
@@ -89,6 +89,26 @@ class _Part:
     deviation: float = 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class _Budget:
+    """Of one image.
+
+    Attributes
+    ----------
+    parts
+        by where they come from and by source.
+    scatter, drawn
+        of images by factors without noise, and all noise that is drawn.
+    steady
+        (n, n') error that is no noise.
+    """
+
+    parts: dict[tuple[str, str], _Part]
+    scatter: Scatter
+    drawn: Noise
+    steady: FloatArray
+
+
 def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[LossRow], list[str]]:
     """Rows of noise, of the scene, of what is not explained and of every drift of the recipe, and what could not be
     predicted.
@@ -100,23 +120,30 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[Los
     lit, clear
         the session that its factors are of, and its factors without noise.
     """
-    parts, chance = _parts(stand, lit, clear)
-    measured, told = squared_error(stand.before_db), sum(part.square for part in parts.values())
+    budget = _budget(stand, lit, clear)
+    measured, told = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
     found = [
         LossRow(of, source, "", *gained(part.square, measured, told, part.deviation), part.square, part.deviation)
-        for (of, source), part in parts.items()
+        for (of, source), part in budget.parts.items()
     ]
-    found.append(_unexplained(measured, told, chance))
+    pixels = budget.steady.size
+    found.append(_unexplained(measured, told, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
     refused = []
-    drift = stand.recipe.drift
+    drift, still = stand.recipe.drift, stand.told(Drift())
+    target = still.image - budget.steady  # so that the image without a drift is off as it is
     for kind in drift.kinds:
         try:
-            foretold = stand.foretold(drift.alone(kind))
+            moved = stand.told(drift.alone(kind))
         except MitsimError as error:
             refused.append(f"{kind}: {error}")
             continue
+        foretold = Foretold(stand.before_db, still.psnr_db(target), moved.psnr_db(target))
+        lost = foretold.predicted_lost_db
+        # Noise that happens to look like what the drift does.
+        chance = budget.scatter.common(budget.drawn, moved.image - still.image) / pixels / measured
+        sure = math.hypot(foretold.predicted_error_db, 10 * math.log10(1 + chance / 10 ** (lost / 10)))
         amount = f"{getattr(drift, kind):g} {UNITS[kind]}".removesuffix(" 1").replace(" 1 rms", " rms")
-        found.append(LossRow(DRIFT, kind, amount, foretold.predicted_lost_db, foretold.predicted_error_db))
+        found.append(LossRow(DRIFT, kind, amount, lost, sure))
     return found, refused
 
 
@@ -128,8 +155,7 @@ def _unexplained(measured: float, told: float, chance: float) -> LossRow:
     return LossRow(UNEXPLAINED, "not explained", "", lost, error, left, chance)
 
 
-def _parts(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[dict[tuple[str, str], _Part], float]:
-    """Parts of the squared error by where they come from and by source; and by how much chance moves what is left."""
+def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> _Budget:
     scene, noises = stand.lit.truth, _noises(stand, lit)
     pixels, found = scene.size, dict[tuple[str, str], _Part]()
     exact = replace(stand.linear, left=clear.left, right=clear.right)
@@ -138,15 +164,18 @@ def _parts(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[dict[tup
     seen = dict(_seen(stand, clear))
     whole = next(iter(seen.values()))
     steady = whole + sum(stand.fixed.values(), np.zeros_like(scene)) - scene
-    scatter = Scatter.of(exact, scene, steady)
+    scatter = Scatter(exact, scene)
     for source, noise in noises.items():
         among = drawn + (noise if source[1] == RENDERING else Noise())
-        found[source] = _Part(stand.linear.variance(scene, noise) / pixels, scatter.share(noise, among) / pixels)
+        found[source] = _Part(
+            stand.linear.variance(scene, noise) / pixels, scatter.share(noise, among, steady) / pixels
+        )
     off = whole - scene
     for source, error in stand.fixed.items():
         found[CAPTURE, source] = _Part(_square(off + error) - _square(off))
         off = off + error
-    return found | _of_scene(exact, scene, seen, sampled), scatter.deviation(drawn) / pixels
+    found |= _of_scene(scatter, seen, sampled)
+    return _Budget(found, scatter, drawn, off)
 
 
 def _seen(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
@@ -159,29 +188,27 @@ def _seen(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]
             yield name, stand.clear(clear, anatomy.without(off))
 
 
-def _of_scene(
-    exact: LinearImage, scene: FloatArray, seen: Mapping[str, FloatArray], sampled: Noise
-) -> dict[tuple[str, str], _Part]:
-    """What the light of a ``scene`` has beside that of a white board, by cause, and what lambda takes away.
+def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], _Part]:
+    """What the light of a scene has beside that of a white board, by cause, and what lambda takes away.
 
     Parameters
     ----------
-    exact, scene
-        the solver with factors without noise, and X.
+    scatter
+        of images by factors without noise.
     seen
         images of the scene's light with its causes, and without one after another.
     sampled
         noise of the light's rendering, which all of these have alike.
     """
-    found = {(SCENE, CAUSES[partial.DETAIL]): _Part(0.0)}
+    exact, scene, found = scatter.solver, scatter.scene, {(SCENE, CAUSES[partial.DETAIL]): _Part(0.0)}
     (_, last), *others = seen.items()
     for name, image in others:
-        moved = Scatter.of(exact, scene, last - image).common(sampled) / scene.size
+        moved = scatter.common(sampled, last - image) / scene.size
         found[SCENE, CAUSES[name]] = _Part(_square(last - scene) - _square(image - scene), moved)
         last = image
     bias = _square(exact.expected(scene).image - scene)
     rest = _square(last - scene) - bias - exact.variance(scene, sampled) / scene.size
-    found[SCENE, REST] = _Part(rest, Scatter.of(exact, scene, last - scene).deviation(sampled) / scene.size)
+    found[SCENE, REST] = _Part(rest, scatter.deviation(sampled, last - scene) / scene.size)
     found[SOLVER, LAMBDA] = _Part(bias)
     return found
 

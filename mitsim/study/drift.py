@@ -26,7 +26,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.perturbation import Changed, Gains, LinearImage, Noise
+from mitsim.reconstruct.perturbation import Changed, Expected, Gains, LinearImage, Noise
 from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.rig.drift import Drift
 from mitsim.rig.order import SIDES
@@ -148,7 +148,7 @@ class DriftStand:
 
     def foretold(self, drift: Drift) -> Foretold:
         """What a ``drift`` is predicted to do; MitsimError for one that the bench cannot have."""
-        return Foretold(self.before_db, self._predicted(Drift()), self._predicted(drift))
+        return Foretold(self.before_db, *(self.told(each).psnr_db(self.lit.truth) for each in (Drift(), drift)))
 
     @property
     def before_db(self) -> float:
@@ -235,15 +235,15 @@ class DriftStand:
 
     # ---- the prediction ----------------------------------------------------------------------------------------------
 
-    def _predicted(self, drift: Drift) -> float:
-        """PSNR [dB] that an image is expected to have after a ``drift``."""
+    def told(self, drift: Drift) -> Expected:
+        """What the image is expected to be after a ``drift``, as the model has it; MitsimError as :meth:`foretold`."""
         image, changed = self.linear, self._changed(drift)
         if drift.session_ramp or drift.session_flicker:
             left, right = self.session_mixes(drift)
             image = replace(image, left=self.factors.left @ left, right=self.factors.right @ right)
             others = [(self.factors.left, self.factors.right), (-image.left, image.right)]
             changed = replace(changed, terms=[*changed.terms, *others])
-        return image.expected(self.lit.truth, changed, self._noise).psnr_db(self.lit.truth)
+        return image.expected(self.lit.truth, changed, self._noise)
 
     @cached_property
     def fixed(self) -> Mapping[str, FloatArray]:
