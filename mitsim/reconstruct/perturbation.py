@@ -31,7 +31,7 @@ The expected squared error of X^ is that of its mean and, as V is orthonormal, t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -218,7 +218,7 @@ class LinearImage:
         changed, noise = changed or Changed(), noise or Noise()
         left, right = self.axes
         cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs
-        weights, variance = np.zeros_like(self.filter), 0.0
+        weights = np.zeros_like(self.filter)
         gain, apart = (np.broadcast_to(each, self._count) for each in (changed.gain, changed.gain_apart))
         seen = [(left.seen(first), right.seen(second)) for first, second in cameras]
         for row, column in np.ndindex(gain.shape):
@@ -228,39 +228,60 @@ class LinearImage:
         if self.family.signed and apart.any():
             for row, column in np.ndindex(gain.shape):
                 weights += apart[row, column] * lit * _together(even, row, column, scene)
-        for rms in changed.flicker:
-            rows = [_by_row(rms) * first for first, _ in cameras]
-            varied = [(left.seen(first), other) for first, (_, other) in zip(rows, seen, strict=True)]
-            varied_evenly = [(left.seen_evenly(first), other) for first, (_, other) in zip(rows, even, strict=True)]
-            for row, column in np.ndindex(gain.shape):
-                squares = np.square(_together(varied, row, column, scene))
-                if self.family.signed:
-                    squares = (squares + np.square(lit * _together(varied_evenly, row, column, scene))) / 2
-                variance += self._energy(squares)
         if changed.response is not None:
             weights += self._by_response(changed.response, cameras, scene, gain)
         if changed.leak and not self.family.signed:
             uniform = sum(first @ scene @ second.T for first, second in cameras)
             weights += changed.leak * left.total.T @ uniform @ right.total
-        if changed.added is not None:
-            added, more = self._by_added(changed.added, changed)
-            weights, variance = weights + added, variance + more
+        if changed.added is not None and not self.family.signed:
+            weights += changed.added_gain * left.total.T @ changed.added @ right.total
+        variance = sum(self._energy(np.square(term)) for term in self._by_gains(scene, changed))
         variance += self.variance(scene, noise)
         return Expected(left.basis @ (self.filter * weights) @ right.basis.T, variance)
 
-    def _by_added(self, frame: FloatArray, changed: Changed) -> tuple[FloatArray | float, float]:
-        """What a ``frame`` that is added to all adds to W and to the image's variance."""
+    def scatter(self, scene: FloatArray, changed: Changed, error: FloatArray) -> float:
+        """Variance that gains, as they are drawn, bring into the squared error, sum over the image.
+
+        Of independent normal gains that add e_g each to the image, beside an error b: sum_g 4 (b . e_g)^2 + 2 |e_g|^4.
+
+        Parameters
+        ----------
+        scene, changed
+            as for :meth:`expected`.
+        error
+            (n, n') error b of the image without them.
+        """
         left, right = self.axes
-        variance, frames = 0.0, 2 if self.family.signed else 1
-        for rms in changed.added_flicker:
-            varying = _by_row(rms) * frame
+        off = self.filter * (left.basis.T @ error @ right.basis)
+        terms = self._by_gains(scene, changed)
+        return sum(4 * float((off * term).sum()) ** 2 + 2 * self._energy(np.square(term)) ** 2 for term in terms)
+
+    def _by_gains(self, scene: FloatArray, changed: Changed) -> Iterator[FloatArray]:
+        """(r, r') what each gain that varies adds to W, by its rms."""
+        left, right = self.axes
+        cameras = [(self.left, self.right), *changed.terms]
+        lit = 1 + 2 * changed.leak
+        for rms in changed.flicker:
+            varied = [(left.seen(_by_row(rms) * first), right.seen(second)) for first, second in cameras]
+            evenly = [(left.seen_evenly(_by_row(rms) * first), right.seen_evenly(second)) for first, second in cameras]
             for row, column in np.ndindex(self._count):
-                variance += frames * self._energy(np.square(left.slabs[row].T @ varying @ right.slabs[column]))
-        if self.family.signed:
-            return 0.0, variance
-        for rms in changed.added_common:
-            variance += self._energy(np.square(left.total.T @ (_by_row(rms) * frame) @ right.total))
-        return changed.added_gain * left.total.T @ frame @ right.total, variance
+                term = _together(varied, row, column, scene)
+                if self.family.signed:  # the gains of two frames
+                    uniform = lit * _together(evenly, row, column, scene)
+                    yield (uniform + term) / 2
+                    yield (uniform - term) / 2
+                else:
+                    yield term
+        if changed.added is None:
+            return
+        for rms in changed.added_flicker:
+            varying = _by_row(rms) * changed.added
+            for row, column in np.ndindex(self._count):
+                term = left.slabs[row].T @ varying @ right.slabs[column]
+                yield from [term, -term] if self.family.signed else [term]
+        if not self.family.signed:
+            for rms in changed.added_common:
+                yield left.total.T @ (_by_row(rms) * changed.added) @ right.total
 
     def _by_response(self, response: FloatArray, cameras: Terms, scene: FloatArray, gain: FloatArray) -> FloatArray:
         """What pixels' ``response`` adds to W, in frames of a ``scene`` behind ``cameras`` with a ``gain`` (K, K')

@@ -128,21 +128,35 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[Los
     ]
     pixels = budget.steady.size
     found.append(_unexplained(measured, told, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
-    refused = []
-    drift, still = stand.recipe.drift, stand.told(Drift())
-    target = still.image - budget.steady  # so that the image without a drift is off as it is
-    for kind in drift.kinds:
+    rows, refused = _drifts(stand, budget, measured)
+    return found + rows, refused
+
+
+def _drifts(stand: DriftStand, budget: _Budget, measured: float) -> tuple[list[LossRow], list[str]]:
+    """Rows of drifts beside the squared error that is ``measured``, and what could not be predicted.
+
+    What a drift adds is as the model has it, and so is what that has in common with the error that is there without
+    it. But the model's drift does not move what the model leaves out of the scene's light, as the true one does: the
+    uncertainty is all of what these have in common, and chance.
+    """
+    still, found, refused = stand.told(Drift()), list[LossRow](), list[str]()
+    target, scene, pixels = still.image - budget.steady, stand.lit.truth, budget.steady.size
+    for kind in stand.recipe.drift.kinds:
+        drift = stand.recipe.drift.alone(kind)
         try:
-            moved = stand.told(drift.alone(kind))
+            moved = stand.told(drift)
         except MitsimError as error:
             refused.append(f"{kind}: {error}")
             continue
-        foretold = Foretold(stand.before_db, still.psnr_db(target), moved.psnr_db(target))
-        lost = foretold.predicted_lost_db
-        # Noise that happens to look like what the drift does.
-        chance = budget.scatter.common(budget.drawn, moved.image - still.image) / pixels / measured
-        sure = math.hypot(foretold.predicted_error_db, 10 * math.log10(1 + chance / 10 ** (lost / 10)))
-        amount = f"{getattr(drift, kind):g} {UNITS[kind]}".removesuffix(" 1").replace(" 1 rms", " rms")
+        lost, apart = (
+            Foretold(stand.before_db, still.psnr_db(truth), moved.psnr_db(truth)).predicted_lost_db
+            for truth in (target, scene)
+        )
+        # Noise that happens to look like what the drift does, and the draw of what drifts at random.
+        alike = budget.scatter.common(budget.drawn, moved.image - still.image) / pixels
+        chance = math.hypot(alike, math.sqrt(stand.scatter(drift, budget.steady))) / measured
+        sure = math.hypot(lost - apart, 10 * math.log10(1 + chance / 10 ** (lost / 10)))
+        amount = f"{getattr(stand.recipe.drift, kind):g} {UNITS[kind]}".removesuffix(" 1").replace(" 1 rms", " rms")
         found.append(LossRow(DRIFT, kind, amount, lost, sure))
     return found, refused
 

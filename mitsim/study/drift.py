@@ -362,6 +362,11 @@ class DriftStand:
         dark = warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
         return black + dark - sensor.superpixel_dark_current_e_per_s
 
+    def scatter(self, drift: Drift, error: FloatArray) -> float:
+        """Variance that the draw of a random ``drift`` brings into the mean squared error, beside an ``error`` (n, n')
+        of the image without it."""
+        return self.linear.scatter(self.lit.truth, self._changed(drift), error) / error.size**2
+
     def _terms(self, drift: Drift) -> SeparableTerms:
         """What a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""
         bench = self.lit.bench
