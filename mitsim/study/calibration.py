@@ -203,7 +203,7 @@ class CalibrationFindings:
             f"{image['exposure_seconds']:.3g} s of exposure, {image['photons']:.3g} photons; it loses by"
         )
         yield from (
-            f"{row.name:>42}: {row.lost_db:.2f} +- {row.error_db:.2f} dB"
+            f"{row.name:>42}: {row.lost_db:z.2f} +- {row.error_db:.2f} dB"
             for row in self.losses
             if abs(row.lost_db) >= _SAID_DB or row.of == UNEXPLAINED
         )
@@ -391,7 +391,8 @@ def _judged(row: LossRow) -> str:
 
 
 def _with_error(value: float, error: float, unit: str) -> str:
-    return f"{value:.2f} \N{PLUS-MINUS SIGN} {error:.2f}{unit}".replace("-", "\N{MINUS SIGN}")
+    # Zero has no sign.
+    return f"{value:z.2f} \N{PLUS-MINUS SIGN} {error:.2f}{unit}".replace("-", "\N{MINUS SIGN}")
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:
