@@ -20,8 +20,8 @@ KINDS = ("datum", "left", "right", "light", "left_light", "right_light")
 @pytest.mark.parametrize("name", ["dots:2", "uniform"])
 def test_squared_errors_scatter_as_stated(name: str) -> None:
     """600 draws, whose spread is known to 3 to 5 %: every kind of noise alone, beside an error that is none and without
-    it, and all of them together, which have more in common than is stated. (Planted: factors' noise taken for
-    independent from number to number; the error's coefficients not filtered; the scene not transposed for the right.)"""
+    it, and all of them together, which have more in common than is stated. (Planted: factors' noise
+    independent from number to number; the error's coefficients not filtered; the scene not transposed on the right.)"""
     shown, rng = parse_patterns(name, N, seed=3), np.random.default_rng(1)
     model = prepare(LEFT, RIGHT, shown.left, shown.right)
     scatter = Scatter(LinearImage(LEFT, RIGHT, shown, LAM), SCENE)
