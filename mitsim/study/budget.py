@@ -185,8 +185,8 @@ def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> _Budget:
             stand.linear.variance(scene, noise) / pixels, scatter.share(noise, among, steady) / pixels
         )
     off = whole - scene
-    for source, error in stand.fixed.items():
-        found[CAPTURE, source] = _Part(_square(off + error) - _square(off))
+    for name, error in stand.fixed.items():
+        found[CAPTURE, name] = _Part(_square(off + error) - _square(off))
         off = off + error
     found |= _of_scene(scatter, seen, sampled)
     return _Budget(found, scatter, drawn, off)

@@ -165,8 +165,8 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_draw_of_gains_scatters_by_each_alone(name: str) -> None:
-    """4 (b . e)^2 + 2 |e|^4 of each gain's e, as the solver makes it. (Planted: signs of two frames; |e|^2 for |e|^4;
-    the filter once.)"""
+    """4 (b . e)^2 + 2 |e|^4 of each gain's e, as the solver makes it. (Planted: signs of two frames; |e|^2 for
+    |e|^4.)"""
     shown, error = family(name), RNG.standard_normal((N, N))
     dark, count = np.zeros_like(seen(shown)), seen(shown).shape[:3]
     alone = []

@@ -219,8 +219,7 @@ def losses_of(scene: Path, variant: str, seed: int = 1, **rig: Path) -> tuple[Ca
 
 def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Callable[..., Path], variant: str) -> None:
     """Squares of one and a half projector pixels take 16 dB, all but a hundredth of the squared error, and what is left
-    is within three of its standard errors; an even print loses a tenth of a decibel at most. (Planted: detail left in
-    the light; noise of factors in its images; rendering not taken off; cross terms left out of the deviation.)"""
+    is within three of its standard errors; an even print loses a tenth of a decibel at most. (Planted: detail left in the light.)"""
     found, rows = losses_of(small_scene("squares", reflectance=print_of_squares(1.5)), variant)
     whole = 10 ** (-found.image["psnr_db"] / 10)
     detail, left = rows["scene: detail inside projector pixels"], rows["not explained"]
@@ -234,8 +233,7 @@ def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Calla
 def test_a_cause_without_a_row_is_said_to_be_missing(
     small_scene: Callable[..., Path], tmp_path: Path, variant: str
 ) -> None:
-    """A camera that is not linear, of which no row knows. (Planted: one standard error for all that is left; a warning
-    of what is told in place of what is not.)"""
+    """A camera that is not linear, of which no row knows. (Planted: a warning for none.)"""
     own = tmp_path / "camera.toml"
     own.write_text(f"linearity = [0.03]\n{shipped('calibration', 'imx249.toml').read_text()}")
     found, rows = losses_of(small_scene("even"), variant, camera=own)
