@@ -80,7 +80,7 @@ class Axis:
         return np.asarray(np.einsum("kmr,mn,nk->krn", self.slabs, factor, self.patterns, optimize=True))
 
     def seen_evenly(self, factor: FloatArray) -> FloatArray:
-        """(K, r, n) the same of uniform light."""
+        """(K, r, n) the same of a ``factor`` in uniform light."""
         return np.asarray(np.einsum("kmr,mn->krn", self.slabs, factor, optimize=True))
 
     @cached_property
