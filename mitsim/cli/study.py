@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -77,6 +78,7 @@ def study(
     from mitsim.study.folder import check_study_folder
 
     session, request = recipe_for(name, recipe), mitsim.Request.of(patterns=patterns, seed=seed)
+    warnings: Sequence[str] = ()
     with job_of(quiet or as_json) as job:
         if name == "merge":
             from mitsim.study.campaign import merge
@@ -109,7 +111,8 @@ def study(
                 with job.clock.stage("open scene"):
                     bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
             result = run_study(bench, output, request, job)
-    return finish(as_json, result.payload(), result.lines(), ())
+            warnings = result.warnings
+    return finish(as_json, result.payload(), result.lines(), warnings)
 
 
 def _only(scenes: list[str] | None) -> str | None:

@@ -31,7 +31,7 @@ The expected squared error of X^ is that of its mean and, as V is orthonormal, t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -47,8 +47,16 @@ Gains = Sequence[float | FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class _Axis:
-    """One side: ``slabs`` (K, m, r) of U, ``singular`` (r,), ``basis`` (n, r), and its ``patterns`` (n, K)."""
+class Axis:
+    """One side.
+
+    Attributes
+    ----------
+    slabs, singular, basis
+        (K, m, r) of U, (r,) of S and (n, r) of V.
+    patterns
+        (n, K).
+    """
 
     slabs: FloatArray
     singular: FloatArray
@@ -56,7 +64,8 @@ class _Axis:
     patterns: FloatArray
 
     @classmethod
-    def of(cls, factor: FloatArray, patterns: FloatArray) -> _Axis:
+    def of(cls, factor: FloatArray, patterns: FloatArray) -> Axis:
+        """Of a side with a ``factor`` (m, n) and ``patterns`` (n, K)."""
         stacked = np.concatenate([factor * column for column in patterns.T])
         left, singular, right = np.linalg.svd(stacked, full_matrices=False)
         return cls(left.reshape(patterns.shape[1], *factor.shape[:1], -1), singular, right.T, patterns)
@@ -71,7 +80,7 @@ class _Axis:
         return np.asarray(np.einsum("kmr,mn,nk->krn", self.slabs, factor, self.patterns, optimize=True))
 
     def seen_evenly(self, factor: FloatArray) -> FloatArray:
-        """(K, r, n) the same of uniform light."""
+        """(K, r, n) the same of a ``factor`` in uniform light."""
         return np.asarray(np.einsum("kmr,mn->krn", self.slabs, factor, optimize=True))
 
     @cached_property
@@ -169,6 +178,10 @@ class Noise:
         """Both, of sources that do not know of each other."""
         return Noise(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
 
+    def __sub__(self, other: Noise) -> Noise:
+        """All but an ``other`` that is part of it."""
+        return Noise(*(getattr(self, each.name) - getattr(other, each.name) for each in fields(self)))
+
 
 @dataclass(frozen=True, eq=False)
 class LinearImage:
@@ -203,9 +216,9 @@ class LinearImage:
             what its frames differ by from what the factors say; None: nothing.
         """
         changed, noise = changed or Changed(), noise or Noise()
-        left, right = self._axes
+        left, right = self.axes
         cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs
-        weights, variance = np.zeros_like(self._filter), 0.0
+        weights = np.zeros_like(self.filter)
         gain, apart = (np.broadcast_to(each, self._count) for each in (changed.gain, changed.gain_apart))
         seen = [(left.seen(first), right.seen(second)) for first, second in cameras]
         for row, column in np.ndindex(gain.shape):
@@ -215,45 +228,66 @@ class LinearImage:
         if self.family.signed and apart.any():
             for row, column in np.ndindex(gain.shape):
                 weights += apart[row, column] * lit * _together(even, row, column, scene)
-        for rms in changed.flicker:
-            rows = [_by_row(rms) * first for first, _ in cameras]
-            varied = [(left.seen(first), other) for first, (_, other) in zip(rows, seen, strict=True)]
-            varied_evenly = [(left.seen_evenly(first), other) for first, (_, other) in zip(rows, even, strict=True)]
-            for row, column in np.ndindex(gain.shape):
-                squares = np.square(_together(varied, row, column, scene))
-                if self.family.signed:
-                    squares = (squares + np.square(lit * _together(varied_evenly, row, column, scene))) / 2
-                variance += self._energy(squares)
         if changed.response is not None:
             weights += self._by_response(changed.response, cameras, scene, gain)
         if changed.leak and not self.family.signed:
             uniform = sum(first @ scene @ second.T for first, second in cameras)
             weights += changed.leak * left.total.T @ uniform @ right.total
-        if changed.added is not None:
-            added, more = self._by_added(changed.added, changed)
-            weights, variance = weights + added, variance + more
+        if changed.added is not None and not self.family.signed:
+            weights += changed.added_gain * left.total.T @ changed.added @ right.total
+        variance = sum(self._energy(np.square(term)) for term in self._by_gains(scene, changed))
         variance += self.variance(scene, noise)
-        return Expected(left.basis @ (self._filter * weights) @ right.basis.T, variance)
+        return Expected(left.basis @ (self.filter * weights) @ right.basis.T, variance)
 
-    def _by_added(self, frame: FloatArray, changed: Changed) -> tuple[FloatArray | float, float]:
-        """What a ``frame`` that is added to all adds to W and to the image's variance."""
-        left, right = self._axes
-        variance, frames = 0.0, 2 if self.family.signed else 1
-        for rms in changed.added_flicker:
-            varying = _by_row(rms) * frame
+    def scatter(self, scene: FloatArray, changed: Changed, error: FloatArray) -> float:
+        """Variance that gains, as they are drawn, bring into the squared error, sum over the image.
+
+        Of independent normal gains that add e_g each to the image, beside an error b: sum_g 4 (b . e_g)^2 + 2 |e_g|^4.
+
+        Parameters
+        ----------
+        scene, changed
+            as for :meth:`expected`.
+        error
+            (n, n') error b of the image without them.
+        """
+        left, right = self.axes
+        off = self.filter * (left.basis.T @ error @ right.basis)
+        terms = self._by_gains(scene, changed)
+        return sum(4 * float((off * term).sum()) ** 2 + 2 * self._energy(np.square(term)) ** 2 for term in terms)
+
+    def _by_gains(self, scene: FloatArray, changed: Changed) -> Iterator[FloatArray]:
+        """(r, r') what each gain that varies adds to W, by its rms."""
+        left, right = self.axes
+        cameras = [(self.left, self.right), *changed.terms]
+        lit = 1 + 2 * changed.leak
+        for rms in changed.flicker:
+            varied = [(left.seen(_by_row(rms) * first), right.seen(second)) for first, second in cameras]
+            evenly = [(left.seen_evenly(_by_row(rms) * first), right.seen_evenly(second)) for first, second in cameras]
             for row, column in np.ndindex(self._count):
-                variance += frames * self._energy(np.square(left.slabs[row].T @ varying @ right.slabs[column]))
-        if self.family.signed:
-            return 0.0, variance
-        for rms in changed.added_common:
-            variance += self._energy(np.square(left.total.T @ (_by_row(rms) * frame) @ right.total))
-        return changed.added_gain * left.total.T @ frame @ right.total, variance
+                term = _together(varied, row, column, scene)
+                if self.family.signed:  # the gains of two frames
+                    uniform = lit * _together(evenly, row, column, scene)
+                    yield (uniform + term) / 2
+                    yield (uniform - term) / 2
+                else:
+                    yield term
+        if changed.added is None:
+            return
+        for rms in changed.added_flicker:
+            varying = _by_row(rms) * changed.added
+            for row, column in np.ndindex(self._count):
+                term = left.slabs[row].T @ varying @ right.slabs[column]
+                yield from [term, -term] if self.family.signed else [term]
+        if not self.family.signed:
+            for rms in changed.added_common:
+                yield left.total.T @ (_by_row(rms) * changed.added) @ right.total
 
     def _by_response(self, response: FloatArray, cameras: Terms, scene: FloatArray, gain: FloatArray) -> FloatArray:
         """What pixels' ``response`` adds to W, in frames of a ``scene`` behind ``cameras`` with a ``gain`` (K, K')
         each."""
-        left, right = self._axes
-        weights = np.zeros_like(self._filter)
+        left, right = self.axes
+        weights = np.zeros_like(self.filter)
         for row, column in np.ndindex(self._count):
             lit = np.outer(left.patterns[:, row], right.patterns[:, column]) * scene
             frame = sum(first @ lit @ second.T for first, second in cameras)
@@ -262,41 +296,45 @@ class LinearImage:
 
     def variance(self, scene: FloatArray, noise: Noise) -> float:
         """Sum of the variances of all numbers of the image of a ``scene`` (n, n') by ``noise``."""
-        left, right = self._axes
-        total = np.full(self._filter.shape, 2 * noise.datum if self.family.signed else noise.datum)
-        total += noise.ambient * np.outer(*(np.square(axis.total).sum(axis=0) for axis in (left, right)))
-        if noise.left:
-            total += noise.left * left.noise @ np.square(scene @ (right.basis * right.singular))
-        if noise.right:
-            total += noise.right * np.square(scene.T @ (left.basis * left.singular)).T @ right.noise.T
-        if noise.left_light:
-            light = np.square(left.basis * left.singular).T
-            total += noise.left_light * light @ np.square(scene @ (right.basis * right.singular))
-        if noise.right_light:
-            light = np.square(right.basis * right.singular)
-            total += noise.right_light * np.square(scene.T @ (left.basis * left.singular)).T @ light
-        if noise.light:
-            total += noise.light * np.outer(np.square(left.singular), np.square(right.singular))
-        return self._energy(total)
+        units = self.units(scene)
+        return self._energy(sum((getattr(noise, name) * unit for name, unit in units.items()), np.zeros((1, 1))))
+
+    def units(self, scene: FloatArray) -> dict[str, FloatArray]:
+        """(r, r') variance of each number of W by 1 of each :class:`Noise`, of frames of a ``scene`` (n, n')."""
+        left, right = self.axes
+        of_left, of_right = np.square(left.basis * left.singular).T, np.square(right.basis * right.singular)
+        seen_right = np.square(scene @ (right.basis * right.singular))
+        seen_left = np.square(scene.T @ (left.basis * left.singular)).T
+        return {
+            "datum": np.full(self.filter.shape, 2.0 if self.family.signed else 1.0),
+            "ambient": np.outer(*(np.square(axis.total).sum(axis=0) for axis in (left, right))),
+            "left": left.noise @ seen_right,
+            "right": seen_left @ right.noise.T,
+            "light": np.outer(np.square(left.singular), np.square(right.singular)),
+            "left_light": of_left @ seen_right,
+            "right_light": seen_left @ of_right,
+        }
 
     @property
     def _count(self) -> tuple[int, int]:
         """Patterns of rows, and of columns."""
-        return len(self._axes[0].slabs), len(self._axes[1].slabs)
+        return len(self.axes[0].slabs), len(self.axes[1].slabs)
 
     def _energy(self, variance: FloatArray) -> float:
         """Sum over the image of what has this ``variance``, or squares, in W."""
-        return float((np.square(self._filter) * variance).sum())
+        return float((np.square(self.filter) * variance).sum())
 
     @cached_property
-    def _axes(self) -> tuple[_Axis, _Axis]:
-        left = _Axis.of(self._centred(self.left), self.family.left.astype(np.float64))
-        right = _Axis.of(self._centred(self.right), self.family.right.astype(np.float64))
+    def axes(self) -> tuple[Axis, Axis]:
+        """Left and right."""
+        left = Axis.of(self._centred(self.left), self.family.left.astype(np.float64))
+        right = Axis.of(self._centred(self.right), self.family.right.astype(np.float64))
         return left, right
 
     @cached_property
-    def _filter(self) -> FloatArray:
-        sigma = np.outer(self._axes[0].singular, self._axes[1].singular)
+    def filter(self) -> FloatArray:
+        """(r, r') F."""
+        sigma = np.outer(self.axes[0].singular, self.axes[1].singular)
         return np.asarray(sigma / (np.square(sigma) + self.lam))
 
     def _centred(self, matrix: FloatArray) -> FloatArray:

@@ -1,34 +1,59 @@
 """A scene, a calibrated camera and patterns in; the decibels that each source of noise and each drift costs, out.
 
-All of it is a perturbation of the solver with its lambda fixed (:mod:`mitsim.reconstruct.perturbation`), beside one
-image that is measured. With E that image's squared error and V the part of it that a source is predicted to have, the
-source costs ``10 log10(E / (E - V))``: what the image would gain without it. These decibels do not add up, but the V
-do, to what E is predicted to be. A drift that adds the squared error A costs ``10 log10((E + A) / E)``. What the
-prediction leaves out of E, such as detail inside projector pixels, may have any share in V and in A; the uncertainty
-is what changes if it has none in E.
+Beside one image that is measured, its squared error E is told by its parts V, which add up. Of noise they are expected,
+a perturbation of the solver with its lambda fixed (:mod:`mitsim.reconstruct.perturbation`). What the scene's light has
+that factors, measured on an even white board, do not hold - detail inside projector pixels, depth, light over several
+surfaces - is found from frames without noise of the light that was traced, solved with factors without noise: of the
+same with one cause after another taken out of the light (:mod:`mitsim.capture.partial`), and less what lambda alone
+takes away. What is left of E is not explained. Noise is drawn once, so every V and what is left scatter by chance, as
+:mod:`mitsim.reconstruct.scatter` states.
+
+A source costs ``10 log10(E / (E - V))``: what the image would gain without it. These decibels do not add up. A drift
+that adds the squared error A costs ``10 log10((E + A) / E)``. Of what is not explained any share may belong to any
+source; the uncertainty is what that changes, and what chance does.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
+from mitsim.capture import partial
+from mitsim.capture.partial import Anatomy
 from mitsim.capture.session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.perturbation import Noise
-from mitsim.rig.drift import UNITS, WORDS
+from mitsim.reconstruct.scatter import Scatter
+from mitsim.rig.drift import UNITS, WORDS, Drift
 from mitsim.rig.order import SIDES
-from mitsim.study.drift import AMBIENT, SESSION, DriftStand, squared_error
+from mitsim.study.drift import AMBIENT, SESSION, DriftStand, Foretold, squared_error
 from mitsim.study.exposures import SPECKLE
 
-CAPTURE, DRIFT, SOLVER = "capture", "drift", "solver"
+CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
 """Where a loss comes from, beside the session."""
-RENDERING, LAMBDA = "rendering", "lambda and resolution"
-"""Sampling of simulated light; and what the solver takes away of the scene itself."""
+RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
+"""Sampling of simulated light; what the solver takes away of the scene itself; and what no named cause has."""
+CAUSES = MappingProxyType(
+    {
+        partial.DETAIL: "detail inside projector pixels",
+        partial.DEPTH: "depth beside the board's",
+        partial.OCCLUSION: "edges that hide pixels from part of the sensor",
+        partial.INTERREFLECTION: "light over several surfaces",
+        partial.MIRRORS: "light over mirrors",
+        partial.GLOSS: "gloss over the sensor",
+        partial.BLACK_LEVEL: "light that black pixels leak",
+    }
+)
+"""Effects of the scene's light that factors do not hold, in the order in which they are taken out, in words. The others
+are in the light of the white board as well."""
+SURE = 3.0
+"""Standard errors from which what is not explained is no chance: 1 of 370 studies has more of normal scatter."""
 _LEAST_LEFT = 1e-9
 """Part of an image's error that is left without a source, at least: 90 dB, for images that one source explains."""
 
@@ -36,7 +61,8 @@ _LEAST_LEFT = 1e-9
 @dataclass(frozen=True)
 class LossRow:
     """What a ``source`` of noise, or a drift by an ``amount``, costs an image [dB], and how sure that is; ``of``:
-    capture, session, drift, or the solver; ``squared_error``, mean over the image, that a source of noise has."""
+    capture, session, scene, drift, the solver, or unexplained; ``squared_error``, mean over the image, that a source
+    has, below 0 where the image has more without it, and its ``deviation`` by chance."""
 
     of: str
     source: str
@@ -44,47 +70,168 @@ class LossRow:
     lost_db: float
     error_db: float
     squared_error: float = 0.0
+    deviation: float = 0.0
 
     @property
     def name(self) -> str:
         """In words."""
+        if self.of == UNEXPLAINED:
+            return self.source
         what = WORDS.get(self.source, self.source) if self.of == DRIFT else f"{self.of}: {self.source}"
         return f"{what}, {self.amount}" if self.amount else what
 
 
-def losses(stand: DriftStand, lit: LitSession) -> tuple[list[LossRow], list[str]]:
-    """Rows of noise and of every drift of the recipe, and what could not be predicted.
+@dataclass(frozen=True)
+class _Part:
+    """Of an image's squared error, mean over the image: how much, and by how much chance moves it."""
+
+    square: float
+    deviation: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Budget:
+    """Of one image.
+
+    Attributes
+    ----------
+    parts
+        by where they come from and by source.
+    scatter, drawn
+        of images by factors without noise, and all noise that is drawn.
+    steady
+        (n, n') error that is no noise.
+    """
+
+    parts: dict[tuple[str, str], _Part]
+    scatter: Scatter
+    drawn: Noise
+    steady: FloatArray
+
+
+def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[LossRow], list[str]]:
+    """Rows of noise, of the scene, of what is not explained and of every drift of the recipe, and what could not be
+    predicted.
 
     Parameters
     ----------
     stand
         the scene in its light, the camera and the patterns; its recipe states the drift.
-    lit
-        the session that its factors are of.
+    lit, clear
+        the session that its factors are of, and its factors without noise.
     """
-    scene, found = stand.lit.truth, list[LossRow]()
-    still = stand.still
-    bias = still.psnr_db(scene)
-    parts = {source: stand.linear.variance(scene, noise) / scene.size for source, noise in _noises(stand, lit).items()}
-    parts |= {(CAPTURE, source): part for source, part in stand.fixed.items()}
-    parts[SOLVER, LAMBDA] = squared_error(bias) if math.isfinite(bias) else 0.0
-    measured, told = squared_error(stand.before_db), sum(parts.values())
-    for (of, source), part in parts.items():
-        found.append(LossRow(of, source, "", *gained(part, measured, told), part))
-    refused = []
-    drift = stand.recipe.drift
-    for kind in drift.kinds:
+    budget = _budget(stand, lit, clear)
+    measured, told = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
+    found = [
+        LossRow(of, source, "", *gained(part.square, measured, told, part.deviation), part.square, part.deviation)
+        for (of, source), part in budget.parts.items()
+    ]
+    pixels = budget.steady.size
+    found.append(_unexplained(measured, told, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
+    rows, refused = _drifts(stand, budget, measured)
+    return found + rows, refused
+
+
+def _drifts(stand: DriftStand, budget: _Budget, measured: float) -> tuple[list[LossRow], list[str]]:
+    """Rows of drifts beside the squared error that is ``measured``, and what could not be predicted.
+
+    What a drift adds is as the model has it, and so is what that has in common with the error that is there without
+    it. But the model's drift does not move what the model leaves out of the scene's light, as the true one does: the
+    uncertainty is all of what these have in common, and chance.
+    """
+    still, found, refused = stand.told(Drift()), list[LossRow](), list[str]()
+    target, scene, pixels = still.image - budget.steady, stand.lit.truth, budget.steady.size
+    for kind in stand.recipe.drift.kinds:
+        drift = stand.recipe.drift.alone(kind)
         try:
-            foretold = stand.foretold(drift.alone(kind))
+            moved = stand.told(drift)
         except MitsimError as error:
             refused.append(f"{kind}: {error}")
             continue
-        amount = f"{getattr(drift, kind):g} {UNITS[kind]}".removesuffix(" 1").replace(" 1 rms", " rms")
-        found.append(LossRow(DRIFT, kind, amount, foretold.predicted_lost_db, foretold.predicted_error_db))
+        lost, apart = (
+            Foretold(stand.before_db, still.psnr_db(truth), moved.psnr_db(truth)).predicted_lost_db
+            for truth in (target, scene)
+        )
+        # Noise that happens to look like what the drift does, and the draw of what drifts at random.
+        alike = budget.scatter.common(budget.drawn, moved.image - still.image) / pixels
+        chance = math.hypot(alike, math.sqrt(stand.scatter(drift, budget.steady))) / measured
+        sure = math.hypot(lost - apart, 10 * math.log10(1 + chance / 10 ** (lost / 10)))
+        amount = f"{getattr(stand.recipe.drift, kind):g} {UNITS[kind]}".removesuffix(" 1").replace(" 1 rms", " rms")
+        found.append(LossRow(DRIFT, kind, amount, lost, sure))
     return found, refused
 
 
-def gained(part: float, measured: float, told: float) -> tuple[float, float]:
+def _unexplained(measured: float, told: float, chance: float) -> LossRow:
+    """Squared error that is ``measured`` and not ``told``, which ``chance`` moves by so much."""
+    left = measured - told
+    lost = _decibels(left / measured)
+    error = abs(_decibels((left + chance) / measured) - lost)
+    return LossRow(UNEXPLAINED, "not explained", "", lost, error, left, chance)
+
+
+def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> _Budget:
+    scene, noises = stand.lit.truth, _noises(stand, lit)
+    pixels, found = scene.size, dict[tuple[str, str], _Part]()
+    exact = replace(stand.linear, left=clear.left, right=clear.right)
+    sampled = sum((noise for (_, name), noise in noises.items() if name == RENDERING), Noise())
+    drawn = sum(noises.values(), Noise()) - sampled
+    seen = dict(_seen(stand, clear))
+    whole = next(iter(seen.values()))
+    steady = whole + sum(stand.fixed.values(), np.zeros_like(scene)) - scene
+    scatter = Scatter(exact, scene)
+    for source, noise in noises.items():
+        among = drawn + (noise if source[1] == RENDERING else Noise())
+        found[source] = _Part(
+            stand.linear.variance(scene, noise) / pixels, scatter.share(noise, among, steady) / pixels
+        )
+    off = whole - scene
+    for name, error in stand.fixed.items():
+        found[CAPTURE, name] = _Part(_square(off + error) - _square(off))
+        off = off + error
+    found |= _of_scene(scatter, seen, sampled)
+    return _Budget(found, scatter, drawn, off)
+
+
+def _seen(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
+    """Images without noise of the scene's light, and of it without one cause after another."""
+    anatomy, off = Anatomy.of(stand.lit.light), frozenset[str]()
+    yield "", stand.clear(clear, stand.lit.light)
+    for name in CAUSES:
+        if name in anatomy.effects:
+            off |= {name}
+            yield name, stand.clear(clear, anatomy.without(off))
+
+
+def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], _Part]:
+    """What the light of a scene has beside that of a white board, by cause, and what lambda takes away.
+
+    Parameters
+    ----------
+    scatter
+        of images by factors without noise.
+    seen
+        images of the scene's light with its causes, and without one after another.
+    sampled
+        noise of the light's rendering, which all of these have alike.
+    """
+    exact, scene, found = scatter.solver, scatter.scene, {(SCENE, CAUSES[partial.DETAIL]): _Part(0.0)}
+    (_, last), *others = seen.items()
+    for name, image in others:
+        moved = scatter.common(sampled, last - image) / scene.size
+        found[SCENE, CAUSES[name]] = _Part(_square(last - scene) - _square(image - scene), moved)
+        last = image
+    bias = _square(exact.expected(scene).image - scene)
+    rest = _square(last - scene) - bias - exact.variance(scene, sampled) / scene.size
+    found[SCENE, REST] = _Part(rest, scatter.deviation(sampled, last - scene) / scene.size)
+    found[SOLVER, LAMBDA] = _Part(bias)
+    return found
+
+
+def _square(error: FloatArray) -> float:
+    return float(np.square(error).mean())
+
+
+def gained(part: float, measured: float, told: float, deviation: float = 0.0) -> tuple[float, float]:
     """Decibels that an image would gain without a source, and how sure that is.
 
     Parameters
@@ -93,12 +240,16 @@ def gained(part: float, measured: float, told: float) -> tuple[float, float]:
         squared error that the source is predicted to have.
     measured, told
         squared error of the image as it is, and as all sources together are predicted to make it.
+    deviation
+        by which chance moves the source's part.
     """
-    lost = _decibels(part / max(measured, told))
+    most = max(measured, told)
+    lost = _decibels(part / most)
+    chance = abs(_decibels((part + deviation) / most) - lost)
     if measured >= told:
-        return lost, abs(_decibels(part / told if told else 0.0) - lost)
+        return lost, math.hypot(chance, _decibels(part / told if told else 0.0) - lost)
     # More is predicted than there is: at most, all of what is too much is this source's.
-    return lost, abs(_decibels(max(part - (told - measured), 0.0) / measured) - lost)
+    return lost, math.hypot(chance, _decibels(max(part - (told - measured), 0.0) / measured) - lost)
 
 
 def _decibels(part: float) -> float:
@@ -113,7 +264,9 @@ def _noises(stand: DriftStand, lit: LitSession) -> Mapping[tuple[str, str], Nois
         if name != SESSION and (name not in (AMBIENT, SPECKLE) or noise != Noise()):
             found[CAPTURE, name] = noise
     light, factors = stand.lit.light, (stand.factors.left, stand.factors.right)
-    found[CAPTURE, RENDERING] = Noise(light=light.apparent.error_of(light.flux_error) ** 2)
+    # The truth's own sampling is in the error as much as that of the light.
+    sampled = light.apparent.error_of(light.flux_error) ** 2 + light.apparent.error**2
+    found[CAPTURE, RENDERING] = Noise(light=sampled)
     left, right = (entry_variances(lit, factors, side) for side in SIDES)
     for source, variance in left.items():
         found[SESSION, source] = Noise(left=float(variance.mean()), right=float(right[source].mean()))

@@ -3,12 +3,13 @@
 Factors of noisy frames are compared with those of the expected frames of the same light, whose difference is noise
 alone; how large it may be is predicted from the sensor's closed form, before any frame is drawn. What no separable
 camera explains of the expected frames is told apart by forming them again with one cause left out. What the session's
-noise, the capture's, and each drift of the recipe cost an image of the scene is predicted beside one image that is
-solved (:mod:`mitsim.study.budget`).
+noise, the capture's, the scene's light, and each drift of the recipe cost an image of the scene is told beside one
+image that is solved, and what of it is not explained (:mod:`mitsim.study.budget`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar
@@ -35,9 +36,19 @@ from mitsim.rig.drift import WORDS, Drift
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.study import plots
-from mitsim.study.budget import CAPTURE, DRIFT, SOLVER, LossRow, entry_variances, losses
+from mitsim.study.budget import (
+    CAPTURE,
+    DRIFT,
+    SCENE,
+    SOLVER,
+    SURE,
+    UNEXPLAINED,
+    LossRow,
+    entry_variances,
+    losses,
+)
 from mitsim.study.charts import bars
-from mitsim.study.drift import SESSION, DriftStand
+from mitsim.study.drift import SESSION, DriftStand, squared_error
 from mitsim.study.exposures import LitScene
 from mitsim.study.knobs import reformed, without
 from mitsim.study.page import Part
@@ -48,7 +59,8 @@ _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
 and bias and angle to first order do not hold."""
-_WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", DRIFT: "drift", SOLVER: "the solver"}
+_WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", SCENE: "light of the scene",
+          DRIFT: "drift", SOLVER: "the solver", UNEXPLAINED: "anywhere"}  # fmt: skip
 """Where a loss comes from, in words."""
 _NO_DRIFT = " The recipe has no table [drift]: calibration/drift.toml is one that has."
 _SAID_DB = 0.005
@@ -110,11 +122,10 @@ class CalibrationFindings:
     session
         frames, seconds of exposure, photoelectrons and photons.
     image
-        of a capture with these factors: ``patterns``, ``psnr_db``, ``predicted_psnr_db`` of all sources of noise
-        together, and ``frames``, ``exposure_seconds``, ``photoelectrons`` and ``photons`` of the capture; empty where
-        none was made.
+        of a capture with these factors: ``patterns``, ``psnr_db``, ``predicted_psnr_db`` of all sources together, and
+        ``frames``, ``exposure_seconds``, ``photoelectrons`` and ``photons`` of the capture; empty where none was made.
     losses
-        what each source of noise and each drift costs it.
+        what each source of noise, the scene's light and each drift costs it, and what is not explained.
     not_predicted
         drifts whose cost is not, each with the reason.
     """
@@ -142,7 +153,19 @@ class CalibrationFindings:
             "image": self.image,
             "losses": [asdict(row) for row in self.losses],
             "not_predicted": self.not_predicted,
+            "warnings": self.warnings,
         }
+
+    @property
+    def warnings(self) -> list[str]:
+        """That the sources do not make the image's squared error, where chance does not either."""
+        return [
+            f"losses: {_judged(row)}, {100 * row.squared_error / squared_error(self.image['psnr_db']):+.1f} % of its "
+            "squared error, which may have a share in every other row; look for what the scene or the camera has that "
+            "no row names"
+            for row in self.losses
+            if row.of == UNEXPLAINED and abs(row.squared_error) > SURE * row.deviation
+        ]
 
     def lines(self) -> list[str]:
         """For people."""
@@ -176,14 +199,15 @@ class CalibrationFindings:
         image = self.image
         yield (
             f"image under {image['patterns']}: PSNR {image['psnr_db']:.2f} dB, {image['predicted_psnr_db']:.2f} as "
-            f"predicted of all its sources of noise, {image['frames']} frames, "
+            f"all its sources say, {image['frames']} frames, "
             f"{image['exposure_seconds']:.3g} s of exposure, {image['photons']:.3g} photons; it loses by"
         )
         yield from (
-            f"{row.name:>42}: {row.lost_db:.2f} +- {row.error_db:.2f} dB"
+            f"{row.name:>42}: {row.lost_db:z.2f} +- {row.error_db:.2f} dB"
             for row in self.losses
-            if row.lost_db >= _SAID_DB
+            if abs(row.lost_db) >= _SAID_DB or row.of == UNEXPLAINED
         )
+        yield from (_judged(row) for row in self.losses if row.of == UNEXPLAINED)
         yield from (f"not predicted: {text}" for text in self.not_predicted)
 
     def figures(self) -> dict[str, Figure]:
@@ -202,7 +226,7 @@ class CalibrationFindings:
         found["singular.png"] = plots.singular_errors(rows)
         if parts:
             found["causes.png"] = plots.error_bars(parts)
-        rated = {row.name: Mean(row.lost_db, row.error_db, 1) for row in self.losses if row.lost_db >= _SAID_DB}
+        rated = {row.name: Mean(row.lost_db, row.error_db, 1) for row in self.losses if abs(row.lost_db) >= _SAID_DB}
         if rated:
             found["losses.png"] = bars(rated, "PSNR lost [dB]")
         return found
@@ -256,27 +280,34 @@ class CalibrationFindings:
         return tuple(f"{name}.png" for name in self.maps)
 
     def _losses_part(self) -> Part:
-        told, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
-        ordered = sorted(self.losses, key=lambda row: -row.lost_db)
+        whole, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
+        rest = [row for row in self.losses if row.of == UNEXPLAINED]
+        ordered = sorted((row for row in self.losses if row not in rest), key=lambda row: -row.lost_db)
         rows = [
             (
                 _WHERE[row.of],
                 WORDS.get(row.source, row.source),
                 row.amount,
-                f"{row.lost_db:.2f} \N{PLUS-MINUS SIGN} {row.error_db:.2f}",
-                "" if row.of == DRIFT else f"{row.squared_error / told:.2%}",
+                _with_error(row.lost_db, row.error_db, ""),
+                ""
+                if row.of == DRIFT
+                else _with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
             )
-            for row in ordered
+            for row in [*ordered, *rest]
         ]
         untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
+        said = "".join(f" {_judged(row).capitalize()}." for row in rest)
         return Part(
             "What an image loses",
             f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
-            f"these factors; all sources of noise together are predicted to leave {image['predicted_psnr_db']:.2f} dB. "
-            "Noise: what the image would gain without that source alone, and the source's part of the squared error "
-            "that is predicted; these parts add up, decibels do not. Drift between calibration and capture, by the "
-            "amounts of the recipe: what the image would lose. All are predicted in closed form with lambda as it is; "
-            "the uncertainty is the prediction's own. Nonuniformity: the session has seen the same pixels, so its "
+            f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{said} "
+            "Noise, light of the scene and solver: what the image would gain without that source alone, and the "
+            "source's part of the squared error; these parts add up to the whole, decibels do not. Below 0: the image "
+            "would be worse without it. Drift between calibration and capture, by the amounts of the recipe: what the "
+            "image would lose. Noise and drift are predicted in closed form with lambda as it is. Light of the scene "
+            "is what factors, measured on an even white board, do not hold of it, found from frames without noise. "
+            "The uncertainty is one standard error: noise is drawn once, and the part that is not explained may "
+            "belong to any source. Nonuniformity: the session has seen the same pixels, so its "
             "factors hold what the pixels of a row or of a column have alike, and the image loses by the rest. "
             "Rendering is the simulation's own sampling, which no camera has."
             + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
@@ -343,9 +374,25 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     found = judged(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
-    rows, refused = losses(stand, lit)
-    told = sum(row.squared_error for row in rows)
+    rows, refused = losses(stand, lit, _factors(lit, clean))
+    told = sum(row.squared_error for row in rows if row.of != UNEXPLAINED)
     return replace(found, image=_image(stand, told), losses=tuple(rows), not_predicted=tuple(refused))
+
+
+def _judged(row: LossRow) -> str:
+    """What is to be said of what is not explained."""
+    errors = abs(row.squared_error) / row.deviation if row.deviation else 0.0
+    if errors <= 1:
+        return "what is not explained is within its standard error"
+    size = f"what is not explained is {errors:.1f} of its standard errors"
+    if errors <= SURE:
+        return f"{size}, of which chance makes {math.erfc(errors / math.sqrt(2)):.1%} of all studies see as much"
+    return f"{size}: the sources do not make the image's error, and a cause is missing"
+
+
+def _with_error(value: float, error: float, unit: str) -> str:
+    # Zero has no sign.
+    return f"{value:z.2f} \N{PLUS-MINUS SIGN} {error:.2f}{unit}".replace("-", "\N{MINUS SIGN}")
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:

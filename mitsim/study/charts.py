@@ -160,7 +160,9 @@ def bars(values: Mapping[str, Mean], x: str) -> Figure:
     axes.barh(rows, lengths, 0.66, xerr=[mean.error for _, mean in ordered], color=_END, capsize=3)
     axes.set_yticks(rows, [name for name, _ in ordered])
     axes.tick_params(axis="y", length=0)
-    axes.set_xlim(0, 1.1 * max(mean.value + mean.error for _, mean in ordered) or 1.0)
+    most = max(mean.value + mean.error for _, mean in ordered)
+    least = min([0.0, *(1.1 * (mean.value - mean.error) for _, mean in ordered if mean.value < 0)])
+    axes.set_xlim(least, 1.1 * most or 1.0)
     axes.set_ylim(-0.6, len(ordered) - 0.4)
     label_axes(axes, x, "", grid="x")
     return figure

@@ -20,6 +20,7 @@ import numpy as np
 from mitsim.capture.ambient import is_taken, shots_for
 from mitsim.capture.bench import Bench
 from mitsim.capture.drift import DriftedExposer, drifted, levels, projecting, warmer
+from mitsim.capture.light import Light
 from mitsim.capture.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import ExpectedFrames
@@ -147,7 +148,7 @@ class DriftStand:
 
     def foretold(self, drift: Drift) -> Foretold:
         """What a ``drift`` is predicted to do; MitsimError for one that the bench cannot have."""
-        return Foretold(self.before_db, self._predicted(Drift()), self._predicted(drift))
+        return Foretold(self.before_db, *(self.told(each).psnr_db(self.lit.truth) for each in (Drift(), drift)))
 
     @property
     def before_db(self) -> float:
@@ -234,28 +235,34 @@ class DriftStand:
 
     # ---- the prediction ----------------------------------------------------------------------------------------------
 
-    def _predicted(self, drift: Drift) -> float:
-        """PSNR [dB] that an image is expected to have after a ``drift``."""
+    def told(self, drift: Drift) -> Expected:
+        """What the image is expected to be after a ``drift``, as the model has it; MitsimError as :meth:`foretold`."""
         image, changed = self.linear, self._changed(drift)
         if drift.session_ramp or drift.session_flicker:
             left, right = self.session_mixes(drift)
             image = replace(image, left=self.factors.left @ left, right=self.factors.right @ right)
             others = [(self.factors.left, self.factors.right), (-image.left, image.right)]
             changed = replace(changed, terms=[*changed.terms, *others])
-        return image.expected(self.lit.truth, changed, self._noise).psnr_db(self.lit.truth)
-
-    @property
-    def still(self) -> Expected:
-        """What the image without a drift, any noise and any difference of pixels is expected to be."""
-        return self.linear.expected(self.lit.truth, replace(self._changed(Drift()), response=None, added=None))
+        return image.expected(self.lit.truth, changed, self._noise)
 
     @cached_property
-    def fixed(self) -> Mapping[str, float]:
-        """Squared error, mean over the image, that each difference of the sensor's pixels makes."""
+    def fixed(self) -> Mapping[str, FloatArray]:
+        """(n, n) what each difference of the sensor's pixels adds to the image."""
         still = self.linear.expected(self.lit.truth).image
         alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
-        found = {source: self.linear.expected(self.lit.truth, each).image for source, each in alone.items()}
-        return {source: float(np.square(image - still).mean()) for source, image in found.items()}
+        return {name: self.linear.expected(self.lit.truth, each).image - still for name, each in alone.items()}
+
+    def clear(self, factors: Factors, light: Light) -> FloatArray:
+        """(n, n) image of frames without noise, with the lambda of the image without a drift.
+
+        Parameters
+        ----------
+        factors
+            that it is made with.
+        light
+            of the scene.
+        """
+        return LitScene(light).rendered(factors, self.family, self.seed).clear(self.linear.lam)
 
     @cached_property
     def linear(self) -> LinearImage:
@@ -354,6 +361,11 @@ class DriftStand:
         black = drift.black_level_dn * sensor.codes / sensor.gain_dn_per_e / self.exposure_s
         dark = warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
         return black + dark - sensor.superpixel_dark_current_e_per_s
+
+    def scatter(self, drift: Drift, error: FloatArray) -> float:
+        """Variance that the draw of a random ``drift`` brings into the mean squared error, beside an ``error`` (n, n')
+        of the image without it."""
+        return self.linear.scatter(self.lit.truth, self._changed(drift), error) / error.size**2
 
     def _terms(self, drift: Drift) -> SeparableTerms:
         """What a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""

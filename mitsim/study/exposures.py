@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from mitsim.capture.ambient import taken_off
+from mitsim.capture.ambient import is_taken, taken_off
 from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer, peak_irradiance
 from mitsim.capture.light import Light
@@ -213,6 +213,20 @@ class Unexposed:
             return model.solve(sums, lam)
         scale, truth = model.problem(sums).scale, self.lit.truth
         return max((model.solve(sums, scale * each) for each in LAMBDAS), key=lambda one: psnr(one.image, truth))
+
+    @single_threaded_blas()
+    def clear(self, lam: float) -> FloatArray:
+        """(n, n) image of the frames without noise, by a lambda ``lam``; lamps' light is taken off without any, too."""
+        model, exposer, expected = self.prepared(), self.exposer(1.0), self.expected
+        off = exposer.electrons(expected.projector_off) if is_taken("auto", self.family, expected) else 0.0
+        sums, positive = model.accumulator(), np.zeros(())
+        for shot, frame in zip(self.family.shots, expected, strict=True):
+            rate = exposer.electrons(frame) - off
+            if shot.sign == 1:
+                positive = rate
+            else:
+                sums.add(positive - rate if shot.sign else rate, shot.row, shot.column)
+        return model.solve(sums, lam).image
 
     def exposer(self, seconds: float) -> Exposer:
         """The camera, at an exposure time of so many ``seconds``."""

@@ -54,6 +54,15 @@ class Tabled(Protocol):
 
 
 @runtime_checkable
+class Warned(Protocol):
+    """Findings that may not be trusted."""
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What is wrong, and what to do; empty where nothing is."""
+
+
+@runtime_checkable
 class Paged(Protocol):
     """Findings with a page."""
 
@@ -80,6 +89,11 @@ class StudyResult:
     def lines(self) -> list[str]:
         """For people."""
         return [*self.findings.lines(), f"JSON and plots: {self.output}"]
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Of the findings."""
+        return self.findings.warnings if isinstance(self.findings, Warned) else ()
 
 
 Measure = Callable[[Any, Request, Job], Findings]

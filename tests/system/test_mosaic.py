@@ -141,7 +141,11 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
             "imx249.toml has no mosaic of colour filters; give one",
         ),
         ("capture", ("--colour", "lines", "--camera", "ov5647", "--patterns", "dots:2"), "use --colour mosaic"),
-        ("capture", ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"), "capture and calibrate it with --colour mosaic"),
+        (
+            "capture",
+            ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"),
+            "capture and calibrate it with --colour mosaic",
+        ),
         (
             "capture",
             ("--colour", "red", "--patterns", "dots:2"),

@@ -25,6 +25,9 @@ from mitsim.study.page import build_findings
 from tests.unit.capture.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 SEEDS = 40
+IMAGE = {"patterns": "dots:7", "psnr_db": 40.0, "predicted_psnr_db": 43.9794, "frames": 49,
+         "exposure_seconds": 4.0, "photoelectrons": 1e9, "photons": 2e9}  # fmt: skip
+SPENT = {"frames": 512.0, "exposure_seconds": 3.0, "photoelectrons": 1e10, "photons": 2e10}
 
 
 class SampledLight(ToyLight):
@@ -194,32 +197,82 @@ def test_all_sources_together_are_what_the_image_is_off(
     found = measure(bench, Request.of(patterns="dots:4", accuracy=2e-3, seed=1), Job())
     assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.5)
     told = {(row.of, row.source): row.squared_error for row in found.losses}
+    left = told.pop(("unexplained", "not explained"))
     assert told["capture", largest] > 0.7 * sum(told.values()) and told["session", "rendering"] > 0
     assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(told.values())))
+    assert found.image["psnr_db"] == pytest.approx(-10 * np.log10(sum(told.values()) + left)) and not found.warnings
+
+
+def print_of_squares(pixels: float) -> FloatArray:
+    """(256, 256) print of squares of so many projector pixels a side."""
+    place = (np.arange(256) + 0.5) / 256 * 17.06 / pixels  # 128 mm of the sheet, pixels of 7.5 mm
+    return 25 + 200 * np.not_equal.outer(place.astype(int) % 2, place.astype(int) % 2)
+
+
+def losses_of(scene: Path, variant: str, seed: int = 1, **rig: Path) -> tuple[CalibrationFindings, dict[str, LossRow]]:
+    """Findings of a session of 16 patterns, and losses by name."""
+    found = measure(
+        open_bench(str(scene), variant, **rig), Request.of(patterns="dots:4", accuracy=2e-3, seed=seed), Job()
+    )
+    return found, {row.name: row for row in found.losses}
+
+
+def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Callable[..., Path], variant: str) -> None:
+    """Squares of one and a half projector pixels take 16 dB, all but a hundredth of the squared error, and what is left
+    is within three of its standard errors; an even print loses a tenth of a decibel at most. (Planted: detail left in
+    the light.)"""
+    found, rows = losses_of(small_scene("squares", reflectance=print_of_squares(1.5)), variant)
+    whole = 10 ** (-found.image["psnr_db"] / 10)
+    detail, left = rows["scene: detail inside projector pixels"], rows["not explained"]
+    assert 0.95 < detail.squared_error / whole < 1 and detail.lost_db > 13
+    assert abs(left.squared_error) < 3 * left.deviation < 0.03 * whole and not found.warnings
+    assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.1)
+    assert abs(rows["scene: all else"].squared_error) < 0.01 * whole
+    even = losses_of(small_scene("even"), variant)[1]
+    assert abs(even["scene: detail inside projector pixels"].lost_db) < 0.1
+    assert abs(even["scene: all else"].squared_error) < 0.5 * even["capture: rendering"].squared_error
+
+
+def test_a_cause_without_a_row_is_said_to_be_missing(
+    small_scene: Callable[..., Path], tmp_path: Path, variant: str
+) -> None:
+    """A camera that is not linear, of which no row knows. (Planted: a warning for none.)"""
+    own = tmp_path / "camera.toml"
+    own.write_text(f"linearity = [0.03]\n{shipped('calibration', 'imx249.toml').read_text()}")
+    found, rows = losses_of(small_scene("even"), variant, camera=own)
+    assert rows["not explained"].squared_error > 10 * rows["not explained"].deviation
+    (warning,) = found.warnings
+    assert "a cause is missing" in warning and found.payload()["warnings"] == found.warnings
+    assert "a cause is missing" in found.lines()[-1]
+
+
+@pytest.mark.parametrize(("errors", "said"), [(0.9, "within its standard error"), (-2.0, "chance makes 4.6% of all")])
+def test_what_is_not_explained_is_said_by_its_standard_errors(errors: float, said: str) -> None:
+    row = LossRow("unexplained", "not explained", "", 0.0, 0.0, errors * 1e-6, 1e-6)
+    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, (row,))
+    assert said in found.lines()[-1] and said in found.parts()[0].lead.lower() and not found.warnings
 
 
 def test_the_page_has_every_loss_in_one_table() -> None:
     """With its uncertainty, the largest first; what could not be predicted is said. (Planted: the order of the rows;
     losses that are 0.00 left out of the table; parts of the error that is measured.)"""
     rows = (
-        LossRow("capture", "shot noise", "", 2.0, 0.1, 3e-5),
+        LossRow("capture", "shot noise", "", 2.0, 0.1, 3e-5, 2e-7),
         LossRow("drift", "mask_rows_um", "0.4 um", 3.0, 0.2),
         LossRow("session", "read noise", "", 0.0, 0.0, 1e-5),
     )
-    image = {"patterns": "dots:7", "psnr_db": 40.0, "predicted_psnr_db": 43.9794, "frames": 49,
-             "exposure_seconds": 4.0, "photoelectrons": 1e9, "photons": 2e9}  # fmt: skip
-    spent_ = {"frames": 512.0, "exposure_seconds": 3.0, "photoelectrons": 1e10, "photons": 2e10}
-    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), spent_, image, rows, ("vibration_um: no",))
+    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, rows, ("vibration_um: no",))
     part = found.parts()[0]
     assert [row[3] for row in part.rows] == ["3.00 \N{PLUS-MINUS SIGN} 0.20", "2.00 \N{PLUS-MINUS SIGN} 0.10",
                                              "0.00 \N{PLUS-MINUS SIGN} 0.00"]  # fmt: skip
-    assert [row[4] for row in part.rows] == ["", "75.00%", "25.00%"] and "to leave 43.98 dB" in part.lead
+    parts = [f"{value} \N{PLUS-MINUS SIGN} 0.{error} %" for value, error in (("75.00", "50"), ("25.00", "00"))]
+    assert [row[4] for row in part.rows] == ["", *parts] and "together say 43.98 dB" in part.lead
     assert part.rows[0][:3] == ("drift", "mask down the rows", "0.4 um") and "vibration_um: no" in part.lead
     assert set(found.figures()) >= {"losses.png"} and len(found.tables()["losses.csv"]) == 3
     text = " ".join(found.lines())
     assert "mask down the rows, 0.4 um: 3.00 +- 0.20 dB" in text and "read noise" not in text
     assert "mask down the rows" in build_findings("calibration", found.title, "toy", found.parts(), found.figures())
-    assert not CalibrationFindings((), (), (), {}, (0.1, 0.2), spent_).parts()[0].figures
+    assert not CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT).parts()[0].figures
 
 
 def test_a_recipe_with_depths_is_refused_before_anything_is_traced() -> None:

@@ -184,10 +184,7 @@ def test_an_image_is_off_the_still_one_by_the_noise_that_is_predicted_of_its_cap
     that. (Planted: electrons for electrons a second; each datum counted twice.)"""
     capture = [noise for name, noise in stand.noises.items() if name != SESSION]
     told = sum(stand.linear.variance(stand.lit.truth, noise) for noise in capture) / stand.lit.truth.size
-    exposer, sums = stand._frames.exposer(1.0), stand._model.accumulator()
-    for frame, shot in zip(stand._expected, stand.family.shots, strict=True):
-        sums.add(exposer.electrons(frame), shot.row, shot.column)
-    still = stand._model.solve(sums, stand.linear.lam).image
+    still = stand.clear(stand.factors, stand.lit.light)
     assert np.mean(np.square(stand._before.image - still)) == pytest.approx(told, rel=0.27)
 
 

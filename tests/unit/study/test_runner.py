@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.study import STUDIES, find_study, plots
 from mitsim.study.folder import study_folder
 from mitsim.study.runner import StudyResult, run_study
+from tests.unit.study.test_colour_by_line import main
 
 BENCH: Any = SimpleNamespace(loaded=SimpleNamespace(path=Path("scene.xml")))
 
@@ -48,6 +50,24 @@ def test_a_study_is_its_measure_and_the_runner_does_the_rest(tmp_path: Path) -> 
     assert result.payload() == payload and payload.items() <= written.items()
     assert written["kind"] == "toy" and written["seed"] == 4 and "mitsim" in written["versions"]
     assert result.lines()[0] == "It is 1." and str(tmp_path / "out") in result.lines()[1]
+
+
+class Doubtful(Toy):
+    """Findings that say so."""
+
+    warnings = ("a cause is missing",)
+
+
+def test_findings_that_may_not_be_trusted_end_with_1(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """(Planted: no warnings on the command line.)"""
+    monkeypatch.setattr("mitsim.cli.study.bench_of", lambda *_: BENCH)
+    for number, (toy, status) in enumerate(((Toy, 0), (Doubtful, 1))):
+        measure = partial(run_study, "calibration", lambda bench, request, job, toy=toy: toy(1.0))
+        monkeypatch.setattr("mitsim.study.find_study", lambda *_, measure=measure: measure)
+        assert main(["study", "calibration", "-o", str(tmp_path / f"{number}")]) == status
+        assert ("mitsim: warning: a cause is missing" in capsys.readouterr().err) == bool(status)
 
 
 def test_a_study_replaces_an_earlier_one_of_its_name_alone(tmp_path: Path) -> None:
