@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import open_bench
 from mitsim.capture.colour import ColourBench
+from mitsim.capture.opening import open_bench
 from mitsim.core.colours import RUN
 from mitsim.transport.cells import aligned_grid
 from mitsim.transport.histogram import Bundle, Deposits
