@@ -124,7 +124,7 @@ def test_the_command_line_tells_of_every_line(
         (("--mosaic", "fourth"), "--mosaic 'fourth': use joint, half or demosaic"),
         (("--method", "tv"), "--method tv: runs behind colour filters are solved by tikhonov"),
         (("--focus", "auto"), "--focus auto: runs behind colour filters"),
-        (("--lambda", "0"), "lambda is 0.0; behind colour filters give a finite number above 0"),
+        (("--lambda", "0"), "--lambda 0.0: behind colour filters give a finite number above 0"),
     ],
 )
 def test_what_filters_do_not_allow_is_refused(
