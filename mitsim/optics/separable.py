@@ -19,8 +19,8 @@ from mitsim.optics.shadow import SeparableTerms
 Pair = tuple[FloatArray, FloatArray]
 """A separable term."""
 _LEFT_OUT = 0.03
-"""Part of what factors lack that its terms may leave out, rms: a thousandth of an energy. Four terms hold the rest of FlatCam's
-masks and MURA in three lines."""
+"""Part of what factors lack that its terms may leave out, rms: a thousandth of an energy. Two to four terms hold the
+rest of FlatCam's masks and of MURA in three lines."""
 _TURNS = 2
 """Steps to the brightness of a session's pixels: the third moves the residual by 1e-7."""
 

@@ -1,7 +1,7 @@
 """Separable terms that factors lack, an image in; out comes what they put into its frames, and into the image itself.
 
 A camera whose shadow is no single product, as of waves behind a FlatCam or MURA mask, adds sum_k L_k (P_ij o X) R_k^T
-to the frames that Phi_L (P_ij o X) Phi_R^T explains. With G_kl = L_k^T L_l and H_kl = R_k^T R_l its energy over all
+to the frames that Phi_L (P_ij o X) Phi_R^T explains. With G_kl = L_k^T L_l and H_kl = R_l^T R_k its energy over all
 patterns is ::
 
     sum_kl <X, (G_kl o P_L P_L^T) X (H_kl o P_R P_R^T)>
@@ -38,7 +38,7 @@ class Lack:
         total = 0.0
         for a, b in self.terms:
             for c, d in self.terms:
-                total += float(np.vdot(self.image, ((a.T @ c) * left) @ self.image @ ((b.T @ d) * right)))
+                total += float(np.vdot(self.image, ((a.T @ c) * left) @ self.image @ ((d.T @ b) * right)))
         return max(total - float(np.square(self.struck).sum()), 0.0)
 
     @cached_property
