@@ -19,7 +19,7 @@ from mitsim.optics.shadow import SeparableTerms
 Pair = tuple[FloatArray, FloatArray]
 """A separable term."""
 _LEFT_OUT = 0.03
-"""Part of what factors lack that its terms may leave out, rms: a thousandth of an energy. Two to four terms hold the
+"""Part of what factors lack that its terms may leave out, rms: a thousandth of an energy. Two or three terms hold the
 rest of FlatCam's masks and of MURA in three lines."""
 _TURNS = 2
 """Steps to the brightness of a session's pixels: the third moves the residual by 1e-7."""

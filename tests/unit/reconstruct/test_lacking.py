@@ -68,8 +68,8 @@ def test_energy_and_coefficients_are_those_of_all_frames(patterns: str, centre: 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:8"])
 def test_misfit_is_foretold_and_the_mask_named(patterns: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scenes without print within pixels, to 5 %: it is foretold from an image that is itself off by 4 % (rms, of the
-    brightest). (Planted: the cause never told by what is foretold.)"""
+    """Scenes without print within pixels, to 5 %: it is foretold from an image that is itself off, by 0.02 rms at
+    `dots:4`. (Planted: the cause never told by what is foretold.)"""
     monkeypatch.setattr(importlib.import_module("mitsim.reconstruct.reconstruction"), "print_energy", lambda *_: 0.0)
     camera, factors = doubled()
     shots = camera.run(patterns, picture(), 0)
