@@ -33,7 +33,8 @@ from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
 from mitsim.core.versions import deciding_versions, versions
 from mitsim.optics.frames import Frame
-from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
+from mitsim.optics.separable import Lacking, lacking
+from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
@@ -182,6 +183,7 @@ def calibrate_session(
         (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
         if lit.kept is not None:
             lit.kept.finish(digital_scale(bench, lit.exposure_s))
+        lacks = _lacking(lit, clean)
         warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
         if saturated:
             warnings += (
@@ -196,6 +198,7 @@ def calibrate_session(
             "unexplained_residual": noisy.unexplained,
             "noise_free_residual": clean.separability_residual,
             "phi_error": _factor_error(noisy, clean),
+            "shadow_residual": lacks and lacks.residual,
             "condition": noisy.condition,
             "exposure_s": lit.exposure_s,
             "seconds": job.clock.seconds(),
@@ -215,7 +218,8 @@ def calibrate_session(
             warnings=warnings,
             versions=versions(),
         )
-        factors = Factors.of(noisy, manifest)
+        much = lacks is not None and lacks.residual > SEPARABLE_RESIDUAL
+        factors = Factors.of(noisy, manifest, lacks.terms if lacks and much else ())
         if checkpoint.folder is not None:
             factors.write(checkpoint.folder)
             checkpoint.clear()
@@ -291,6 +295,15 @@ def _looked(
     """What the responses to a pattern add to the ``sums`` of each kind, and their saturated shots."""
     responses = _responses(lit, kinds, sums[0].side, *shown)
     return [(own.seen(each.rate, shown[0]), each.saturated) for own, each in zip(sums, responses, strict=True)]
+
+
+def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:
+    """What ``clean`` factors lack of the camera that is simulated in a ``lit`` session; None where its shadow is no sum
+    of few terms."""
+    physics = lit.light.simulation.physics
+    if not physics.geometry.few_wave_terms:
+        return None
+    return lacking(lit.session.shadow(physics.geometry, physics.spectrum), clean.left, clean.right)
 
 
 def _factor_error(noisy: Estimate, clean: Estimate) -> float:

@@ -32,14 +32,16 @@ from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
 from mitsim.optics.frames import Frame
 from mitsim.optics.separable import best_term, centred
-from mitsim.optics.shadow import Directions
+from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, decibels
 from mitsim.reconstruct.ladder import Chosen, Ladder
 from mitsim.rig.board import BoardShape
+from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.digital import digital_of
 from mitsim.rig.order import SIDES, UNIFORM, Half, taken
 from mitsim.rig.patterns import Lighting, PatternFamily, stripe_signs
+from mitsim.rig.projector import Spectrum
 from mitsim.rig.recipe import SessionRecipe
 from mitsim.sensor.chain import Digital
 
@@ -49,6 +51,9 @@ _NUMBERS_AT_ONCE = 2**15
 took ten times as long."""
 SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
 """Sources of a frame's noise."""
+_IN_RAYS = 0.5
+"""Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
+be of diffraction."""
 _LINES = 4
 """Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
 
@@ -116,21 +121,31 @@ class Session:
 
     @cached_property
     def mask_warnings(self) -> tuple[str, ...]:
-        """What the best separable camera leaves of this one's geometric shadow between projector pixels and sensor,
-        where a plate makes it much. Stripes, whose lines add up, show less of it."""
-        geometry = self.bench.geometry
-        if geometry.mask_plate is None:
-            return ()
-        rows, columns = (Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows)
-        terms = shadow_terms(geometry, rows, columns, geometry.scene_distance)
-        residual = best_term(centred(terms) if self.centre else terms).residual
+        """What the best separable camera leaves of this one's shadow between projector pixels and sensor, where it is
+        much, and what of it waves make. Stripes, whose lines add up, show less of it."""
+        geometry, spectrum = self.bench.geometry, self.bench.spectrum
+        rays = residual = best_term(self.shadow(geometry)).residual
+        if geometry.few_wave_terms and spectrum is not None:
+            residual = best_term(self.shadow(geometry, spectrum)).residual
         if residual <= SEPARABLE_RESIDUAL:
             return ()
+        cause, remedy = "", "straighten the mask, or take a separable one"
+        if rays < _IN_RAYS * residual:
+            cause = f" by diffraction ({rays:.1%} without)"
+            remedy = "take a separable mask, or one nearer to the sensor or of larger features"
         return (
-            f"the mask ({geometry.mask_words}) is not separable: the best separable one leaves {residual:.1%} of its "
-            f"shadow, {-decibels(residual):.1f} dB below it, and images of these factors lack it; straighten the mask, "
-            "or take a separable one",
+            f"the mask ({geometry.mask_words}) is not separable{cause}: the best separable one leaves {residual:.1%} "
+            f"of its shadow, {-decibels(residual):.1f} dB below it, and images of these factors lack it; {remedy}",
         )
+
+    def shadow(self, geometry: CameraGeometry, spectrum: Spectrum | None = None) -> SeparableTerms:
+        """The operator of a camera's ``geometry`` from projector pixels at the board's distance to the sensor, of
+        transmissions: in rays, or in waves of a ``spectrum``; centred where frames are."""
+        rows, columns = (
+            Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
+        )
+        terms = shadow_terms(geometry, rows, columns, self.distance, spectrum)
+        return centred(terms) if self.centre else terms
 
     @cached_property
     def signs(self) -> FloatArray:

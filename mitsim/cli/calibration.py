@@ -188,11 +188,13 @@ def _session_lines(payload: dict[str, Any]) -> list[str]:
         math.inf if payload[name] is None else payload[name]
         for name in ("separability_residual", "noise_free_residual", "phi_error", "condition")
     )
+    shadow = payload["shadow_residual"]
     return [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: "
         f"{payload['output']}",
         f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
         f"{condition:.2e}",
+        *([] if shadow is None else [f"of single pixels' shadows the factors lack {shadow:.1e}"]),
         f"memory {payload['memory_bytes'] / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} "
         "predicted",
     ]

@@ -80,7 +80,7 @@ class Signatures:
 
     ``rows``, ``columns``, ``everywhere``: explained by light of any scene row, of any column, of any pixel.
     ``gloss``: explained by factors that change over the sensor. ``common``: the same in every shot. ``saturated``: part
-    of the readings at the end of their range.
+    of the readings at the end of their range. ``mask``: foretold by what the calibration knows that its factors lack.
     """
 
     rows: float
@@ -89,6 +89,7 @@ class Signatures:
     gloss: float
     common: float
     saturated: float
+    mask: float = np.nan
 
 
 class Evidence:
@@ -100,9 +101,14 @@ class Evidence:
         of the model.
     patterns
         P_L (n, K) and P_R (n', K').
+    foretold
+        energy that terms of the camera which the factors lack leave; None: not known.
     """
 
-    def __init__(self, factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> None:
+    def __init__(
+        self, factors: Factors, patterns: tuple[FloatArray, FloatArray], foretold: float | None = None
+    ) -> None:
+        self.foretold = foretold
         self._factors = factors.sides
         noise = factors.manifest.noise
         self.of_factors = noise.unexplained if noise else 0.0
@@ -151,7 +157,8 @@ class Evidence:
             ranges = (own[0], own[1]), (everything[0], own[1]), (own[0], everything[1]), everything, glossy
             left += [_beyond(frame, variance, *pair) for pair in ranges]
         rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
-        return Signatures(*(float(value) for value in (rows, columns, everywhere, gloss, common, saturated)))
+        mask = self.foretold / unexplained if self.foretold is not None and unexplained > 0 else np.nan
+        return Signatures(*(float(value) for value in (rows, columns, everywhere, gloss, common, saturated, mask)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +192,7 @@ def likely_cause(signatures: Signatures, unexplained: float, of_factors: float =
     along, across = max(signatures.columns, signatures.rows), min(signatures.columns, signatures.rows)
     if signatures.saturated > _SATURATED:
         return Cause.SATURATION
-    if of_factors > max(SEPARABLE_RESIDUAL, unexplained):
+    if signatures.mask > _MOST or of_factors > max(SEPARABLE_RESIDUAL, unexplained):
         return Cause.MASK
     # One axis explains what the other does not: a baseline. NaN compares as False throughout.
     if along > _MOST and along > 2 * across:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,10 @@ from mitsim.rig.patterns import PatternFamily, parse_patterns
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
 
+Pair = tuple[FloatArray, FloatArray]
+"""A separable term: left (m, n) and right (m', n')."""
+_LACKING = "lacking"
+"""What channels of a factor's file begin with that hold terms which it lacks; their number follows."""
 _LIGHT = ("projector.lines_nm", "projector.radiant_shares")
 """Parts of an identity that manifests of 0.4.0 do not state; where one of two states none, its light may be any."""
 
@@ -47,6 +51,9 @@ class Factors:
         the folder, or what messages call factors in memory.
     estimate
         what they were fitted as, with residual and predicted error; None for factors from a folder.
+    lacking
+        separable terms [(m, n), (m', n')] of the camera that the factors lack, where a model of it tells them: they
+        foretell what images leave unexplained. Of other pixels, or scaled, factors have none.
     """
 
     left: FloatArray
@@ -55,17 +62,29 @@ class Factors:
     status: Status
     name: str = "in memory"
     estimate: Estimate | None = None
+    lacking: tuple[Pair, ...] = ()
 
     @classmethod
-    def of(cls, estimate: Estimate, manifest: CalibrationManifest) -> Factors:
-        """The factors of an ``estimate``, of the camera that the ``manifest`` names."""
-        left, right = (side.astype(np.float32).astype(np.float64) for side in (estimate.left, estimate.right))
+    def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[Pair] = ()) -> Factors:
+        """The factors of an estimate.
+
+        Parameters
+        ----------
+        estimate
+            as it was fitted.
+        manifest
+            which names the camera.
+        lacking
+            what the factors lack of the camera, as separable terms.
+        """
+        left, right = _single(estimate.left), _single(estimate.right)
         update = {
             "estimate": str(estimate.status),
             "verdict": estimate.status.verdict.value,
             "noise": _factor_noise(estimate),
         }
-        return cls(left, right, manifest.model_copy(update=update), estimate.status, estimate=estimate)
+        terms = tuple((_single(a), _single(b)) for a, b in lacking)
+        return cls(left, right, manifest.model_copy(update=update), estimate.status, estimate=estimate, lacking=terms)
 
     @cached_property
     def condition(self) -> float:
@@ -108,8 +127,10 @@ class Factors:
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:
             metadata["reflectance"] = self.manifest.board_reflectance
-        for name, factor in zip(SIDES, (self.left, self.right), strict=True):
-            write_frame(folder / f"{name}.exr", {"factor": factor.astype(np.float32)}, metadata)
+        for axis, (name, factor) in enumerate(self._sides()):
+            channels = {"factor": factor} | {f"{_LACKING}{k}": term[axis] for k, term in enumerate(self.lacking)}
+            single = {channel: values.astype(np.float32) for channel, values in channels.items()}
+            write_frame(folder / f"{name}.exr", single, metadata)
         checksums = {f"{name}.exr": checksum(folder / f"{name}.exr") for name in SIDES}
         write_manifest(folder, self.manifest.model_copy(update={"checksums": checksums, "status": "complete"}))
         return folder
@@ -203,6 +224,11 @@ class Factors:
         return tuple(zip(SIDES, (self.left, self.right), strict=True))
 
 
+def _single(values: FloatArray) -> FloatArray:
+    """``values`` rounded to single precision."""
+    return values.astype(np.float32).astype(np.float64)
+
+
 def _parts(camera: Mapping[str, Any]) -> dict[str, Any]:
     """What the identity of a ``camera`` says, by names such as ``projector.n``."""
     found: dict[str, Any] = {}
@@ -255,8 +281,13 @@ def factors_of(
     MitsimError
         when a factor is not there, or not finite.
     """
-    left, right = (finite_channel(read(f"{side}.exr")[0], "factor", Path(name) / f"{side}.exr") for side in SIDES)
+    files = [(Path(name) / f"{side}.exr", read(f"{side}.exr")[0]) for side in SIDES]
+    left, right = (finite_channel(channels, "factor", path) for path, channels in files)
+    terms = max(sum(channel.startswith(_LACKING) for channel in channels) for _, channels in files)
+    rows, columns = (
+        [finite_channel(channels, f"{_LACKING}{k}", path) for k in range(terms)] for path, channels in files
+    )
     sentence = manifest.estimate or "Factors from elsewhere, without a word on how good they are"
     known = {verdict.value: verdict for verdict in Verdict}
     status = Status(known.get(manifest.verdict or "", Verdict.UNKNOWN), sentence.rstrip("."))
-    return Factors(left, right, manifest, status, name)
+    return Factors(left, right, manifest, status, name, lacking=tuple(zip(rows, columns, strict=True)))

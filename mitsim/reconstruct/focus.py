@@ -78,7 +78,7 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
             )
     # Without a copy the factors of the calibrated depth are the calibration's own, to the last bit.
     shape = len(factors.left), len(factors.right)
-    return Focused(replace(factors, left=left[rows], right=right[columns]), rows, columns, shape)
+    return Focused(replace(factors, left=left[rows], right=right[columns], lacking=()), rows, columns, shape)
 
 
 def stated_parallax(factors: Factors) -> Parallax:

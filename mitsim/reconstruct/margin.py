@@ -51,7 +51,7 @@ class Margin:
         sizes = factors.left.shape[1], factors.right.shape[1]
         manifest = factors.manifest.model_copy(update={"parallax": _wider(parallax, sizes, self.cells)})
         shape = len(factors.left), len(factors.right)
-        wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest)
+        wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
         return Focused(wider, rows, columns, shape)
 
     def of(self, shots: Capture) -> Capture:

@@ -18,6 +18,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.accumulator import centred
+from mitsim.reconstruct.calibration import decibels
 from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solver import Prepared
@@ -65,6 +66,9 @@ class Misfit:
         the likely one of a flagged image.
     signatures
         of a flagged image: the parts of the unexplained energy by which causes are told apart.
+    foretold
+        what the calibration foretells of ``unexplained``, print apart, from what its factors lack of the camera; None
+        where it does not know.
     """
 
     chi_square: float
@@ -75,6 +79,7 @@ class Misfit:
     flagged: bool
     cause: Cause | None
     signatures: Signatures | None
+    foretold: float | None = None
 
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
@@ -91,6 +96,7 @@ class Misfit:
             "flagged": self.flagged,
             "cause": self.cause.name.lower() if self.cause else None,
             "signatures": asdict(self.signatures) if self.signatures else None,
+            "foretold": self.foretold,
             "map": self.tiles.tolist(),
         }
 
@@ -99,8 +105,12 @@ class Misfit:
         if not self.flagged or self.cause is None:
             return status
         times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
+        foretold = ""
+        if self.foretold:
+            foretold = f"; its calibration foretells up to {self.foretold:.1%} ({decibels(self.foretold):.1f} dB)"
         sentence = (
-            f"{self.unexplained:.1%} of the measurements fit no image{times}; likely cause: {self.cause.value[0]}"
+            f"{self.unexplained:.1%} of the measurements fit no image{times}{foretold}; "
+            f"likely cause: {self.cause.value[0]}"
         )
         if not status.verdict.good:
             return replace(status, flags=(*status.flags, f"Misfit: {sentence}; {self.cause.value[1]}."))
@@ -209,6 +219,8 @@ def judge(
     expected = sums.expected(factor_energy or 0.0)
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
     found, excess = balance.misfit(noise, print_energy)
+    if evidence.foretold is not None:
+        found = replace(found, foretold=float(np.sqrt(evidence.foretold / max(float(sums.energy.sum()), _TINY))))
     if not found.flagged:
         return found
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))

@@ -23,6 +23,7 @@ from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import focused
+from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.margin import Margin
 from mitsim.reconstruct.misfit import Misfit, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
@@ -158,6 +159,10 @@ class Accumulated:
         """The factorised model."""
         return self.model.prepared
 
+    def lack(self, factors: Factors, image: FloatArray) -> Lack | None:
+        """What ``factors`` are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
+        return Lack(self.model, factors.lacking, image) if factors.lacking else None
+
     def misfit(self, shots: Capture, factors: Factors, solution: DepthMap | Solution | TVSolution) -> Misfit | None:
         """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
 
@@ -170,6 +175,7 @@ class Accumulated:
         """
         problem, stated, image = self.prepared.problem(self.frames), factors.manifest.noise, solution.image
         added = factor_energy(self.prepared, shots.patterns, stated, image) if stated else None
+        lack = self.lack(factors, image)
         if isinstance(solution, DepthMap):
             return solution.misfit(self.noise, added, print_energy(self.model, image))
         return judge(
@@ -179,7 +185,7 @@ class Accumulated:
             self.noise,
             added,
             print_energy(self.model, image),
-            Evidence(factors, shots.patterns),
+            Evidence(factors, shots.patterns, lack.energy if lack else None),
         )
 
     def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
@@ -200,6 +206,7 @@ class Accumulated:
             math.hypot(shots.manifest.digital.exposure_uncertainty, calibrated),
             solution.image,
             self.prepared.problem(self.frames),
+            self.lack(factors, solution.image),
         )
 
 

@@ -44,6 +44,7 @@ from mitsim.core.framefile import Channel
 from mitsim.core.manifests import FactorNoise
 from mitsim.reconstruct.detail import PRINT, Model, disagreement
 from mitsim.reconstruct.halves import Halves
+from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.sides import Side
@@ -201,6 +202,12 @@ class Propagation:
         columns = _of_factor(right, left, self.model.patterns[1], self.terms[::-1], image.T).T
         return noise.left**2 * rows, noise.right**2 * columns
 
+    def of_lack(self, struck: FloatArray) -> FloatArray:
+        """(n, n') mean square, near each place, of what the image is off by where terms that the factors lack add
+        ``struck`` (r, r') to the coefficients W."""
+        off = np.square(self.model.prepared.image(self.gain * struck))
+        return np.asarray(gaussian_filter(off, _NEAR, mode="nearest"))
+
     def of_print(self, image: FloatArray) -> FloatArray:
         """(n, n') mean square of what an ``image`` is off by when its print changes within every projector pixel."""
         left, right = self.model.sides
@@ -245,6 +252,7 @@ def uncertainty(
     exposure: float,
     image: FloatArray,
     problem: DiagonalProblem,
+    lack: Lack | None = None,
 ) -> Uncertainty:
     """Standard uncertainty of an image.
 
@@ -262,6 +270,8 @@ def uncertainty(
         (n, n').
     problem
         its data in the diagonal basis.
+    lack
+        what the factors are known to lack of the camera; None: nothing.
     """
     zero, data = np.zeros_like(image), problem.data_count
     frames = propagation.of_frames(noise.rows, noise.columns)
@@ -274,6 +284,7 @@ def uncertainty(
         "calibration_noise": left + right,
         "print_detail": np.maximum(propagation.of_print(image), told),
         "exposure": np.square(exposure * image),
+        "inseparability": propagation.of_lack(lack.struck) if lack else zero,
         "regularisation_bias": propagation.of_regularisation(problem, float(noise.variance.mean())),
     }
     return Uncertainty({name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in variances.items()})

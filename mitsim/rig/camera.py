@@ -318,6 +318,12 @@ class CameraGeometry(BaseModel):
             return False
         return mask.irradiance or bool(mask.flaws.turn_deg) or (waves and mask.amplitude.crosses is None)
 
+    @property
+    def few_wave_terms(self) -> bool:
+        """Whether waves behind the mask are a sum of few separable terms: of a mask of one or two that is mounted
+        straight, and at rest."""
+        return self.diffracts and not self.drawn(waves=True) and not any(self.mask_tilt) and self.mask_motion is None
+
     def fresnel_number(self, wavelength_nm: float) -> float:
         """a^2 / (lambda d) of one mask feature at ``wavelength_nm``: well above 1, a geometric shadow is good."""
         return self.mask_feature**2 / (wavelength_nm * 1e-6 * self.mask_distance)

@@ -25,6 +25,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
+from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import mls_mask
@@ -275,6 +276,39 @@ def test_calibration_and_image_of_a_turned_mask_say_so(
     assert not factors.ok and any("is not separable" in text and " dB" in text for text in factors.warnings)
     image = reconstruct(bench.capture("uniform", accuracy=0.02), factors)
     assert any("is not separable" in flag and " dB" in flag for flag in image.status.flags)
+
+
+def test_waves_behind_flatcam_are_told_to_be_not_separable(small_scene: Callable[..., Path], variant: str) -> None:
+    """Against the singular values of the whole operator in waves; in rays nothing is left. The MLS mask has one term a
+    line, and nothing is said. (Planted: the shadow in rays.)"""
+    bench = open_bench(small_scene(mask="flatcam"), variant)
+    (found,) = Session(bench, load_recipe()).mask_warnings
+    assert "not separable by diffraction (0.0% without)" in found
+    rows, columns = (Directions.cells(np.linspace(*edges, 17)) for edges in bench.windows)
+    terms = shadow_terms(bench.geometry, rows, columns, 400.0, bench.spectrum)
+    whole = sum(np.outer(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms)
+    singular = np.linalg.svd(whole, compute_uv=False)
+    expected = np.sqrt(np.square(singular[1:]).sum() / np.square(singular).sum())
+    residual, decibels = (float(part) for part in re.findall(r"([0-9.]+)(?:% of| dB)", found))
+    assert residual == pytest.approx(100 * expected, abs=0.051) and expected > 0.02
+    assert decibels == pytest.approx(-20 * np.log10(expected), abs=0.051)
+    assert Session(open_bench(small_scene(), variant), load_recipe()).mask_warnings == ()
+
+
+@pytest.mark.slow
+def test_a_sessions_factors_foretell_the_misfit_behind_flatcam(small_scene: Callable[..., Path], variant: str) -> None:
+    """An even sheet, so that no print is in the misfit: foretold to 5 %, of the session's noise and what terms leave
+    out, and named; 95 % of the image within its uncertainty, less one in twenty by chance of 256 pixels."""
+    bench = open_bench(small_scene(mask="flatcam", pixels=96), variant)
+    factors = bench.calibrate(accuracy=5e-4)
+    assert not factors.ok and len(factors.lacking) >= 2
+    assert factors.manifest.result["shadow_residual"] > 3 * factors.manifest.result["noise_free_residual"]
+    shots = bench.capture("dots:4", accuracy=5e-4)
+    image = reconstruct(shots, factors)
+    assert image.misfit is not None and image.uncertainties is not None and shots.truth is not None
+    assert image.misfit.cause is Cause.MASK
+    assert image.misfit.foretold == pytest.approx(image.misfit.unexplained, rel=0.05)
+    assert (np.abs(image.image - shots.truth) < 1.96 * image.uncertainties.total).mean() > 0.9
 
 
 def test_one_mask_is_stated_once(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:

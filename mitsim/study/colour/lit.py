@@ -178,7 +178,7 @@ def serving(line: LitLine, other: LitLine) -> Factors:
         gain *= float(np.vdot(mine, theirs) / np.vdot(theirs, theirs))
     root = np.sqrt(gain)
     manifest = model.manifest.model_copy(update={"camera": own.manifest.camera})
-    return replace(model, left=root * model.left, right=root * model.right, manifest=manifest)
+    return replace(model, left=root * model.left, right=root * model.right, manifest=manifest, lacking=())
 
 
 def _opened(setup: Setup, scene: Path) -> Bench:

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import hadamard
 
-from mitsim.optics.separable import best_term, centred, relative_difference
+from mitsim.optics.separable import best_term, centred, lacking, relative_difference
+from mitsim.reconstruct.calibration import estimate_factors
 
 Terms = list[tuple[np.ndarray, np.ndarray]]
 
@@ -70,3 +72,27 @@ def test_centred_factors_give_centred_frames() -> None:
     frame -= frame.mean(axis=0)
     frame -= frame.mean(axis=1, keepdims=True)
     assert np.allclose(sum(left @ scene @ right.T for left, right in centred(terms)), frame)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_what_factors_of_stripes_lack_is_the_rest_of_the_operator(count: int) -> None:
+    """Pixels of a brightness of their own, which only their factors tell: the calibration's own estimate of the dense
+    operator's responses, and the operator less these factors. (Planted: factors held against the best term.)"""
+    random, signs = np.random.default_rng(6), hadamard(4).astype(np.float64)
+    terms = [
+        (part * random.normal(size=(7, 4)) + 0.5, part * random.normal(size=(6, 4)) + 0.5)
+        for part in (1.0, 0.2, 0.1)[:count]
+    ]
+    rows, columns = 1 + 0.2 * random.random(4), 1 + 0.2 * random.random(4)
+    bright = [(3 * rows * left, columns * right) for left, right in terms]
+    horizontal, vertical = (
+        [sum(left @ shown @ right.T for left, right in bright) for shown in shot]
+        for shot in (np.stack([np.outer(h, np.ones(4)) for h in signs.T]), [np.outer(np.ones(4), h) for h in signs.T])
+    )
+    found = estimate_factors(horizontal, vertical, signs)
+    whole = sum(np.einsum("ir,jc->irjc", *term) for term in bright)
+    rest = whole - np.einsum("ir,jc->irjc", found.left, found.right)
+    lacks = lacking(terms, found.left, found.right)
+    assert lacks.residual == pytest.approx(np.linalg.norm(rest) / np.linalg.norm(whole), rel=0.02, abs=1e-12)
+    made = sum((np.einsum("ir,jc->irjc", *term) for term in lacks.terms), 0 * rest)
+    assert np.linalg.norm(made - rest) <= 0.06 * np.linalg.norm(rest) + 1e-12 * np.linalg.norm(whole)
