@@ -20,7 +20,7 @@ from mitsim.capture.session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.perturbation import Noise
-from mitsim.rig.drift import UNITS, WORDS
+from mitsim.rig.drift import WORDS, amount_in_words
 from mitsim.rig.order import SIDES
 from mitsim.study.drift import AMBIENT, SESSION, DriftStand, squared_error
 from mitsim.study.exposures import SPECKLE
@@ -79,7 +79,7 @@ def losses(stand: DriftStand, lit: LitSession) -> tuple[list[LossRow], list[str]
         except MitsimError as error:
             refused.append(f"{kind}: {error}")
             continue
-        amount = f"{getattr(drift, kind):g} {UNITS[kind]}".removesuffix(" 1").replace(" 1 rms", " rms")
+        amount = amount_in_words(kind, getattr(drift, kind))
         found.append(LossRow(DRIFT, kind, amount, foretold.predicted_lost_db, foretold.predicted_error_db))
     return found, refused
 

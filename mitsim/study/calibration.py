@@ -128,7 +128,7 @@ class CalibrationFindings:
     image: dict[str, Any] = field(default_factory=dict)
     losses: tuple[LossRow, ...] = ()
     not_predicted: tuple[str, ...] = ()
-    title: ClassVar[str] = "What a calibration session leaves to be wished for"
+    title: ClassVar[str] = "What limits a calibration session"
 
     def payload(self) -> dict[str, Any]:
         """The JSON of the command line."""
@@ -225,11 +225,11 @@ class CalibrationFindings:
         found.append(
             Part(
                 "Errors of the factors",
-                "Noisy factors against those of expected frames of the same light: error, found and predicted "
+                "Noisy factors against those of expected frames of the same light: relative error, found and predicted "
                 "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
                 "in predicted deviations. Maps: sensor pixels down, scene pixels across. Then each "
                 "singular value's error, beside its predicted standard error.",
-                ("Factor", "Error", "Predicted", "Chi-square", "Largest"),
+                ("Factor", "Relative error", "Predicted", "Chi-square an entry", "Largest [deviations]"),
                 tuple(entries),
                 (*self.maps_files, "singular.png"),
             )
@@ -264,10 +264,12 @@ class CalibrationFindings:
                 WORDS.get(row.source, row.source),
                 row.amount,
                 f"{row.lost_db:.2f} \N{PLUS-MINUS SIGN} {row.error_db:.2f}",
-                "" if row.of == DRIFT else f"{row.squared_error / told:.2%}",
+                "" if row.of == DRIFT else f"{100 * row.squared_error / told:.1f} %",
             )
             for row in ordered
+            if row.lost_db >= _SAID_DB
         ]
+        small = ", ".join(row.name for row in ordered if row.lost_db < _SAID_DB)
         untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
         return Part(
             "What an image loses",
@@ -280,7 +282,8 @@ class CalibrationFindings:
             "factors hold what the pixels of a row or of a column have alike, and the image loses by the rest. "
             "Rendering is the simulation's own sampling, which no camera has."
             + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
-            + untold,
+            + untold
+            + (f" Below {_SAID_DB:g} dB each: {small}." if small else ""),
             ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
             tuple(rows),
             ("losses.png",),

@@ -39,7 +39,12 @@ Curve = Mapping[Any, Mean]
 
 
 def curves(
-    panels: Mapping[str, Mapping[str, Curve]], x: str, y: str = "PSNR [dB]", log: bool = False, ticks: bool = True
+    panels: Mapping[str, Mapping[str, Curve]],
+    x: str,
+    y: str = "PSNR [dB]",
+    log: bool = False,
+    ticks: bool = True,
+    title: str = "",
 ) -> Figure:
     """Curves with bars of one standard error, in panels side by side on one scale.
 
@@ -53,6 +58,8 @@ def curves(
         whether x is logarithmic.
     ticks
         whether every x that was measured has a tick.
+    title
+        of all panels.
     """
     figure, _ = figure_of(0.46 * WIDTH)
     figure.clear()
@@ -60,10 +67,10 @@ def curves(
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
     for axes, (title, shown) in zip(places[0], panels.items(), strict=True):
         for name, curve in ((name, curve) for name, curve in shown.items() if curve):
-            points = sorted((float(number), mean.value, np.nan_to_num(mean.error)) for number, mean in curve.items())
+            points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
             numbers, means, errors = np.array(points).reshape(-1, 3).T
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
-            axes.errorbar(numbers, means, errors, label=name, **style)
+            axes.errorbar(numbers, means, _known(errors), label=name, **style)
         axes.set_title(title, fontsize=FONT)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
@@ -86,6 +93,8 @@ def curves(
     figure.legend(
         handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=min(len(labels), 4)
     )
+    if title:
+        figure.suptitle(title, fontsize=FONT + 1)
     return figure
 
 
@@ -137,12 +146,11 @@ def paired(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: 
     figure, axes = figure_of(0.9 + _ROW * len(ordered))
     rows = np.arange(len(ordered))
     first, second = (
-        np.array([(pair[index].value, np.nan_to_num(pair[index].error)) for _, pair in ordered]).reshape(-1, 2).T
-        for index in (0, 1)
+        np.array([(pair[index].value, pair[index].error) for _, pair in ordered]).reshape(-1, 2).T for index in (0, 1)
     )
-    axes.barh(rows, first[0], 0.66, xerr=first[1], color=_END, capsize=3, label=labels[0])
+    axes.barh(rows, first[0], 0.66, xerr=_known(first[1]), color=_END, capsize=3, label=labels[0])
     style: dict[str, Any] = {"color": VERMILION, "ms": 5.5, "capsize": 3, "lw": 0, "elinewidth": 1.5}
-    axes.errorbar(second[0], rows, xerr=second[1], fmt="D", label=labels[1], **style)
+    axes.errorbar(second[0], rows, xerr=_known(second[1]), fmt="D", label=labels[1], **style)
     axes.set_yticks(rows, [name for name, _ in ordered])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(-0.6, len(ordered) - 0.4)
@@ -276,3 +284,8 @@ def _signed(mean: Mean) -> str:
     text = f"{mean.value:+.1f}" if round(mean.value, 1) else "0.0"
     text = text.replace("-", "\N{MINUS SIGN}")
     return text if np.isnan(mean.error) else f"{text} \N{PLUS-MINUS SIGN} {mean.error:.1f}"
+
+
+def _known(errors: FloatArray) -> FloatArray | None:
+    """Errors of bars; None where none is known, so that no bar of zero is drawn."""
+    return None if np.isnan(errors).all() else errors
