@@ -27,6 +27,7 @@ from mitsim.sensor.specimen import mean_dark_current
 from mitsim.study.characterise_plots import MOST_OFF, figures_of
 from mitsim.study.procedure import Frames, Procedure, capacity_of, drawn, efficiency_of
 from mitsim.study.runner import DPI, study_folder
+from mitsim.study.typeset import rounded
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
@@ -125,8 +126,9 @@ class Characterisation:
         for row in self.rows:
             expected = "" if row.expected is None else f"{row.expected:.5g}"
             told.append(
-                f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}{row.found:>12.5g}"
-                f"{row.standard_error:>12.2g}{row.deviations:>8.1f}"
+                f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}"
+                f"{rounded(row.found, row.standard_error):>12}"
+                f"{rounded(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
             )
         if any(row.expected is not None for row in self.rows):
             told.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 DASH = "\N{EN DASH}"
@@ -21,6 +22,20 @@ def scientific(value: float | None) -> str:
     if 1e-2 <= abs(value) < 1e4:
         return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:#.3g}"
     return typeset(f"{value:.1e}")
+
+
+def rounded(value: float, error: float) -> str:
+    """A number to the second digit of its standard error.
+
+    Parameters
+    ----------
+    value, error
+        in one unit; an error of 0, or none that is finite, leaves five digits.
+    """
+    if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
+        return f"{value:.5g}"
+    places = 1 - math.floor(math.log10(error))
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}"
 
 
 def typeset(text: str) -> str:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mitsim.study.typeset import scientific, typeset
+from mitsim.study.typeset import rounded, scientific, typeset
 
 TIMES, MICRO = "\N{MULTIPLICATION SIGN}", "\N{GREEK SMALL LETTER MU}"
 
@@ -39,3 +39,12 @@ def test_numbers_in_a_text_are_printed_and_names_are_left_alone(text: str, print
 def test_a_number_keeps_its_digits(value: float | None, printed: str) -> None:
     """(Planted: 0.011 beside 0.0108, and 1.23e+03 for 1234.)"""
     assert scientific(value) == printed
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "printed"),
+    [(0.66877, 0.00088, "0.66877"), (-3.8364e-4, 0.0012, "-0.0004"), (128_314.0, 880.0, "128310"), (1.5, 0.0, "1.5")],
+)
+def test_a_measured_number_ends_where_its_error_does(value: float, error: float, printed: str) -> None:
+    """(Planted: five digits of a number whose first one is not known.)"""
+    assert rounded(value, error) == printed
