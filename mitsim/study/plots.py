@@ -6,6 +6,7 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -40,6 +41,8 @@ _SHORT_AXIS = 30.0
 """Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
 _SHOWN_PERCENT = 99.0
 """Of the errors, those that the scale holds: a normal error's are then within 2.6 deviations."""
+_TITLE_LETTERS = 100
+"""Of a line above a figure of the page's width."""
 _BEST = "best for its time"
 Point = tuple[float, float]
 """Wall seconds, relative error."""
@@ -249,7 +252,7 @@ def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> 
         axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
     axes.set_yticks(range(len(systems)), systems, fontsize=FONT - 2)
     label_axes(axes, "PSNR of the image [dB]", "", grid="x")
-    figure.suptitle(message, fontsize=FONT)
+    figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=FONT)
     _legend_below(figure, len(factors), *axes.get_legend_handles_labels())
     return figure
 
