@@ -136,7 +136,9 @@ def _losses(table: Table) -> Mapping[str, tuple[Mean, Mean]]:
     for kind in table.distinct("kind"):
         rows = table.where(kind=kind)
         amount = rows.rows[0]["amount"]
-        found[f"{WORDS[kind]}, {amount_in_words(str(kind), float(amount))}"] = _both(rows.where(amount=amount))
+        found[f"{WORDS[kind]}, {amount_in_words(str(kind), rows.numbers('amount')[0])}"] = _both(
+            rows.where(amount=amount)
+        )
     return found
 
 
