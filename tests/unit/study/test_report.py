@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from mitsim.capture.plan import PlanRow
 from mitsim.core.errors import MitsimError
 from mitsim.study import report as R
 from mitsim.study.demo import _no_image
 from mitsim.study.metrics import Quality
+from mitsim.study.page import Part, build_findings
 from mitsim.study.trust import Trust
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
@@ -326,3 +328,13 @@ def test_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(MitsimError, match="cannot be written"):
         R.build_report(small, tmp_path / "missing" / "report.html")
+
+
+def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
+    """(Planted: each column as its first cell; a column of words after one of numbers then went right, too.)"""
+    rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
+    part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
+    assert part.numeric == (False, True, True, False)
+    page = build_findings("toy", "A study", "Scene toy", [part], {"a.png": Figure(figsize=(3.0, 2.0))})
+    assert page.count('<th class="n">') == 2 and page.count('<td class="n">') == 4
+    assert "512 \u00d7 512 pixels" in page and "2.8\u00d710\u00b9\u00b2" in page and "wide small" in page
