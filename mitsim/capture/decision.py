@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
     from mitsim.scene.guard.outline import Tag
 
-_GREY = "no surface differs by wavelength; the mask's shadow is the mean of all lines'"
+_GREY = "no surface differs by wavelength; the mask's shadow is the mean over all lines"
 """What is said of a scene in greys."""
 _TOLD = 2.0
 """An estimate whose bound is above this much of it is told as a bound."""
@@ -239,7 +239,7 @@ class _Words:
 
     def _without(self, settings: Settings) -> str:
         """What the total error would be with other ``settings``."""
-        return f"without it the error would be up to {self._total(settings):.1e} of {self.accuracy:g} allowed"
+        return f"without it the error would be up to {self._total(settings):.1e}, and {self.accuracy:g} is allowed"
 
     def _total(self, settings: Settings) -> float:
         other = predicted(self.accuracy, self.evidence, settings, {})

@@ -175,15 +175,15 @@ def _always(*light: str) -> Callable[[Physics], frozenset[str]]:
 
 def _diffraction(bench: Bench) -> str:
     wavelength = bench.projector.effective_wavelength_nm
-    number = bench.geometry.fresnel_number(wavelength)
-    return (
-        f"a mask feature's Fresnel number is {number:.1f} at {wavelength:.0f} nm, {len(bench.spectrum.weights)} line(s)"
-    )
+    number, lines = bench.geometry.fresnel_number(wavelength), len(bench.spectrum.weights)
+    counted = f"{lines} line{'s' if lines > 1 else ''}"
+    return f"a mask feature's Fresnel number is {number:.1f} at {wavelength:.0f} nm, {counted}"
 
 
 def _lamps(bench: Bench) -> str:
     counted = ", counted from {:g} to {:g} nm".format(*bench.lamplight.range_nm) if bench.lamplight else ""
-    return f"{len(bench.loaded.lamps)} emitter(s) beside the projector{counted}"
+    lamps = len(bench.loaded.lamps)
+    return f"{lamps} emitter{'s' if lamps > 1 else ''} beside the projector{counted}"
 
 
 def _lens(bench: Bench) -> str:

@@ -58,6 +58,8 @@ class Raster:
     @classmethod
     def known(cls, model: Mapping[str, Any]) -> Raster:
         """Of a projector's ``model``, as a run's manifest has it; MitsimError as :meth:`of`."""
+        if not model:
+            raise ArgumentError("projector", "is not known of a run of imported frames; give its name or file")
         rows, columns = model.get("rows"), model.get("columns")
         if not (isinstance(rows, int) and isinstance(columns, int)):
             raise ArgumentError("projector", "does not say its rows and columns; give one that does")

@@ -166,3 +166,9 @@ class Drift(BaseModel):
         if not (self.mask_rotation_mrad or self.vibration_um):
             return None
         return MaskMotion(rotation_mrad=self.mask_rotation_mrad, vibration_um=self.vibration_um)
+
+
+def amount_in_words(kind: str, amount: float) -> str:
+    """An ``amount`` of a ``kind`` of drift with its unit; parts of a whole as a percentage."""
+    unit = UNITS[kind]
+    return f"{100 * amount:g} %{unit[1:]}" if unit.startswith("1") else f"{amount:g} {unit}"

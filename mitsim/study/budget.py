@@ -30,7 +30,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.perturbation import Noise
 from mitsim.reconstruct.scatter import Scatter
-from mitsim.rig.drift import UNITS, WORDS, Drift
+from mitsim.rig.drift import WORDS, Drift, amount_in_words
 from mitsim.rig.order import SIDES
 from mitsim.study.drift import AMBIENT, SESSION, DriftStand, Foretold, squared_error
 from mitsim.study.exposures import SPECKLE
@@ -156,7 +156,7 @@ def _drifts(stand: DriftStand, budget: _Budget, measured: float) -> tuple[list[L
         alike = budget.scatter.common(budget.drawn, moved.image - still.image) / pixels
         chance = math.hypot(alike, math.sqrt(stand.scatter(drift, budget.steady))) / measured
         sure = math.hypot(lost - apart, 10 * math.log10(1 + chance / 10 ** (lost / 10)))
-        amount = f"{getattr(stand.recipe.drift, kind):g} {UNITS[kind]}".removesuffix(" 1").replace(" 1 rms", " rms")
+        amount = amount_in_words(kind, getattr(stand.recipe.drift, kind))
         found.append(LossRow(DRIFT, kind, amount, lost, sure))
     return found, refused
 

@@ -139,7 +139,7 @@ class CalibrationFindings:
     image: dict[str, Any] = field(default_factory=dict)
     losses: tuple[LossRow, ...] = ()
     not_predicted: tuple[str, ...] = ()
-    title: ClassVar[str] = "What a calibration session leaves to be wished for"
+    title: ClassVar[str] = "What limits a calibration session"
 
     def payload(self) -> dict[str, Any]:
         """The JSON of the command line."""
@@ -249,11 +249,11 @@ class CalibrationFindings:
         found.append(
             Part(
                 "Errors of the factors",
-                "Noisy factors against those of expected frames of the same light: error, found and predicted "
+                "Noisy factors against those of expected frames of the same light: relative error, found and predicted "
                 "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
                 "in predicted deviations. Maps: sensor pixels down, scene pixels across. Then each "
                 "singular value's error, beside its predicted standard error.",
-                ("Factor", "Error", "Predicted", "Chi-square", "Largest"),
+                ("Factor", "Relative error", "Predicted", "Chi-square an entry", "Largest [deviations]"),
                 tuple(entries),
                 (*self.maps_files, "singular.png"),
             )
@@ -293,8 +293,9 @@ class CalibrationFindings:
                 if row.of == DRIFT
                 else _with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
             )
-            for row in [*ordered, *rest]
+            for row in [*(row for row in ordered if abs(row.lost_db) >= _SAID_DB), *rest]
         ]
+        small = ", ".join(row.name for row in ordered if abs(row.lost_db) < _SAID_DB)
         untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
         said = "".join(f" {_judged(row).capitalize()}." for row in rest)
         return Part(
@@ -311,7 +312,8 @@ class CalibrationFindings:
             "factors hold what the pixels of a row or of a column have alike, and the image loses by the rest. "
             "Rendering is the simulation's own sampling, which no camera has."
             + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
-            + untold,
+            + untold
+            + (f" Below {_SAID_DB:g} dB each: {small}." if small else ""),
             ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
             tuple(rows),
             ("losses.png",),

@@ -28,6 +28,7 @@ from mitsim.study.emva import Procedure, capacity_of, efficiency_of
 from mitsim.study.folder import study_folder
 from mitsim.study.procedure import Frames, drawn
 from mitsim.study.runner import write_figures
+from mitsim.study.typeset import rounded
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
@@ -126,8 +127,9 @@ class Characterisation:
         for row in self.rows:
             expected = "" if row.expected is None else f"{row.expected:.5g}"
             told.append(
-                f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}{row.found:>12.5g}"
-                f"{row.standard_error:>12.2g}{row.deviations:>8.1f}"
+                f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}"
+                f"{rounded(row.found, row.standard_error):>12}"
+                f"{rounded(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
             )
         if any(row.expected is not None for row in self.rows):
             told.append(

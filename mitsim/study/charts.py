@@ -15,6 +15,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.pictures import lightness
 from mitsim.study.plots import BLUE, FONT, GREEN, VERMILION, WIDTH, figure_of, label_axes, line_style
 from mitsim.study.table import Mean
+from mitsim.study.typeset import typeset
 
 _CELL = 1.5
 """Inches of an image in a grid, at most: six stand on a page."""
@@ -39,7 +40,12 @@ Curve = Mapping[Any, Mean]
 
 
 def curves(
-    panels: Mapping[str, Mapping[str, Curve]], x: str, y: str = "PSNR [dB]", log: bool = False, ticks: bool = True
+    panels: Mapping[str, Mapping[str, Curve]],
+    x: str,
+    y: str = "PSNR [dB]",
+    log: bool = False,
+    ticks: bool = True,
+    title: str = "",
 ) -> Figure:
     """Curves with bars of one standard error, in panels side by side on one scale.
 
@@ -53,18 +59,20 @@ def curves(
         whether x is logarithmic.
     ticks
         whether every x that was measured has a tick.
+    title
+        of all panels.
     """
     figure, _ = figure_of(0.46 * WIDTH)
     figure.clear()
     places: Any = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
-    for axes, (title, shown) in zip(places[0], panels.items(), strict=True):
+    for axes, (panel, shown) in zip(places[0], panels.items(), strict=True):
         for name, curve in ((name, curve) for name, curve in shown.items() if curve):
-            points = sorted((float(number), mean.value, np.nan_to_num(mean.error)) for number, mean in curve.items())
+            points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
             numbers, means, errors = np.array(points).reshape(-1, 3).T
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
-            axes.errorbar(numbers, means, errors, label=name, **style)
-        axes.set_title(title, fontsize=FONT)
+            axes.errorbar(numbers, means, _known(errors), label=name, **style)
+        axes.set_title(panel, fontsize=FONT)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
         axes.tick_params(labelsize=FONT - 1)
@@ -86,6 +94,8 @@ def curves(
     figure.legend(
         handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=min(len(labels), 4)
     )
+    if title:
+        figure.suptitle(title, fontsize=FONT + 1)
     return figure
 
 
@@ -137,13 +147,12 @@ def paired(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: 
     figure, axes = figure_of(0.9 + _ROW * len(ordered))
     rows = np.arange(len(ordered))
     first, second = (
-        np.array([(pair[index].value, np.nan_to_num(pair[index].error)) for _, pair in ordered]).reshape(-1, 2).T
-        for index in (0, 1)
+        np.array([(pair[index].value, pair[index].error) for _, pair in ordered]).reshape(-1, 2).T for index in (0, 1)
     )
-    axes.barh(rows, first[0], 0.66, xerr=first[1], color=_END, capsize=3, label=labels[0])
+    axes.barh(rows, first[0], 0.66, xerr=_known(first[1]), color=_END, capsize=3, label=labels[0])
     style: dict[str, Any] = {"color": VERMILION, "ms": 5.5, "capsize": 3, "lw": 0, "elinewidth": 1.5}
-    axes.errorbar(second[0], rows, xerr=second[1], fmt="D", label=labels[1], **style)
-    axes.set_yticks(rows, [name for name, _ in ordered])
+    axes.errorbar(second[0], rows, xerr=_known(second[1]), fmt="D", label=labels[1], **style)
+    axes.set_yticks(rows, [typeset(name) for name, _ in ordered])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(-0.6, len(ordered) - 0.4)
     # Above the axes, where no bar is, however few there are.
@@ -158,7 +167,7 @@ def bars(values: Mapping[str, Mean], x: str) -> Figure:
     figure, axes = figure_of(0.9 + _ROW * len(ordered))
     rows, lengths = np.arange(len(ordered)), [mean.value for _, mean in ordered]
     axes.barh(rows, lengths, 0.66, xerr=[mean.error for _, mean in ordered], color=_END, capsize=3)
-    axes.set_yticks(rows, [name for name, _ in ordered])
+    axes.set_yticks(rows, [typeset(name) for name, _ in ordered])
     axes.tick_params(axis="y", length=0)
     most = max(mean.value + mean.error for _, mean in ordered)
     least = min([0.0, *(1.1 * (mean.value - mean.error) for _, mean in ordered if mean.value < 0)])
@@ -278,3 +287,8 @@ def _signed(mean: Mean) -> str:
     text = f"{mean.value:+.1f}" if round(mean.value, 1) else "0.0"
     text = text.replace("-", "\N{MINUS SIGN}")
     return text if np.isnan(mean.error) else f"{text} \N{PLUS-MINUS SIGN} {mean.error:.1f}"
+
+
+def _known(errors: FloatArray) -> FloatArray | None:
+    """Errors of bars; None where none is known, so that no bar of zero is drawn."""
+    return None if np.isnan(errors).all() else errors

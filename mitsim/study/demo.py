@@ -188,7 +188,7 @@ def _page(evidence: _Evidence) -> ReportData:
             BudgetRow(
                 "Separable model",
                 session["noise_free_residual"],
-                "what noise-free board frames leave beside Phi_L X Phi_R^T",
+                "what no product of a left and a right factor explains of noise-free frames of the board",
             ),
         ),
         accuracy=light.plan.accuracy,
@@ -201,8 +201,8 @@ def _page(evidence: _Evidence) -> ReportData:
             f"standard error of {light.apparent.error:.1e} from sampling of its own.",
             "Idealised: the paper's model with its own exact factors and the same sensor noise.",
             "lambda is chosen by an unbiased risk estimate; no result has seen the truth.",
-            *evidence.warnings,
         ),
+        warnings=evidence.warnings,
     )
 
 

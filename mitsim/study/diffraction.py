@@ -126,9 +126,10 @@ class DiffractionFindings:
         """What idealised frames of the separable mask in the projector's light say, in one clause."""
         case = "idealised", MASKS[0], PROJECTOR, self.patterns
         wrong, right = (self.loss_db(self.row(*case, factors)) for factors in (ASSUMED, SEPARABLE))
-        left = f"lose {right:.1f} dB" if right > 0 else f"lose nothing ({-right:+.1f} dB)"
+        told = "lose" if right > 0 else "gain"
         return (
-            f"Assuming the geometric mask costs {wrong:.1f} dB under {self.patterns}; factors of the true shadow {left}"
+            f"Under {self.patterns}, against a mask that does not diffract: geometric factors lose {wrong:.1f} dB, "
+            f"factors of the true shadow {told} {abs(right):.1f} dB"
         )
 
     def figures(self) -> dict[str, Figure]:
@@ -142,7 +143,7 @@ class DiffractionFindings:
         # It lies on the projector's lines, to the width of a plotted line.
         del profiles[LINE]
         off = next(row for row in self.shadows if (row.mask, row.light) == (MASKS[0], PROJECTOR))
-        message = f"A point's shadow in the projector's light is {off.point_source:.0%} off the geometric one"
+        message = f"A point's shadow in the projector's light is {100 * off.point_source:.0f} % off the geometric one"
         position = self.bench.geometry.centres(0)
         return {
             "quality.png": plots.quality_by_factors(quality, self.verdict),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,14 @@ from mitsim.study.experiment import HEADS, Claim, Experiment, PageTable, Results
 from mitsim.study.html import rendered, shown_figure, write_html
 from mitsim.study.pictures import TEST_IMAGES
 
+_NUMBER = re.compile(r"[+-]?\d|nothing$")
+"""How a cell of a column of numbers begins."""
+
 
 @dataclass(frozen=True)
 class Section:
     """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``about``
-    and ``heads`` are the experiment's."""
+    and ``heads`` are the experiment's; ``quick``: of a few points alone."""
 
     name: str
     title: str
@@ -29,6 +33,7 @@ class Section:
     about: str = ""
     heads: tuple[str, str, str] = HEADS
     tables: tuple[PageTable, ...] = ()
+    quick: bool = False
 
     @classmethod
     def of(
@@ -53,17 +58,19 @@ class Section:
         means = f", over {len(prints)} test images" if len(prints) > 1 else ""
         setup = scope.setup
         command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
+        good = f"frames before noise good to {setup.accuracy:g} (relative rms)"
         return cls(
             name=experiment.name,
             title=experiment.title,
             question=experiment.question,
             claims=tuple(claims),
             pictures={name: shown_figure(figure) for name, figure in figures.items()},
-            count=f"{len(results.table)} measurements{means}, light to {setup.accuracy:g}",
+            count=f"{len(results.table)} measurements{means}; {good}",
             command=" ".join(command),
             about=experiment.about,
             heads=experiment.heads,
             tables=tuple(experiment.tables(results)),
+            quick=scope.quick,
         )
 
 
@@ -76,6 +83,12 @@ class Part:
     head: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     figures: tuple[str, ...] = ()
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Of which columns all cells begin with a number: these stand to the right."""
+        columns = zip(*self.rows, strict=True)
+        return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
 
 
 def build_findings(name: str, title: str, where: str, parts: Sequence[Part], figures: Mapping[str, Figure]) -> str:

@@ -6,6 +6,7 @@ Colours are safe for the colour-blind. The caller saves the figure; no pyplot st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.study.table import Mean
+from mitsim.study.typeset import scientific, typeset
 
 if TYPE_CHECKING:
     from mitsim.study.solver_cost import SolverRow
@@ -39,6 +41,8 @@ _SHORT_AXIS = 30.0
 """Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
 _SHOWN_PERCENT = 99.0
 """Of the errors, those that the scale holds: a normal error's are then within 2.6 deviations."""
+_TITLE_LETTERS = 100
+"""Of a line above a figure of the page's width."""
 _BEST = "best for its time"
 Point = tuple[float, float]
 """Wall seconds, relative error."""
@@ -64,10 +68,10 @@ def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
     figure.clear()
     panels: Any = figure.subplots(1, 2, sharex=True, sharey=True)
     largest = max(float(uncertainty.max()), float(np.percentile(error, _SHOWN_PERCENT)))
-    titled = {"stated: standard uncertainty": uncertainty, "actual: |image - truth|": error}
+    titled = {"stated: standard uncertainty": uncertainty, "actual: |image \N{MINUS SIGN} truth|": error}
     for axes, (title, values) in zip(panels, titled.items(), strict=True):
         drawn = axes.imshow(values, vmin=0, vmax=largest, cmap="viridis", interpolation="none")
-        axes.set_title(f"{title}\nrms {np.sqrt(np.mean(np.square(values))):.1e}", fontsize=FONT)
+        axes.set_title(f"{title}\nrms {scientific(float(np.sqrt(np.mean(np.square(values)))))}", fontsize=FONT)
         axes.set_xlabel("column [projector pixel]", fontsize=FONT - 1)
         axes.tick_params(labelsize=FONT - 2)
     panels[0].set_ylabel("row [projector pixel]", fontsize=FONT - 1)
@@ -106,7 +110,8 @@ def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
     figure, axes = figure_of(0.45 * WIDTH)
     for index, (name, rows) in enumerate(factors.items()):
         exact, noisy, error = rows.T
-        style = {"color": _PALETTE[index + 1], "lw": 1.6}
+        # Dashes over a line: the two may coincide.
+        style = {"color": _PALETTE[index + 1], "ls": _STYLES[index], "lw": 3.0 - 1.2 * index}
         axes.plot(np.arange(len(rows)), error / exact, label=f"{name}: standard error", **style)
         axes.plot(
             np.arange(len(rows)),
@@ -179,7 +184,7 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figur
     axes.hlines(seen, left, values[seen], color=LINK, lw=2)
     axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
     for row, (_, value) in enumerate(ordered):
-        _beside(axes, row, 8, f"{value:.1e}" if value > 0 else "0")
+        _beside(axes, row, 8, scientific(value))
     if limit is not None:
         axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
         where: Any = axes.get_xaxis_transform()
@@ -221,7 +226,7 @@ def solver_costs(rows: Sequence[SolverRow]) -> Figure:
         _log_log(axes)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=FONT - 1)
-        axes.set_title(rf"relative $\lambda$ {lam:.0e}", fontsize=FONT)
+        axes.set_title(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {lam:.0e}"), fontsize=FONT)
         label_axes(axes, "wall time [s]", "")
     panels[0].set_ylabel("relative error of the image [1]", fontsize=FONT)
     grey: dict[str, Any] = {"ls": "", "ms": 8, "color": "#9ca3af"}
@@ -229,18 +234,6 @@ def solver_costs(rows: Sequence[SolverRow]) -> Figure:
     entries.append((panels[0].lines[-1], _BEST))
     entries += [(Line2D([], [], **grey, marker=_MARKERS[i]), ", ".join(form)) for i, form in enumerate(forms)]
     _legend_below(figure, 4, *zip(*entries, strict=True))
-    return figure
-
-
-def seconds_by_stage(seconds: Mapping[str, float]) -> Figure:
-    """Wall time {stage: ``seconds``} as horizontal bars in the order given."""
-    figure, axes = figure_of(0.7 + 0.34 * len(seconds))
-    place = np.arange(len(seconds))[::-1]
-    bars = axes.barh(place, list(seconds.values()), 0.62, color=BLUE)
-    axes.bar_label(bars, fmt="%.2g s", fontsize=FONT - 1, padding=4)
-    axes.set_yticks(place, list(seconds), fontsize=FONT)
-    axes.margins(x=0.12)
-    label_axes(axes, "wall time [s]", "", grid="x")
     return figure
 
 
@@ -259,7 +252,7 @@ def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> 
         axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
     axes.set_yticks(range(len(systems)), systems, fontsize=FONT - 2)
     label_axes(axes, "PSNR of the image [dB]", "", grid="x")
-    figure.suptitle(message, fontsize=FONT)
+    figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=FONT)
     _legend_below(figure, len(factors), *axes.get_legend_handles_labels())
     return figure
 

@@ -26,9 +26,8 @@ from mitsim.study.html import figure_uri, rendered, write_html
 from mitsim.study.metrics import Quality
 from mitsim.study.table import Mean
 from mitsim.study.trust import Trust
+from mitsim.study.typeset import DASH, scientific
 
-_DASH = "\N{EN DASH}"
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PATTERN_CORNER = 40
 """Projector pixels a side that are shown of a pattern, so that single ones can be told apart."""
 _SMALLEST = 384
@@ -36,7 +35,7 @@ _SMALLEST = 384
 _FIGURE_DPI = 160
 """Figures are 8.6 inches wide: 1376 pixels, what the page's width shows on the same screen."""
 _WORTH_TELLING = 0.01
-"""Part of the total time below which what is in no stage is left out: the stages are shown to two digits."""
+"""Part of the total time below which a stage has no line of its own: its bar would be three pixels wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,8 @@ class ReportData:
     top. The first of the ``families`` is the one that the tiles compare the best with; of the one named ``main`` the
     errors are shown as a picture. ``frames`` are (m, m) [DN] by caption, ``exposure`` says which convention the
     reconstructions used, ``calibration`` is what `calibrate --json`
-    says of the session, and its ``status``. ``accuracy`` and ``effects`` are the plan's.
+    says of the session, and its ``status``. ``accuracy`` and ``effects`` are the plan's. ``warnings`` say why the
+    results are flagged, at the head of the page.
     """
 
     title: str
@@ -108,6 +108,7 @@ class ReportData:
     seeds: Mapping[str, int] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
@@ -145,9 +146,9 @@ def build_report(report: ReportData, path: Path) -> Path:
 def render_html(report: ReportData) -> str:
     """The page of a ``report`` as text; `build_report` writes it."""
     filters: dict[str, Callable[..., str]] = {
-        "sci": _scientific,
-        "chi": lambda value: _DASH if value is None else shown(value),
+        "chi": lambda value: DASH if value is None else shown(value),
         "db": _decibel,
+        "rms": _rms,
         "seconds": _seconds,
         "trouble": _trouble,
         "reflectance": _reflectance,
@@ -200,19 +201,16 @@ def _figures(report: ReportData) -> dict[str, Any]:
     if positive:
         figures["budget"] = _picture(plots.error_bars(positive, report.accuracy))
     figures["stages"] = _stages(report.seconds)
-    if figures["stages"]:
-        figures["seconds"] = _picture(plots.seconds_by_stage(figures["stages"]))
     return figures
 
 
 def _stages(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Seconds by stage, and as "not in a stage" what the total holds beside them, where that is worth telling."""
+    """Seconds of each stage that is worth telling, and as "all else" what the total holds beside them."""
     stages = {name: value for name, value in seconds.items() if name != "total"}
-    total = seconds.get("total", 0.0)
-    rest = total - math.fsum(stages.values())
-    if stages and rest > _WORTH_TELLING * total:
-        stages["not in a stage"] = rest
-    return stages
+    total = seconds.get("total", math.fsum(stages.values()))
+    told = {name: value for name, value in stages.items() if value >= _WORTH_TELLING * total}
+    rest = total - math.fsum(told.values())
+    return told | ({"all else": rest} if stages and rest > _WORTH_TELLING * total else {})
 
 
 def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
@@ -224,18 +222,13 @@ def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
     return best
 
 
-def _scientific(value: float | None) -> str:
-    """Three digits, a power of ten as a superscript sign; None as a dash."""
-    if value is None:
-        return _DASH
-    if value == 0.0 or 1e-2 <= abs(value) < 1e4:
-        return f"{value:.3g}"
-    mantissa, exponent = f"{value:.1e}".split("e")
-    return f"{mantissa}\N{MULTIPLICATION SIGN}10" + str(int(exponent)).translate(_SUPERSCRIPT)
-
-
 def _decibel(value: float | None) -> str:
-    return _DASH if value is None else f"{value:.1f} dB"
+    return DASH if value is None else f"{value:.1f} dB"
+
+
+def _rms(value: float) -> str:
+    """Of a column of errors in reflectance: four places, as all of them are below 1 and few below 0.001."""
+    return f"{value:.4f}" if value >= 1e-3 else scientific(value)
 
 
 def _seconds(value: float) -> str:

@@ -133,7 +133,8 @@ def run_study(
         if isinstance(findings, Paged):
             from mitsim.study.page import build_findings
 
-            where = f"{scene}, patterns {patterns}, seed {request.seed}"
+            where = f"Scene {bench.loaded.path.parent.name}, " if bench else ""
+            where += f"patterns {patterns}, seed {request.seed}."
             page = build_findings(name, findings.title, where, findings.parts(), figures)
             with whole_file(folder / f"{name}.html") as part:
                 part.write_text(page, encoding="utf-8")

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitsim.study.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, figure_of, label_axes
+from mitsim.study.typeset import scientific
 
 if TYPE_CHECKING:
     from mitsim.study.accuracy.findings import PartCost, Row
@@ -69,11 +70,13 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
         _ticks(axes)
         label_axes(axes, "wall time of all frames [s]", "")
     panels[0].set_ylabel("relative error of the frames [1]", fontsize=FONT)
-    said = {"the judge's own error": judge} | ({"sensor noise at equal peak": noise} if noise is not None else {})
+    figure.suptitle("What accuracy costs in time", fontsize=FONT + 1)
+    said = {"error of what all is compared with": judge}
+    said |= {"sensor noise, exposure equal peak": noise} if noise is not None else {}
     for text, error in said.items():
         where: Any = panels[0].get_yaxis_transform()
         style = {"fontsize": FONT - 2, "color": GREY, "xycoords": where, "textcoords": "offset points"}
-        panels[0].annotate(f"{text}, {error:.1e}", (0.01, error), (2, 3), **style)
+        panels[0].annotate(f"{text}: {scientific(error)}", (0.01, error), (2, 3), **style)
     return figure
 
 
@@ -106,7 +109,7 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
             errors.plot([floor, part.error_if_off], [place, place], color=LINK, lw=2, zorder=1)
             errors.plot([part.error_if_off, part.error_bound], [place, place], "|-", color=BLUE, lw=1, zorder=2)
             errors.plot([part.error_if_off], [place], "o", **dot)
-            _beside(errors, part.error_bound, place, f"{part.error_if_off:.1e}")
+            _beside(errors, part.error_bound, place, scientific(part.error_if_off))
         else:
             _beside(errors, floor, place, "none")
         if timed:
@@ -142,7 +145,7 @@ def _draw_seconds(axes: Axes, part: PartCost, place: int, shortest: float) -> No
     elif extra.within_noise:
         most = max(extra.most, shortest)
         axes.plot([shortest, most], [place, place], color=LINK, lw=2, ls=":", zorder=1)
-        _beside(axes, most, place, f"within noise, below {extra.most:.1g} s")
+        _beside(axes, most, place, "within noise" + (f", below {extra.most:.1g} s" if extra.most > 0 else ""))
     else:
         axes.plot([extra.least, extra.most], [place, place], color=VERMILION, lw=2, zorder=2)
         axes.plot([extra.median], [place], "o", color=VERMILION, ms=6 if part.of else 8, zorder=3)

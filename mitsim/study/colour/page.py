@@ -60,7 +60,7 @@ def write_page(
         patches=image.patches,
         means=_means(image.patches),
         matrix=[(axis, [f"{value:.4f}" for value in row]) for axis, row in zip("XYZ", image.model.matrix, strict=True)],
-        names=image.lines.names,
+        names=[f"{line.wavelength_nm:g} nm" for line in image.lines.channels],
         model=image.model.summary(),
         facts=facts,
         warnings=warnings,
@@ -73,15 +73,15 @@ def write_page(
 
 def _verdict(image: ColourImage) -> tuple[str, str]:
     """Headline and detail."""
-    quality = "" if image.psnr_db is None else f"PSNR of the {len(image.lines.names)} lines {image.psnr_db:.1f} dB. "
+    quality = "" if image.psnr_db is None else f"PSNR of the {len(image.lines.names)} lines: {image.psnr_db:.1f} dB. "
     if image.patches:
         mean, floor = _means(image.patches)[:2]
         return (
-            f"Mean Delta E 2000 of {len(image.patches)} patches {mean:.2f}",
+            f"Mean Delta E 2000 of {len(image.patches)} patches: {mean:.2f}",
             f"{quality}The floor is {floor:.2f}: these spectral lines alone, without a camera.",
         )
     if image.delta_e is not None:
-        return f"Delta E 2000 to the truth {image.delta_e.mean():.2f}", f"{quality}Mean over all pixels."
+        return f"Mean Delta E 2000 to the truth: {image.delta_e.mean():.2f}", f"{quality}Mean over all pixels."
     return f"An image from {len(image.lines.names)} spectral lines", "No truth to compare it with."
 
 
@@ -96,7 +96,7 @@ def _line(image: ColourImage, number: int, quality: Quality | None) -> dict[str,
     line, truth = image.lines.channels[number], image.truth
     return {
         "name": f"{line.wavelength_nm:g} nm",
-        "share": None if line.radiant_share is None else f"{line.radiant_share:.0%}",
+        "share": None if line.radiant_share is None else f"{100 * line.radiant_share:.0f} %",
         "image": _grey(image.images[..., number]),
         "truth": None if truth is None else _grey(truth[..., number]),
         "quality": None if quality is None else f"{quality.psnr_db:.1f} dB",

@@ -74,7 +74,14 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    drawn = {"psnr.png": curves(panels(by_patterns(table), "pixels"), "sensor rows, equal peak", log=True)}
+    drawn = {
+        "psnr.png": curves(
+            panels(by_patterns(table), "pixels"),
+            "rows of the sensor [pixel]",
+            log=True,
+            title=f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}",
+        )
+    }
     pixels = table.distinct("pixels")
     for family in _SHOWN:
         if grid := pictured(results, by_print(table.where(patterns=family)), "pixels", pixels):

@@ -184,7 +184,10 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         rows = quality.where(exposure=exposure)
         lines = {f"{psf} point spread function": rows.where(psf=psf).means("psnr_db", "patterns") for psf in psfs}
         drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
-            {"all light, best lambda": lines}, f"frames, {exposure}", log=True
+            {"": lines},
+            "frames",
+            log=True,
+            title=f"PSNR by the number of frames, exposure {exposure}, all light, best lambda",
         )
     drawn["seconds.png"] = _seconds(speed, psfs)
     few = [each for each in quality.distinct("patterns") if each in (1, 9, 49)]
@@ -210,7 +213,13 @@ def _seconds(speed: Table, psfs: Sequence[str]) -> Figure:
         panels[f"{psf} point spread function"] = {
             name: rows.means(column, "patterns") for name, column in names.items()
         }
-    figure = curves(panels, "frames, equal error", "CPU seconds [s]", log=True)
+    figure = curves(
+        panels,
+        "frames",
+        "processor time [s]",
+        log=True,
+        title="Time of the solvers by the number of frames, at equal error",
+    )
     for axes in figure.axes:
         axes.set_yscale("log")
     return figure

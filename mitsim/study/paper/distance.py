@@ -69,7 +69,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     table, drawn = results.table, {}
     for exposure in table.distinct("exposure"):
         shown = panels(by_patterns(table.where(exposure=exposure)), "mask_distance")
-        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(shown, f"sensor to mask [mm], {exposure}", log=True)
+        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
+            shown, "sensor to mask [mm]", log=True, title=f"PSNR by the mask's distance, exposure {exposure}"
+        )
     distances = table.distinct("mask_distance")
     for family in _SHOWN:
         lines = by_print(table.where(patterns=family, exposure=EQUAL_FRAME))

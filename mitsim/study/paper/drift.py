@@ -18,7 +18,7 @@ from mitsim.capture.drift import projecting
 from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors
-from mitsim.rig.drift import UNITS, WORDS, Drift
+from mitsim.rig.drift import UNITS, WORDS, Drift, amount_in_words
 from mitsim.rig.families import check_patterns
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 from mitsim.rig.sensor import load_sensor
@@ -135,9 +135,10 @@ def _losses(table: Table) -> Mapping[str, tuple[Mean, Mean]]:
     found = {}
     for kind in table.distinct("kind"):
         rows = table.where(kind=kind)
-        amount, unit = rows.rows[0]["amount"], str(rows.rows[0]["unit"])
-        name = f"{WORDS[kind]}, {amount:g} {unit}".removesuffix(" 1").replace(" 1 rms", " rms")
-        found[name] = _both(rows.where(amount=amount))
+        amount = rows.rows[0]["amount"]
+        found[f"{WORDS[kind]}, {amount_in_words(str(kind), rows.numbers('amount')[0])}"] = _both(
+            rows.where(amount=amount)
+        )
     return found
 
 

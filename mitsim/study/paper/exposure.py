@@ -90,9 +90,11 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    drawn = {"psnr.png": quality_bars(bars({name: table.where(patterns=name) for name in SHARED}), EQUAL_FRAME)}
+    drawn = {
+        "psnr.png": quality_bars(bars({name: table.where(patterns=name) for name in SHARED}), f"exposure {EQUAL_FRAME}")
+    }
     if grid := pictured(results, by_print(table), "patterns", SHARED):
-        drawn["images.png"] = image_grid(grid, SHARED, EQUAL_FRAME)
+        drawn["images.png"] = image_grid(grid, SHARED, f"exposure {EQUAL_FRAME}")
     return drawn
 
 

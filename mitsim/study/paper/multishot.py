@@ -144,12 +144,14 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         rows = table.where(exposure=exposure)
         first = rows.where(patterns=UNIFORM, frames=1).rows  # one uniform frame is the first of each
         lines = {name: Table((*first, *rows.where(patterns=name).rows)) for name in (SWEPT, DOTS)}
-        lines, axis = {UNIFORM: rows.where(patterns=UNIFORM), **lines}, f"frames, {exposure}"
-        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(panels(lines, "frames"), axis, log=True)
+        lines = {UNIFORM: rows.where(patterns=UNIFORM), **lines}
+        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
+            panels(lines, "frames"), "frames", log=True, title=f"PSNR by the number of frames, exposure {exposure}"
+        )
     names = {UNIFORM: "49 uniform", SWEPT: "SweepCam, 49", DOTS: "49 dots"}
     shown = table.where(exposure=EQUAL_FRAME, frames=_FRAMES)
     if grid := pictured(results, by_print(shown), "patterns", list(names)):
-        drawn["images.png"] = image_grid(grid, list(names.values()))
+        drawn["images.png"] = image_grid(grid, list(names.values()), f"exposure {EQUAL_FRAME}")
     return drawn
 
 

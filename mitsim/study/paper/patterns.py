@@ -83,7 +83,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             for kind, said in _KINDS.items()
         }
         drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
-            panels(lines, "patterns_count"), f"patterns, {exposure}"
+            panels(lines, "patterns_count"), "patterns", title=f"PSNR by the number of patterns, exposure {exposure}"
         )
     spectra = {
         label(str(row["patterns"])): found for row in table.rows if (found := results.array(row, _SPECTRUM)) is not None
@@ -91,7 +91,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     drawn["singular_values.png"] = singular_values(spectra)
     grid = pictured(results, by_print(table.where(exposure=EQUAL_FRAME)), "patterns", _SHOWN)
     if grid:
-        drawn["images.png"] = image_grid(grid, [label(family) for family in _SHOWN], EQUAL_FRAME)
+        drawn["images.png"] = image_grid(grid, [label(family) for family in _SHOWN], f"exposure {EQUAL_FRAME}")
     return drawn
 
 

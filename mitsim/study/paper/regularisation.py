@@ -105,7 +105,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         for method in METHODS
     }
     for column, which in _COLUMNS.items():
-        drawn[f"psnr_{which}.png"] = quality_bars(bars(lines, column), f"{EQUAL_FRAME}, {which} weight")
+        drawn[f"psnr_{which}.png"] = quality_bars(bars(lines, column), f"exposure {EQUAL_FRAME}, {which} weight")
     for family in _SHOWN:
         if grid := pictured(results, by_print(table.where(patterns=family)), "method", METHODS):
             drawn[f"images_{family.replace(':', '')}.png"] = image_grid(

@@ -128,7 +128,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     table, drawn, lines = results.table, {}, by_patterns(results.table)
     for column, file in (("contrast", "contrast"), ("transfer", "edge")):
         drawn[f"{file}.png"] = curves(
-            panels(lines, "pairs_a_mm", column), "line pairs a mm of the print", f"{column} [1]", ticks=False
+            panels(lines, "pairs_a_mm", column), "fineness on the print [line pairs/mm]", f"{column} [1]", ticks=False
         )
     names = [name for name in table.distinct("picture") if name.startswith("bars")]
     both = {f"{name}, {model}": rows.where(model=model) for name, rows in lines.items() for model in MODELS}

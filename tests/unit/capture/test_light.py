@@ -197,7 +197,7 @@ def test_flux_is_what_each_pixel_casts_on_the_sensor(bench: Bench, plan: Plan) -
 def test_facts_name_what_is_there(small_scene: Callable[..., Path], bench: Bench) -> None:
     sky = '<emitter type="constant"><spectrum name="radiance" value="1"/></emitter>'
     facts = SceneFacts.of(open_bench(small_scene(extra=sky, fov=12)))
-    assert "1 emitter(s)" in facts.notes["ambient"] and "field stop" in facts.warnings[0]
+    assert "1 emitter beside" in facts.notes["ambient"] and "field stop" in facts.warnings[0]
     assert not SceneFacts.of(bench).warnings
 
 

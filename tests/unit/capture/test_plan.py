@@ -76,7 +76,7 @@ def test_rows_carry_the_measured_errors() -> None:
     for name, error in EVIDENCE.effects.items():
         assert found[name].error_if_off == error.value
     assert found["diffraction"].reason.startswith("Fresnel number 3.2; ")
-    assert "without it the error would be up to 3.0e-01 of 0.001 allowed" in found["diffraction"].reason
+    assert "without it the error would be up to 3.0e-01, and 0.001 is allowed" in found["diffraction"].reason
 
 
 def test_a_row_is_found_by_its_name() -> None:

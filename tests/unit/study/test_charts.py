@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mitsim.study.charts import curves, image_grid
+from mitsim.study.charts import curves, image_grid, paired
 from mitsim.study.table import Mean
 
 
@@ -42,3 +42,23 @@ def test_a_grid_has_a_title_of_its_own_and_one_for_each_column() -> None:
     assert [axes.get_title() for axes in figure.axes] == ["a", "b", "", ""]
     assert [axes.get_xlabel() for axes in figure.axes] == ["0.2 dB", "0.8 dB"] * 2
     assert [axes.get_ylabel() for axes in figure.axes] == ["one", "", "two", ""]
+
+
+def test_a_title_stands_above_all_panels() -> None:
+    """(Planted: the last panel's own.)"""
+    figure = curves({"left": {"a": {"1": Mean(1.0, 0.1, 2)}}, "right": {"a": {}}}, "x [mm]", title="both")
+    assert figure.get_suptitle() == "both"
+
+
+def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
+    """(Planted: zeros for what is not known, whose caps look like a sure number.)"""
+    single, several = (
+        curves({"": {"a": {"1": Mean(1.0, error, 1), "2": Mean(2.0, error, 1)}}}, "x [mm]").axes[0].containers[0]
+        for error in (float("nan"), 0.5)
+    )
+    assert several.has_yerr and not single.has_yerr
+    both = paired(
+        {"mask, 2 um": (Mean(2.0, float("nan"), 1), Mean(1.0, 0.2, 4))}, ("measured", "predicted"), "lost [dB]"
+    )
+    assert [container.has_xerr for container in both.axes[0].containers if hasattr(container, "has_xerr")] == [True]
+    assert [tick.get_text() for tick in both.axes[0].get_yticklabels()] == ["mask, 2 \N{GREEK SMALL LETTER MU}m"]

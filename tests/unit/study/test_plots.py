@@ -11,6 +11,7 @@ import numpy as np
 from mitsim.study import plots
 from mitsim.study.solver_cost import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
 from mitsim.study.table import Mean
+from mitsim.study.typeset import typeset
 
 SOLVER_ROWS = [
     SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
@@ -24,7 +25,6 @@ def test_every_axis_has_a_unit() -> None:
         plots.frame(np.ones((4, 4))),
         plots.singular_values({"a": np.ones(3)}),
         plots.error_bars({"a": 1e-3}, 1e-2),
-        plots.seconds_by_stage({"a": 1.0}),
         plots.quality_bars({"a": (Mean(20.0, 1.0, 8), Mean(10.0, float("nan"), 1))}),
         plots.solver_costs(SOLVER_ROWS),
     )
@@ -52,7 +52,11 @@ def test_stated_and_actual_errors_share_one_scale() -> None:
     stated, actual, bar = figure.axes
     assert stated.images[0].get_clim() == actual.images[0].get_clim() == (0.0, np.percentile(error, 99))
     assert np.array_equal(np.asarray(actual.images[0].get_array()), error)
-    assert "stated" in stated.get_title() and "4.0e-03" in stated.get_title() and "5.8e-03" in actual.get_title()
+    assert (
+        "stated" in stated.get_title()
+        and "4.0\u00d710⁻³" in stated.get_title()
+        and "5.8\u00d710⁻³" in actual.get_title()
+    )
     assert bar.get_ylabel() == "reflectance, 1 = board"
 
 
@@ -74,8 +78,8 @@ def test_values_of_error_bars_stand_beside_the_axes_where_no_line_crosses_them()
     figure.canvas.draw()
     axes = figure.axes[0]
     right = axes.get_window_extent().x1
-    written = [text for text in axes.texts if "e-" in text.get_text() and "asked" not in text.get_text()]
-    assert [text.get_text() for text in written] == ["1.0e-05", "7.8e-04", "1.0e-02"]
+    written = [text for text in axes.texts if "10" in text.get_text() and "asked" not in text.get_text()]
+    assert [text.get_text() for text in written] == ["1.0\u00d710⁻⁵", "7.8\u00d710⁻⁴", "0.0100"]
     for text in written:
         box = text.get_window_extent()
         assert box.x0 > right and box.x1 < figure.bbox.x1
@@ -111,7 +115,7 @@ def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
 def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
     figure = plots.solver_costs(SOLVER_ROWS)
     for axes, lam in zip(figure.axes, LAMBDAS, strict=True):
-        assert axes.get_title().endswith(f"{lam:.0e}")
+        assert axes.get_title().endswith(typeset(f"{lam:.0e}"))
         shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
         assert sorted(shown) == sorted((row.seconds, row.error) for row in SOLVER_ROWS if row.lambda_rel == lam)
     looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines[:-1]}

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from mitsim.capture.plan import PlanRow
 from mitsim.core.errors import MitsimError
 from mitsim.study import report as R
 from mitsim.study.demo import _no_image
 from mitsim.study.metrics import Quality
+from mitsim.study.page import Part, build_findings
 from mitsim.study.trust import Trust
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
@@ -169,8 +171,8 @@ def test_every_number_that_was_given_is_shown(page: str) -> None:
 
 
 def test_each_image_stands_in_its_place(page: str) -> None:
-    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 5 plots.
-    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 5
+    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 4 plots.
+    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 4
     assert page.count('class="picture result best"') == 2
 
 
@@ -196,7 +198,7 @@ def test_trust_is_a_row_a_family_and_one_picture_of_the_main_one(page: str) -> N
     assert [row[0] for row in rows] == ["Uniform", "16 dots", "25 dots", "49 dots", "64 Hadamard"]
     for row, decibel in zip(rows, (18.7, 27.9, 29.6, 31.8, 30.9), strict=True):
         stated = 10 ** (-decibel / 20)
-        assert row[1] == f"{decibel} dB" and row[2] == f"{stated:.3g}" and row[5] == "1.020"
+        assert row[1] == f"{decibel} dB" and row[2] == f"{stated:.4f}" and row[5] == "1.020"
         assert float(row[3]) == pytest.approx(stated, rel=0.1)
         assert float(row[4].removesuffix(" %")) == pytest.approx(95, abs=2.1)
     assert [re.sub(r"<.*?>", "", row[6]) for row in rows] == ["depth", "fits", "fits", "fits", "fits"]
@@ -260,7 +262,8 @@ def test_plan_shows_costs_where_there_are_any_and_no_column_of_zeros(page: str) 
 
 
 def test_time_outside_all_stages_is_not_hidden() -> None:
-    assert R._stages({"a": 1.0, "b": 2.0, "total": 5.0}) == {"a": 1.0, "b": 2.0, "not in a stage": 2.0}
+    assert R._stages({"a": 1.0, "b": 2.0, "total": 5.0}) == {"a": 1.0, "b": 2.0, "all else": 2.0}
+    assert R._stages({"a": 1.0, "b": 0.006, "c": 0.009, "total": 1.015}) == {"a": 1.0, "all else": pytest.approx(0.015)}
     assert R._stages({"a": 1.0, "b": 2.0, "total": 3.02}) == {"a": 1.0, "b": 2.0}
     assert R._stages({"a": 1.0}) == {"a": 1.0} and R._stages({}) == {}
 
@@ -325,3 +328,13 @@ def test_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(MitsimError, match="cannot be written"):
         R.build_report(small, tmp_path / "missing" / "report.html")
+
+
+def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
+    """(Planted: each column as its first cell; a column of words after one of numbers then went right, too.)"""
+    rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
+    part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
+    assert part.numeric == (False, True, True, False)
+    page = build_findings("toy", "A study", "Scene toy", [part], {"a.png": Figure(figsize=(3.0, 2.0))})
+    assert page.count('<th class="n">') == 2 and page.count('<td class="n">') == 4
+    assert "512 \u00d7 512 pixels" in page and "2.8\u00d710\u00b9\u00b2" in page and "wide small" in page

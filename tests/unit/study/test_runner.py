@@ -35,7 +35,7 @@ class Toy:
         return [f"It is {self.value:g}."]
 
     def figures(self) -> dict[str, Figure]:
-        return {"toy.png": plots.seconds_by_stage({"a": self.value})}
+        return {"toy.png": plots.error_bars({"a": self.value})}
 
 
 def run(folder: Path, value: float = 1.0, name: str = "toy") -> StudyResult:

@@ -1,0 +1,54 @@
+"""Numbers and plain text in, the same as a page or a figure prints them out: powers of ten, signs, micrometres."""
+
+from __future__ import annotations
+
+import math
+import re
+
+DASH = "\N{EN DASH}"
+"""Where there is no number."""
+_SUPERSCRIPT = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_TIMES = "\N{MULTIPLICATION SIGN}"
+_POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?\d+)(?![\w.]\w)")
+"""A number such as 4.9e-03, and neither a part of a name nor of a longer number."""
+_SIZE = re.compile(r"(?<![\w:.])(\d+(?:\.\d+)?)( ?)x\2(?=\d+(?:\.\d+)?(?![\w:]))")
+"""512 x 512 and 3x3, but not dots:7x16."""
+
+
+def scientific(value: float | None) -> str:
+    """A number of three digits, a ``value`` below 0.01 or from 10,000 on of two with a power of ten; None as a dash."""
+    if value is None or value == 0.0:
+        return DASH if value is None else "0"
+    if 1e-2 <= abs(value) < 1e4:
+        return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:#.3g}"
+    return typeset(f"{value:.1e}")
+
+
+def rounded(value: float, error: float) -> str:
+    """A number to the second digit of its standard error.
+
+    Parameters
+    ----------
+    value, error
+        in one unit; an error of 0, or none that is finite, leaves five digits.
+    """
+    if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
+        return f"{value:.5g}"
+    places = 1 - math.floor(math.log10(error))
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}"
+
+
+def typeset(text: str) -> str:
+    """A ``text`` for people: 4.9e-03 as a power of ten, +- as one sign, 512 x 512 with a times sign, um with a Greek
+    letter."""
+    text = _POWER.sub(_power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
+    text = _SIZE.sub(rf"\1\2{_TIMES}\2", text)
+    return re.sub(r"(?<=[\d\[(] )um\b|(?<=[\[(/])um\b", "\N{GREEK SMALL LETTER MU}m", text)
+
+
+def _power(found: re.Match[str]) -> str:
+    mantissa, exponent = found[1], int(found[2])
+    if not float(mantissa):
+        return "0"
+    power = f"10{str(exponent).translate(_SUPERSCRIPT)}"
+    return power if float(mantissa) == 1 and "." not in mantissa else f"{mantissa}{_TIMES}{power}"
