@@ -32,7 +32,7 @@ from mitsim.reconstruct.status import Verdict
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
-METHODS = ("tikhonov", "tv")
+TIKHONOV, MARKOV, TV = METHODS = ("tikhonov", "markov", "tv")
 
 
 @single_threaded_blas()
@@ -40,7 +40,7 @@ def reconstruct(
     shots: Capture,
     factors: Factors,
     lam: float | Literal["auto"] = "auto",
-    method: str = "tikhonov",
+    method: str = TIKHONOV,
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
 ) -> Reconstruction:
@@ -56,7 +56,8 @@ def reconstruct(
         lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
         from the data.
     method
-        ``tikhonov`` (closed form) or ``tv`` (least total variation).
+        ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
+        :mod:`mitsim.reconstruct.prior`) or ``tv`` (least total variation).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -78,8 +79,8 @@ def reconstruct(
         wider = beside.factors(factors)
         shots, factors = beside.of(wider.of(shots)), wider.factors
     # Depths that are looked for, and total variation, take as long as the data ask for.
-    cost = predicted(shots, factors) if method == "tikhonov" and focus not in ("auto", "map") else None
-    _check_factorising(shots, factors)
+    cost = predicted(shots, factors) if method == TIKHONOV and focus not in ("auto", "map") else None
+    _check_factorising(shots, factors, method)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
@@ -88,14 +89,14 @@ def reconstruct(
     if isinstance(depth, Depth):
         of_depth = focused(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
-    data = accumulated(shots, factors)
+    data = accumulated(shots, factors, method)
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
     solution: DepthMap | Solution | TVSolution
     if isinstance(depth, DepthMap) and not depth.doubt:
         solution = depth
     else:
-        solution = prepared.solve(frames, lam) if method == "tikhonov" else solve_tv(prepared, frames, lam)
+        solution = solve_tv(prepared, frames, lam) if method == TV else prepared.solve(frames, lam)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution)
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
@@ -205,12 +206,26 @@ class Accumulated:
         )
 
 
-def accumulated(shots: Capture, factors: Factors) -> Accumulated:
-    """The model of ``shots`` and ``factors`` factorised, and every frame added. MitsimError when that takes more memory
-    than is free, or a frame cannot be read."""
+def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulated:
+    """The model of shots and factors factorised, and every frame added.
+
+    Parameters
+    ----------
+    shots, factors
+        that fit each other.
+    method
+        of the image that they are for.
+
+    Raises
+    ------
+    MitsimError
+        when that takes more memory than is free, or a frame cannot be read.
+    """
     left, right = shots.patterns
-    _check_factorising(shots, factors)
+    _check_factorising(shots, factors, method)
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
+    if method == MARKOV:
+        prepared = prepared.correlated()
     noise = FrameNoise(shots.manifest, _ambient_noise(shots))
     frames, kept = prepared.accumulator(), list[Measurement]()
     few = is_kept(shots, factors)
@@ -222,9 +237,10 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     return Accumulated(Model(prepared, factors.sides, shots.patterns), frames, noise, tuple(kept))
 
 
-def _check_factorising(shots: Capture, factors: Factors) -> None:
-    """MitsimError where factorising the model of ``shots`` and ``factors`` takes more memory than is free."""
-    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors))
+def _check_factorising(shots: Capture, factors: Factors, method: str) -> None:
+    """MitsimError where factorising the model of ``shots`` and ``factors`` for a ``method`` takes more memory than is
+    free."""
+    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=method == MARKOV))
     cost.check(f"{shots.name}: factorising its patterns", Limits())
 
 
@@ -253,16 +269,16 @@ def inputs(
         as asked for; ArgumentError for an unknown method, or another lambda, focus or margin than reconstruct takes.
     """
     if method not in METHODS:
-        raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
+        raise ArgumentError("method", f"{method!r}: use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
     if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < np.inf):
         raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
     if focus is not None and focus not in ("auto", "map") and (isinstance(focus, str) or not 0 < focus < np.inf):
         raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
-    if focus == "map" and method != "tikhonov":
+    if focus == "map" and method != TIKHONOV:
         raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
     if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
         raise ArgumentError("margin", f"{margin}: give a whole number of cells, at least 0")
-    if margin and (focus is not None or method != "tikhonov"):
+    if margin and (focus is not None or method != TIKHONOV):
         raise ArgumentError("margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus")
     asked: dict[str, str | float] = {
         "run": shots.fingerprint,

@@ -19,7 +19,7 @@ from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, load_run
 from mitsim.reconstruct.cost import Predicted, predicted
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.reconstruction import METHODS, accumulated, reconstruct
 from mitsim.reconstruct.status import Status, Verdict
 from mitsim.rig.patterns import parse_patterns
 from mitsim.study.quality import reconstruct as reconstruct_folders
@@ -60,7 +60,7 @@ def shots(factors: Factors) -> Capture:
     )
 
 
-@pytest.mark.parametrize("method", ["tikhonov", "tv"])
+@pytest.mark.parametrize("method", METHODS)
 def test_memory_and_disk_give_the_same_image(shots: Capture, factors: Factors, tmp_path: Path, method: str) -> None:
     memory = reconstruct(shots, factors, method=method)
     factors.save(tmp_path / "cal")
