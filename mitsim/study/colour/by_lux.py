@@ -33,7 +33,9 @@ LADDER_LX, DRAWS = (0.0, 5.0, 10.0, 20.0, 60.0, 200.0, 600.0), 3
 """Illuminances of daylight [lx], dark, dusk, a dim room, a bright office; and exposures at each."""
 LEAST = "least without bias"
 METHODS = TIKHONOV, MARKOV, LEAST
+"""Values of the column ``method``: two ways to solve the same frames, and what no linear image without bias is below."""
 _FEW_LX, _ASKED_LX = (0.0, 60.0), (60.0, 600.0)
+"""Of a quick look: the dark, and where the goal is near its end; and those for which the page says what they take."""
 _FAMILIES = ("dots:7", "hadamard:8")
 _BETWEEN_LX, _VARIANCES = (1e-2, 1e5), (1e-6, 1.0)
 """Where the illuminance that keeps the goal, and the part of one exposure's variance that does, are looked for."""
@@ -115,12 +117,12 @@ def claim_of(rows: Table, patterns: str) -> Claim:
     own = rows.where(patterns=patterns)
     by_lux, goal = own.where(method=MARKOV).means("mean_delta_e", "lux"), own.mean("goal_delta_e").value
     kept, last = kept_lx(by_lux, goal), max(by_lux)
-    limit = f"the brightest tried, {last:g} lx" if kept == last else f"{kept:.2g} lx"
+    limit = f"the brightest tried, {last:g} lx" if kept == last else f"{_digits(kept)} lx"
     least = own.mean("kept_lx", method=LEAST).value
     return Claim(
         f"{label(patterns)} add at most {GOAL:g} to the floor's mean Delta E 2000 beside D65 ({MARKOV})", "", "",
-        f"kept up to {limit}; without bias at best up to {least:.2g} lx",
-        "confirmed" if kept == last else f"confirmed only if D65 has at most {kept:.2g} lx" if kept else
+        f"kept up to {limit}; without bias at best up to {_digits(least)} lx",
+        "confirmed" if kept == last else f"confirmed only if D65 has at most {_digits(kept)} lx" if kept else
         "not confirmed",
     )  # fmt: skip
 
@@ -144,6 +146,11 @@ def kept_lx(by_lux: Mapping[float, Mean], goal: float) -> float:
             share = (goal - first) / (second - first)
             return float(low * (high / low) ** share if low else high * share)
     return order[-1]
+
+
+def _digits(value: float) -> str:
+    """A ``value`` to two digits, without a power of ten."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def figure(rows: Table) -> Figure:
@@ -176,8 +183,8 @@ def tables(rows: Table) -> tuple[PageTable, PageTable]:
         kept = kept_lx(by_lux, least.mean("goal_delta_e").value), least.mean("kept_lx").value
         told = [(least.numbers("repeats", lux=lux), least.numbers("power", lux=lux)) for lux in asked]
         return (
-            label(family), *(f"{each:.2g}" for each in kept),
-            *("never" if not (count and power) else f"{count[0]:g}; {max(power[0], 1):.2g}" for count, power in told),
+            label(family), *map(_digits, kept),
+            *("never" if not (count and power) else f"{count[0]:g}; {_digits(max(power[0], 1))}" for count, power in told),
         )  # fmt: skip
 
     count = len(rows.where(method=MARKOV).distinct("draw"))
