@@ -33,7 +33,7 @@ LADDER_LX, DRAWS = (0.0, 5.0, 10.0, 20.0, 60.0, 200.0, 600.0), 3
 """Illuminances of daylight [lx], dark, dusk, a dim room, a bright office; and exposures at each."""
 LEAST = "least without bias"
 METHODS = TIKHONOV, MARKOV, LEAST
-"""Values of the column ``method``: two ways to solve the same frames, and what no linear image without bias is below."""
+"""Of the column ``method``: two ways to solve the same frames, and what no linear image without bias is below."""
 _FEW_LX, _ASKED_LX = (0.0, 60.0), (60.0, 600.0)
 """Of a quick look: the dark, and where the goal is near its end; and those for which the page says what they take."""
 _FAMILIES = ("dots:7", "hadamard:8")
@@ -184,7 +184,7 @@ def tables(rows: Table) -> tuple[PageTable, PageTable]:
         told = [(least.numbers("repeats", lux=lux), least.numbers("power", lux=lux)) for lux in asked]
         return (
             label(family), *map(_digits, kept),
-            *("never" if not (count and power) else f"{count[0]:g}; {_digits(max(power[0], 1))}" for count, power in told),
+            *(f"{count[0]:g}; {_digits(max(power[0], 1))}" if count and power else "never" for count, power in told),
         )  # fmt: skip
 
     count = len(rows.where(method=MARKOV).distinct("draw"))
@@ -196,8 +196,8 @@ def tables(rows: Table) -> tuple[PageTable, PageTable]:
             tuple((f"{lux:g}", *(cell(lux, *pair) for pair in pairs)) for lux in rows.distinct("lux")),
         ),
         PageTable(
-            f"What keeps the mean Delta E at most {GOAL:g} above the floor: D65 [lx] with one exposure a pattern; "
-            "in more light repeats of all exposures, or times the laser power (the same as a filter that lets through "
+            f"What keeps the mean Delta E at most {GOAL:g} above the floor: D65 [lx] with one exposure a pattern; in "
+            "more light repeats of all exposures, or times the laser power (the same as a filter that lets through "
             "one over that part of D65), by the least noise without bias",
             ("Patterns", f"Most [lx], {MARKOV}", f"Most [lx], {LEAST}",
              *(f"{lux:g} lx: repeats; power" for lux in asked)),
