@@ -24,7 +24,9 @@ def reconstruct(
         Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
     ] = None,
     lam: Annotated[str, typer.Option("--lambda", help="regularisation, or auto", metavar="auto|VALUE")] = "auto",
-    method: Annotated[str, typer.Option(help="tikhonov or tv")] = "tikhonov",
+    method: Annotated[
+        str, typer.Option(help="tikhonov, markov (neighbouring pixels alike: for noisy frames) or tv")
+    ] = "tikhonov",
     focus: Annotated[
         str | None,
         typer.Option(

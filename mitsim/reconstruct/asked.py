@@ -6,7 +6,7 @@ import math
 
 from mitsim.core.errors import ArgumentError
 
-METHODS = ("tikhonov", "tv")
+TIKHONOV, MARKOV, TV = METHODS = ("tikhonov", "markov", "tv")
 """Of solving."""
 IMAGE_FILE = "image.exr"
 """By which a folder is known to hold an image."""
@@ -21,16 +21,16 @@ def check_asked(lam: float | str, method: str, focus: float | str | None, margin
         as there.
     """
     if method not in METHODS:
-        raise ArgumentError("method", f"{method!r}: use {' or '.join(METHODS)}")
+        raise ArgumentError("method", f"{method!r}: use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
     if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < math.inf):
         raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
     if focus is not None and focus not in ("auto", "map") and (isinstance(focus, str) or not 0 < focus < math.inf):
         raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
-    if focus == "map" and method != "tikhonov":
+    if focus == "map" and method != TIKHONOV:
         raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
     if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
         raise ArgumentError("margin", f"{margin}: give a whole number of cells, at least 0")
-    if margin and (focus is not None or method != "tikhonov"):
+    if margin and (focus is not None or method != TIKHONOV):
         raise ArgumentError("margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus")
 
 

@@ -64,7 +64,20 @@ def is_kept(shots: Capture, factors: Factors) -> bool:
     return bool(left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= KEPT_NUMBERS)
 
 
-def slab_numbers(shots: Capture, factors: Factors) -> float:
-    """Numbers of the ``factors`` and of all slabs that they are factorised into under the patterns of ``shots``."""
+def slab_numbers(shots: Capture, factors: Factors, whole: bool = False) -> float:
+    """Numbers of the factors and of all slabs that they are factorised into.
+
+    Parameters
+    ----------
+    shots, factors
+        the patterns, and the camera.
+    whole
+        whether every pattern's slab has all coefficients, not those of the pixels that it lights alone.
+    """
     sides = zip((factors.left, factors.right), shots.patterns, strict=True)
-    return float(sum(len(factor) * np.count_nonzero(patterns) + factor.size for factor, patterns in sides))
+    return float(
+        sum(
+            len(factor) * (patterns.size if whole else np.count_nonzero(patterns)) + factor.size
+            for factor, patterns in sides
+        )
+    )

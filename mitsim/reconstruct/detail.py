@@ -86,7 +86,7 @@ def print_energy(model: Model, image: FloatArray) -> float:
     own = tuple(zip(model.sides, model.slopes, model.patterns, model.moved, strict=True))
     for (other, *_), (_, slope, lit, moved), seen in (own[0], own[1], image), (own[1], own[0], image.T):
         if seen.shape[1] > 1:
-            along = (other.basis * other.singular).T @ np.gradient(seen, axis=1) / 12
+            along = other.response.T @ np.gradient(seen, axis=1) / 12
             everything = np.sum((along.T @ along) * (lit @ lit.T) * (slope.T @ slope))
             total += float(everything - np.square(along @ moved.sum(axis=0)).sum())
     return EDGES * max(total, 0.0)
@@ -138,7 +138,7 @@ def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[Fl
     total = np.zeros_like(known[0])
     sides = model.sides, model.sides[::-1]
     for axis, ((own, other), response, variance) in enumerate(zip(sides, model.moved, known, strict=True)):
-        weights, light = np.square(gain.T if axis else gain), np.square(other.singular)
+        weights, light = np.square(gain.T if axis else gain), np.square(other.response).sum(axis=0)
         whole = response.sum(axis=0)
         parts = whole, response[0] - whole @ own.first_half
         struck, told = (float(np.square(part).sum(axis=0) @ weights @ light) for part in parts)

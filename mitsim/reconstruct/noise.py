@@ -115,7 +115,7 @@ def factor_energy(
     total = 0.0
     sides = (left, right, patterns[0], noise.left, image), (right, left, patterns[1], noise.right, image.T)
     for own, other, lit, deviation, seen in sides:
-        spread = np.square(seen @ (other.basis * other.singular)).sum(axis=1)
+        spread = np.square(seen @ other.response).sum(axis=1)
         spare = 1 - own.rank / own.data_rows
         total += own.sensor_size * deviation**2 * spare * float(np.square(lit).sum(axis=1) @ spread)
     return total

@@ -15,7 +15,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
-from mitsim.reconstruct.asked import check_asked
+from mitsim.reconstruct.asked import MARKOV, TIKHONOV, TV, check_asked
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.cost import BYTES_A_NUMBER, is_kept, predicted, slab_numbers
 from mitsim.reconstruct.depth import Depth, best_depth
@@ -39,7 +39,7 @@ def reconstruct(
     shots: Capture,
     factors: Factors,
     lam: float | Literal["auto"] = "auto",
-    method: str = "tikhonov",
+    method: str = TIKHONOV,
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
 ) -> Reconstruction:
@@ -55,7 +55,8 @@ def reconstruct(
         lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
         from the data.
     method
-        ``tikhonov`` (closed form) or ``tv`` (least total variation).
+        ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
+        :mod:`mitsim.reconstruct.prior`) or ``tv`` (least total variation).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -77,8 +78,8 @@ def reconstruct(
         wider = beside.factors(factors)
         shots, factors = beside.of(wider.of(shots)), wider.factors
     # Depths that are looked for, and total variation, take as long as the data ask for.
-    cost = predicted(shots, factors) if method == "tikhonov" and focus not in ("auto", "map") else None
-    _check_factorising(shots, factors)
+    cost = predicted(shots, factors) if method == TIKHONOV and focus not in ("auto", "map") else None
+    _check_factorising(shots, factors, method)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
@@ -87,14 +88,14 @@ def reconstruct(
     if isinstance(depth, Depth):
         of_depth = focused(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
-    data = accumulated(shots, factors)
+    data = accumulated(shots, factors, method)
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
     solution: DepthMap | Solution | TVSolution
     if isinstance(depth, DepthMap) and not depth.doubt:
         solution = depth
     else:
-        solution = prepared.solve(frames, lam) if method == "tikhonov" else solve_tv(prepared, frames, lam)
+        solution = solve_tv(prepared, frames, lam) if method == TV else prepared.solve(frames, lam)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution)
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
@@ -210,12 +211,26 @@ class Accumulated:
         )
 
 
-def accumulated(shots: Capture, factors: Factors) -> Accumulated:
-    """The model of ``shots`` and ``factors`` factorised, and every frame added. MitsimError when that takes more memory
-    than is free, or a frame cannot be read."""
+def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulated:
+    """The model of shots and factors factorised, and every frame added.
+
+    Parameters
+    ----------
+    shots, factors
+        that fit each other.
+    method
+        of the image that they are for.
+
+    Raises
+    ------
+    MitsimError
+        when that takes more memory than is free, or a frame cannot be read.
+    """
     left, right = shots.patterns
-    _check_factorising(shots, factors)
+    _check_factorising(shots, factors, method)
     prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
+    if method == MARKOV:
+        prepared = prepared.correlated()
     noise = FrameNoise(shots.manifest, _ambient_noise(shots))
     frames, kept = prepared.accumulator(), list[Measurement]()
     few = is_kept(shots, factors)
@@ -227,9 +242,10 @@ def accumulated(shots: Capture, factors: Factors) -> Accumulated:
     return Accumulated(Model(prepared, factors.sides, shots.patterns), frames, noise, tuple(kept))
 
 
-def _check_factorising(shots: Capture, factors: Factors) -> None:
-    """MitsimError where factorising the model of ``shots`` and ``factors`` takes more memory than is free."""
-    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors))
+def _check_factorising(shots: Capture, factors: Factors, method: str) -> None:
+    """MitsimError where factorising the model of ``shots`` and ``factors`` for a ``method`` takes more memory than is
+    free."""
+    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=method == MARKOV))
     cost.check(f"{shots.name}: factorising its patterns", Limits())
 
 

@@ -73,6 +73,11 @@ class Side:
         True: slabs are rows of U. False (``gram``): slabs are Phi diag(p_i), and W is the paper's Q.
     n_blocks, pattern_count, sensor_size, scene_size, data_rows
         number of blocks; K; m; n; independent data rows, m K (less K once frames are centred).
+    dual
+        (n, r) V' with B = U S V'^T; None: V' is the basis, which is orthonormal
+        (:mod:`mitsim.reconstruct.prior` has others).
+    spread
+        condition of what the basis is made with, which magnifies rounding; 1 of an orthonormal one.
     """
 
     basis: FloatArray
@@ -84,6 +89,13 @@ class Side:
     sensor_size: int
     scene_size: int
     data_rows: int
+    dual: FloatArray | None = None
+    spread: float = 1.0
+
+    @cached_property
+    def response(self) -> FloatArray:
+        """B^T U (n, r): what the coefficients see of light of each scene pixel."""
+        return _frozen((self.basis if self.dual is None else self.dual) * self.singular)
 
     @property
     def rank(self) -> int:

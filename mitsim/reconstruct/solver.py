@@ -23,7 +23,7 @@ magnified as noise, and by more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -34,6 +34,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.accumulator import Accumulator, centred_columns
 from mitsim.reconstruct.halves import Halves
+from mitsim.reconstruct.prior import correlated
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.sides import Method, Side, Structure, check_choices, factorise, group_pixels
 from mitsim.reconstruct.status import Status, Verdict
@@ -130,6 +131,13 @@ class Prepared:
             f"{right.condition:.1e})"
         )
 
+    def correlated(self) -> Prepared:
+        """The same model for images whose neighbouring pixels are alike (:mod:`mitsim.reconstruct.prior`); frames go to
+        its own accumulator. MitsimError for the Gram method."""
+        with single_threaded_blas():
+            left = correlated(self.left)
+            return replace(self, left=left, right=left if self.right is self.left else correlated(self.right))
+
     def accumulator(self) -> Accumulator:
         """An empty sum to add frames to."""
         return Accumulator(self.left, self.right, self.centre)
@@ -213,7 +221,7 @@ class Prepared:
         power = np.square(sigma) + lam
         top = float(sigma.max())
         magnified = top * (sigma / power).max() if self.method == "svd" else top**2 / power.min()
-        return _ROUNDING_UNITS * max(float(magnified), 1.0)
+        return _ROUNDING_UNITS * max(float(magnified), 1.0) * self.left.spread * self.right.spread
 
     def _status(self, lam: float, rounding: float, scale: float) -> Status:
         """Whether the image is complete, and what to do where it is not."""

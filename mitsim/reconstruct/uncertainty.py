@@ -19,7 +19,9 @@ d_L diag(p_i) has independent numbers of variance s_L^2 rho[a, p], rho[a, p] = |
     var X[p, q] = s_L^2 sum_a V_L[p, a]^2 sum_p' rho[a, p'] (sum_b G[a, b] Q[p', b] V_R[q, b])^2
 
 and the same with the sides exchanged. G is taken apart into a few products of a row and a column. (For patterns whose
-blocks share no row, such as ``random``, rho leaves out what is correlated between coefficients.)
+blocks share no row, such as ``random``, and for neighbours alike, rho leaves out what is correlated between
+coefficients.) Where the basis V is not orthonormal (:mod:`mitsim.reconstruct.prior`) V makes the image, its dual sees
+light; formulas are the same.
 
 Print that changes within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its
 light g / 12 pixels off the centre; what that does to the image stands for print that may have hard edges or none, which
@@ -171,16 +173,30 @@ class Propagation:
         rows, columns
             (m,) and (m',) mean variance of its pixels by sensor row, and by sensor column.
         """
-        products = []
-        for side, own, variance in zip(self.model.sides, self.terms, (rows, columns), strict=True):
-            common = _common(side) * np.sqrt(variance)[:, None]
-            taken = np.stack([(side.basis * term) @ common.T for term in own.T], axis=1)
-            products.append(taken @ taken.transpose(0, 2, 1))
-        return np.asarray(np.einsum("pkl,qkl->pq", *products, optimize=True) / rows.mean())
+        sides = zip(self.model.sides, (rows, columns), strict=True)
+        left, right = (common_response(side) * np.sqrt(variance)[:, None] for side, variance in sides)
+        return np.asarray(self._taken(left, right) / rows.mean())
 
     def of_light(self, variance: float) -> FloatArray:
         """(n, n') variance of the image by an independent error of this ``variance`` in every scene pixel's light."""
-        return self._spread(variance * np.square(self._sigma))
+        left, right = self.model.sides
+        if left.dual is None and right.dual is None:  # what coefficients get is then independent too
+            return self._spread(variance * np.square(self._sigma))
+        return variance * self._taken(left.response, right.response)
+
+    def _taken(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """(n, n') variance of the image of W = left^T E right, E (s, s') independent numbers of variance 1.
+
+        Parameters
+        ----------
+        left, right
+            (s, r) and (s', r').
+        """
+        products = []
+        for side, own, seen in zip(self.model.sides, self.terms, (left, right), strict=True):
+            taken = np.stack([(side.basis * term) @ seen.T for term in own.T], axis=1)
+            products.append(taken @ taken.transpose(0, 2, 1))
+        return np.asarray(np.einsum("pkl,qkl->pq", *products, optimize=True))
 
     def of_regularisation(self, problem: DiagonalProblem, variance: float) -> FloatArray:
         """(n, n') mean square of what lambda takes away of the image of a ``problem``, whose data have the stated
@@ -213,7 +229,7 @@ class Propagation:
         left, right = self.model.sides
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
         moved = [each.sum(axis=0) for each in self.model.moved]
-        seen = moved[0].T @ rows @ (right.basis * right.singular), (left.basis * left.singular).T @ columns @ moved[1]
+        seen = moved[0].T @ rows @ right.response, left.response.T @ columns @ moved[1]
         return PRINT * sum(
             (np.square(self.model.prepared.image(self.gain * each)) for each in seen), np.zeros_like(image)
         )
@@ -323,8 +339,8 @@ def scene_energy(problem: DiagonalProblem, variance: float) -> FloatArray:
     return energies
 
 
-def _common(side: Side) -> FloatArray:
-    """(m, r) sum of all slabs: how each coefficient takes what is common to all frames."""
+def common_response(side: Side) -> FloatArray:
+    """(m, r) sum of all slabs of a ``side``: how each coefficient takes what is common to all frames."""
     total = np.zeros((side.sensor_size, len(side.singular)))
     for slab in side.slabs:
         total[:, slab.columns] += slab.matrix
@@ -335,7 +351,7 @@ def _of_factor(
     own: Side, other: Side, patterns: FloatArray, terms: tuple[FloatArray, FloatArray], image: FloatArray
 ) -> FloatArray:
     """(n, n') variance of an ``image`` by independent numbers of variance 1 in the factor of its ``own`` side."""
-    seen = image @ (other.basis * other.singular)
+    seen = image @ other.response
     # Pixels that the same patterns light are seen alike: coefficients answer to each kind of them once.
     kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
     of_kind = (kind.ravel() == np.arange(len(kinds))[:, None]).astype(np.float64)

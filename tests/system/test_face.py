@@ -184,7 +184,7 @@ def test_images_from_memory_and_from_disk_are_equal(shots: ms.Capture, factors: 
     run, cal = ms.load_run(shots.save(tmp_path / "run")), ms.load_calibration(factors.save(tmp_path / "cal"))
     assert np.array_equal(cal.left, factors.left) and np.array_equal(cal.right, factors.right)
     assert cal.fingerprint == factors.fingerprint and str(cal.status) == str(factors.status)
-    for method in ("tikhonov", "tv"):
+    for method in ("tikhonov", "markov", "tv"):
         first, second = ms.reconstruct(shots, factors, method=method), ms.reconstruct(run, cal, method=method)
         assert np.array_equal(first.image, second.image) and first.inputs == second.inputs, method
         assert first.save(tmp_path / method) == second.save(tmp_path / method), "the same inputs may be written again"

@@ -17,21 +17,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.capture.ambient import shots_for
-from mitsim.capture.exposer import Exposer
 from mitsim.core.arrays import FloatArray
 from mitsim.core.pictures import lightness
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.reconstruct.solver import prepare
 from mitsim.rig.chart import ChartPlace, load_chart
-from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.study.colour import by_lux
+from mitsim.study.colour.by_lux import BY_LUX, GOAL
+from mitsim.study.colour.daylight import DaylitLine
 from mitsim.study.colour.lit import LitLine, daylit, lit_lines, serving
 from mitsim.study.colour.plots import by_patch, halves
-from mitsim.study.colour.shots import exposed, installed, mosaic_shots, peak_seconds
+from mitsim.study.colour.shots import installed, mosaic_shots
 from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope
-from mitsim.study.exposures import RENDERED
 from mitsim.study.metrics import psnr
 from mitsim.study.paper.measure import verdict
 from mitsim.study.plots import BLUE, FONT, VERMILION, figure_of, label_axes
@@ -39,12 +38,10 @@ from mitsim.study.studio import Studio
 from mitsim.study.table import Table, Value
 
 FAMILIES = ("uniform", "dots:7", "hadamard:8")
-GOAL = 0.5
-"""Most that 49 dots may add to the floor's mean Delta E."""
 OWN, ONE = "one line at a time", "one calibration for all lines"
 DAYLIGHT = {"D65 a tenth as bright as the projector": 0.1, "D65 as bright as the projector": 1.0}
-"""Irradiance of daylight on the chart's middle over that of the projector's white light, which is 2.97 W/m^2: some 60
-and 600 lx (D65 has 205 lm/W from 380 to 780 nm), a dim room and a bright office."""
+"""Irradiance of daylight on the chart's middle over that of the projector's white light: some 60 and 600 lx, a dim room
+and a bright office (:data:`mitsim.study.colour.daylight.FULL_LX`)."""
 _IMAGE = "xyz"
 _SHOWN = "dots:7"
 
@@ -57,12 +54,13 @@ def _points(scope: Scope) -> Sequence[Point]:
         **{way: scope.chosen(FAMILIES, (_SHOWN,)) for way in DAYLIGHT},
         **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in installed()},
     }
-    return [
+    points = [
         Point.of(setup, way=way, patterns=patterns, seed=seed)
         for seed in scope.seeds
         for way, families in seen.items()
         for patterns in families
     ]
+    return points + by_lux.points_of(scope, setup)
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -71,9 +69,11 @@ def _measure(studio: Studio, point: Point) -> Found:
     if way.startswith("mosaic"):
         shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: mosaic_shots(lines, patterns, seed))
         images = np.moveaxis(shots.images(way.removeprefix("mosaic, ")), 0, -1)
-    elif way in DAYLIGHT:
-        light, wavelength = studio.once("daylight", 1, setup, lambda: daylit(setup, studio.folder("daylight")))
-        images = _under_daylight(lines, (DAYLIGHT[way] * light, wavelength), patterns, seed)
+    elif way in (*DAYLIGHT, BY_LUX):
+        light = studio.once("daylight", 1, setup, lambda: daylit(setup, studio.folder("daylight")))
+        if way == BY_LUX:
+            return by_lux.measured(lines, light, point, _place(setup.scene))
+        images = _under_daylight(lines, light, DAYLIGHT[way], patterns, seed)
     else:
         middle = lines[len(lines) // 2]
         factors = [line.factors if way == OWN else serving(line, middle) for line in lines]
@@ -88,22 +88,15 @@ def _solved(line: LitLine, factors: Factors, patterns: str, seed: int) -> FloatA
     return reconstruct(line.lit.light.expose(patterns, seed=line.seed(seed)), factors).image
 
 
-def _under_daylight(lines: Sequence[LitLine], light: tuple[FloatArray, float], patterns: str, seed: int) -> FloatArray:
-    """(n, n, lines) images of frames that a lamp's ``light`` (irradiance and wavelength) shines on, less that light."""
+def _under_daylight(
+    lines: Sequence[LitLine], light: tuple[FloatArray, float], part: float, patterns: str, seed: int
+) -> FloatArray:
+    """(n, n, lines) images of frames beside a ``part`` of a lamp's ``light`` (irradiance and wavelength), less it."""
     images = []
     for line in lines:
-        bench, family = line.lit.bench, line.lit.bench.family(patterns, seed)
-        lamp = electrons_from_irradiance(light[0], 1.0, bench.sensor, light[1])
-        unit = Exposer(bench.rig, 1.0, 0)
-        rates = [unit.electrons(frame) + lamp for frame in line.lit.expected(RENDERED, family)]
-        exposer = Exposer(bench.rig, peak_seconds(bench.sensor, rates), line.seed(seed))
-        names = [("ambient", shot) for shot in range(0 if family.signed else shots_for(family))]
-        dark = [exposer.rate(exposer.digital(lamp * exposer.exposure_s, *name)) for name in names]
-        model = prepare(*line.factors.sides, family.left, family.right, centre=line.factors.manifest.centre)
-        sums = model.accumulator()
-        for measured in exposed(exposer, family, rates, np.mean(dark, axis=0) if dark else 0.0):
-            sums.add(*measured)
-        images.append(model.solve(sums, "auto").image)
+        lit = DaylitLine.of(line, light, patterns, seed)
+        shots = 0 if lit.family.signed else shots_for(lit.family)
+        images += lit.images([(part, seed)], [lit.model], shots)[0]
     return np.stack(images, axis=-1)
 
 
@@ -156,6 +149,7 @@ def _claims(results: Results) -> Sequence[Claim]:
             "", "", f"mean Delta E {mean:.2f}, floor {floor:.2f}", verdict(mean <= floor + GOAL),
         )  # fmt: skip
 
+    beside = table.where(way=BY_LUX)
     own, one = (table.where(way=way, patterns=_SHOWN) for way in (OWN, ONE))
     loss = own.mean("psnr_db").value - one.mean("psnr_db").value
     more = one.mean("delta_e").value - own.mean("delta_e").value
@@ -163,7 +157,8 @@ def _claims(results: Results) -> Sequence[Claim]:
     found = {way: table.where(way=way, patterns=_SHOWN) for way in mosaics}
     *others, joint = (rows.mean("psnr_db").value for rows in found.values())
     return [
-        *(told(way) for way in (OWN, *DAYLIGHT)),
+        told(OWN),
+        *(by_lux.claim_of(beside, patterns) for patterns in beside.distinct("patterns")),
         Claim(
             "Each line needs a calibration of its own (49 dots)", "", "",
             f"one for all: {loss:.1f} dB less, mean Delta E {more:+.2f}", verdict(loss > 0),
@@ -185,6 +180,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     rows = table.where(way=OWN, patterns=_SHOWN).rows
     drawn["chart.png"] = _patches(rows[: len(chart().names)])
     drawn["images.png"] = _images(results)
+    drawn["daylight.png"] = by_lux.figure(table.where(way=BY_LUX))
     return drawn
 
 
@@ -201,7 +197,7 @@ def _by_patch(table: Table) -> Figure:
 def _by_way(table: Table) -> Figure:
     """Mean Delta E of each way to see colour, under 49 dots."""
     rows = table.where(patterns=_SHOWN)
-    ways = rows.distinct("way")
+    ways = [way for way in rows.distinct("way") if way != BY_LUX]
     figure, axes = figure_of(0.42 * len(ways) + 1.0)
     means = [rows.mean("delta_e", way=way).value for way in ways]
     bars = axes.barh(ways, means, color=BLUE)
@@ -265,8 +261,13 @@ def _tables(results: Results) -> Sequence[PageTable]:
         PageTable(
             "Mean Delta E 2000 of 24 patches, and PSNR of all lines, by the way to see colour",
             ("Way", *labels),
-            tuple((str(way), *(cell(way, family) for family in FAMILIES)) for way in table.distinct("way")),
+            tuple(
+                (str(way), *(cell(way, family) for family in FAMILIES))
+                for way in table.distinct("way")
+                if way != BY_LUX
+            ),
         ),
+        *by_lux.tables(table.where(way=BY_LUX)),
         PageTable(
             f"Delta E 2000 of each patch to its spectrum in D65, {OWN}: the floor (no camera), the truth (no noise), "
             "and what is reconstructed",

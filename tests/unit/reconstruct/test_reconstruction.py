@@ -17,6 +17,7 @@ from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHea
 from mitsim.core.recorders import RunMemory, frame_name
 from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, load_run
+from mitsim.reconstruct.asked import METHODS
 from mitsim.reconstruct.cost import Predicted, predicted
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
@@ -61,7 +62,7 @@ def shots(factors: Factors) -> Capture:
     )
 
 
-@pytest.mark.parametrize("method", ["tikhonov", "tv"])
+@pytest.mark.parametrize("method", METHODS)
 def test_memory_and_disk_give_the_same_image(shots: Capture, factors: Factors, tmp_path: Path, method: str) -> None:
     memory = reconstruct(shots, factors, method=method)
     factors.save(tmp_path / "cal")

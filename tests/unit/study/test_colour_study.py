@@ -18,6 +18,7 @@ from mitsim.study.experiment import Point, Results, Scope, Setup
 from mitsim.study.paper import colour
 from mitsim.study.points import batches
 from mitsim.study.table import Table
+from tests.unit.study.test_colour_daylight import rows_of
 
 LINES = (638.0, 520.0, 445.0)
 
@@ -41,7 +42,7 @@ def results(**scales: float) -> Results:
             found = colour._judged(point, LINES, images(scale), images())
             rows += [{**row, "point": point.key} for row in found.rows]
             arrays |= {(point.key, name): array for name, array in found.arrays.items()}
-    return Results(Table(tuple(rows)), arrays)
+    return Results(Table((*rows, *rows_of(2.0, 30.0).rows)), arrays)
 
 
 def test_points_are_of_the_chart_and_share_its_light() -> None:
@@ -63,37 +64,34 @@ def test_an_exact_image_has_the_floors_colours() -> None:
 
 
 def test_verdicts_are_on_what_is_added_to_the_floor() -> None:
-    """Images 2 % too bright are near it, 30 % are not; a scale is what a fitted matrix takes out, but for white."""
+    """Images 2 % too bright are near it, 30 % are not; a scale is what a fitted matrix takes out, but for white. Beside
+    daylight, rows of their own say up to where."""
     mosaics = {"half resolution": 0.9, "joint": 1.01}
     claims = colour._claims(results(own=1.02, one=1.3, dim=1.02, bright=1.3, **mosaics))
-    assert [claim.verdict for claim in claims] == ["confirmed", "confirmed", "not confirmed", "confirmed", "confirmed"]
+    beside = ["confirmed only if D65 has at most 30 lx"] * 2
+    assert [claim.verdict for claim in claims] == ["confirmed", *beside, "confirmed", "confirmed"]
     assert "most PSNR of 2" in claims[4].claim
     swapped = colour._claims(
         results(own=1.3, one=1.01, dim=1.3, bright=1.01, **{"half resolution": 1.01, "joint": 0.9})
     )
-    assert [claim.verdict for claim in swapped] == [
-        "not confirmed",
-        "not confirmed",
-        "confirmed",
-        "not confirmed",
-        "not confirmed",
-    ]
+    assert [claim.verdict for claim in swapped] == ["not confirmed", *beside, "not confirmed", "not confirmed"]
 
 
 def test_every_figure_is_drawn() -> None:
     drawn = colour._figures(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
-    assert set(drawn) == {"delta_e.png", "ways.png", "chart.png", "images.png"}
+    assert set(drawn) == {"delta_e.png", "ways.png", "chart.png", "images.png", "daylight.png"}
 
 
 def test_the_page_has_every_patch() -> None:
     """By patch: floor, truth and three families; images 2 % too bright are off the truth's, which is the floor's."""
-    ways, patches = colour._tables(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
+    ways, ladder, needed, patches = colour._tables(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
     assert patches.headings == ("Patch", "Floor", "Truth", "Uniform", "49 dots", "64 Hadamard")
     assert [row[0] for row in patches.rows] == ["mean of 24", *chart().names]
     assert all(row[1] == row[2] and row[3] == row[4] for row in patches.rows)
     assert patches.rows[0][1] == "4.37" and float(patches.rows[0][4]) != 4.37
     assert ways.rows[0][0] == colour.OWN and ways.rows[-1][1] == "-", "mosaics are not seen under uniform light"
-    assert "dB" in ways.rows[0][2]
+    assert "dB" in ways.rows[0][2] and colour.BY_LUX not in [row[0] for row in ways.rows]
+    assert [len(table.rows) for table in (ladder, needed)] == [3, 2]
 
 
 @pytest.mark.slow
