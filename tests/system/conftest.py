@@ -45,6 +45,9 @@ source = "made for a test"
 """
 PROJECTOR = 'name = "test projector"\neffective_wavelength_nm = 562.0\n'
 MITSIM = Path(sys.executable).with_name("mitsim")
+HANGS_S = 1200
+"""Seconds on the clock after which a program counts as hung: ten times 120, which captures in colour passed while a
+dozen other busy processes shared two processors."""
 _commands = cache(typer.main.get_command)
 """Typer builds all commands anew whenever one is called, for longer than most refusals take."""
 
@@ -118,7 +121,7 @@ def _captured() -> Iterator[tuple[Path, Path]]:
 def shell(*arguments: object, cwd: Path | None = None, **options: Any) -> Outcome:
     """The installed program ``mitsim ARGUMENTS``."""
     done = subprocess.run(
-        [MITSIM, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=120, check=False, **options
+        [MITSIM, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=HANGS_S, check=False, **options
     )
     return Outcome(done.returncode, done.stdout, done.stderr)
 
