@@ -98,7 +98,17 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     assert found["focus_mm"] is None and found["focus_error_mm"] is None
     assert number(found["uncertainty"], 1e-6, 0.1) and all(map(number, found["uncertainty_budget"].values()))
     assert found["misfit"].keys() == {
-        *("chi_square", "unexplained", "worst_tile", "noise_stated", "flagged", "cause", "signatures", "map"),
+        *(
+            "chi_square",
+            "unexplained",
+            "worst_tile",
+            "noise_stated",
+            "flagged",
+            "cause",
+            "signatures",
+            "foretold",
+            "map",
+        ),
     }
     assert number(found["misfit"]["chi_square"], 0.5, 1.2) and found["misfit"]["noise_stated"]
     assert not found["misfit"]["flagged"] and found["misfit"]["cause"] is None

@@ -229,7 +229,7 @@ def test_resume_with_another_version_is_refused(
     from mitsim.core.versions import versions
 
     for package in ("mitsim", "mitsuba", "numpy"):
-        monkeypatch.setattr("mitsim.capture.run.versions", lambda name=package: {**versions(), name: "99.0"})
+        monkeypatch.setattr("mitsim.core.versions.versions", lambda name=package: {**versions(), name: "99.0"})
         line = refused("capture", *lab.rig, "-o", interrupted, "--patterns", PATTERNS, "--resume")
         assert "resume" in line and "another configuration (versions differ)" in line
 

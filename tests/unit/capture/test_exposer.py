@@ -155,4 +155,6 @@ def test_a_session_says_what_factors_do_not_know_of_a_camera() -> None:
     """(Planted: the mask's warnings alone.)"""
     loud = sensor(dead_pixels=0.03, row_noise_e=2.0, linearity=(-0.01,))
     bench = SimpleNamespace(sensor=loud, geometry=SimpleNamespace(mask_plate=None, frame_shape=(10, 10)))
-    assert Session(bench, load_recipe()).warnings == tuple(camera_warnings(loud, (10, 10)))
+    session = Session(bench, load_recipe())  # type: ignore[arg-type]
+    session.__dict__["mask_warnings"] = ("the mask",)
+    assert session.warnings == ("the mask", *camera_warnings(loud, (10, 10)))

@@ -91,7 +91,7 @@ def test_the_most_that_is_kept() -> None:
 
 
 def test_illuminance_that_keeps_a_goal_lies_between_those_measured() -> None:
-    """(Planted: straight over the illuminance; the last kept one; the first below.)"""
+    """Between rungs straight over the logarithm of the illuminance, up to the first that is not kept."""
     by_lux = {lux: Mean(value, 0.1, 3) for lux, value in ((0.0, 1.0), (10.0, 2.0), (1000.0, 4.0))}
     assert kept_lx(by_lux, 3.0) == pytest.approx(100.0) and kept_lx(by_lux, 1.5) == pytest.approx(5.0)
     assert kept_lx(by_lux, 9.0) == 1000.0 and kept_lx(by_lux, 0.5) == 0.0

@@ -331,7 +331,7 @@ def test_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
-    """(Planted: each column as its first cell; a column of words after one of numbers then went right, too.)"""
+    """A column of words after one of numbers does not go right."""
     rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
     part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
     assert part.numeric == (False, True, True, False)

@@ -19,7 +19,7 @@ TIMES, MICRO = "\N{MULTIPLICATION SIGN}", "\N{GREEK SMALL LETTER MU}"
     ],
 )
 def test_numbers_in_a_text_are_printed_and_names_are_left_alone(text: str, printed: str) -> None:
-    """(Planted: a pattern's name taken for a size; 1.0 for 10 to the power of nothing.)"""
+    """No pattern's name is a size, and no number 10 to the power of nothing."""
     assert typeset(text) == printed
 
 
@@ -37,7 +37,7 @@ def test_numbers_in_a_text_are_printed_and_names_are_left_alone(text: str, print
     ],
 )
 def test_a_number_keeps_its_digits(value: float | None, printed: str) -> None:
-    """(Planted: 0.011 beside 0.0108, and 1.23e+03 for 1234.)"""
+    """Not 0.011 beside 0.0108, nor 1.23e+03 for 1234."""
     assert scientific(value) == printed
 
 
@@ -46,5 +46,5 @@ def test_a_number_keeps_its_digits(value: float | None, printed: str) -> None:
     [(0.66877, 0.00088, "0.66877"), (-3.8364e-4, 0.0012, "-0.0004"), (128_314.0, 880.0, "128310"), (1.5, 0.0, "1.5")],
 )
 def test_a_measured_number_ends_where_its_error_does(value: float, error: float, printed: str) -> None:
-    """(Planted: five digits of a number whose first one is not known.)"""
+    """No digits of a number whose first one is not known."""
     assert rounded(value, error) == printed
