@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +19,10 @@ from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.optics.frames import Frame
+from mitsim.reconstruct.perturbation import Expected, Noise
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import load_recipe
-from mitsim.study.budget import LossRow, gained, session_rendering
+from mitsim.study.budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gained, session_rendering
 from mitsim.study.calibration import CalibrationFindings, _row, judged, measure, singular_rows, spent
 from mitsim.study.page import build_findings
 from tests.unit.capture.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
@@ -135,6 +138,17 @@ def test_a_part_of_the_error_gains_what_is_left_without_it() -> None:
     assert gained(1.0, 4.0, 8.0) == pytest.approx((0.5799, 0.5799), abs=1e-4)
     assert gained(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
     assert gained(0.0, 4.0, 0.0) == (0.0, 0.0) and gained(4.0, 4.0, 4.0)[0] == pytest.approx(90)
+
+
+def test_what_lambda_takes_of_a_scene_is_a_loss_of_the_solvers() -> None:
+    """Nine tenths of the scene are left without noise: a hundredth of its square is lambda's, and nothing the light's.
+    (Planted: lambda's part left out; all of it told as the rest of the light.)"""
+    scene = np.random.default_rng(9).random((7, 7))
+    solver = SimpleNamespace(expected=lambda light: Expected(0.9 * light), variance=lambda *_: 0.0)
+    scatter: Any = SimpleNamespace(solver=solver, scene=scene, common=lambda *_: 0.0, deviation=lambda *_: 0.0)
+    found = _of_scene(scatter, {"": 0.9 * scene}, Noise())
+    assert found[SOLVER, LAMBDA].square == pytest.approx(0.01 * float(np.square(scene).mean()))
+    assert found[SCENE, REST].square == pytest.approx(0, abs=1e-12)
 
 
 def test_noise_by_source_is_all_noise() -> None:
