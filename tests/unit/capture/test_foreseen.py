@@ -30,7 +30,12 @@ def exposed(lit: LitSession) -> list[Estimate]:
 
 
 @pytest.mark.parametrize(
-    ("mode", "n", "repeats"), [("pair", 7, 1), ("uniform", 8, 1), pytest.param("pair", 4, 3, marks=pytest.mark.slow)]
+    ("mode", "n", "repeats"),
+    [
+        pytest.param("pair", 7, 1, marks=pytest.mark.slow),
+        ("uniform", 8, 1),
+        pytest.param("pair", 4, 3, marks=pytest.mark.slow),
+    ],
 )
 def test_drawn_noise_is_that_of_exposed_frames_number_by_number(mode: str, n: int, repeats: int) -> None:
     """The mean squared error of a row of a factor, and of a column, by 120 sessions and by 480 draws.

@@ -228,7 +228,7 @@ def test_without_names_each_effect_once(bench: Bench) -> None:
 THICK = '<float name="mask_thickness" value="0.3"/>'
 
 
-@pytest.mark.parametrize("lacking", ["thick mask", "lens and blur"])
+@pytest.mark.parametrize("lacking", [pytest.param("thick mask", marks=pytest.mark.slow), "lens and blur"])
 def test_the_judge_of_the_reference_has_what_the_registry_says(
     shared_scene: Callable[..., Path], variant: str, tmp_path: Path, lacking: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -195,8 +195,8 @@ def test_sampled_light_of_a_session_multiplies_columns_of_its_factors() -> None:
 @pytest.mark.parametrize(
     ("camera", "largest"),
     [({"prnu_pixel": 0.08, "prnu_row": 0.02, "prnu_column": 0.02}, "response nonuniformity"),
-     ({"dsnu_pixel_e": 400.0, "dsnu_row_e": 100.0, "dark_current_spread_e_per_s": 5.0, "dark_current_e_per_s": 10.0},
-      "offset nonuniformity")],
+     pytest.param({"dsnu_pixel_e": 400.0, "dsnu_row_e": 100.0, "dark_current_spread_e_per_s": 5.0,
+                   "dark_current_e_per_s": 10.0}, "offset nonuniformity", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_all_sources_together_are_what_the_image_is_off(
     camera: dict[str, float], largest: str, small_scene: Callable[..., Path], tmp_path: Path, variant: str

@@ -59,9 +59,9 @@ SCENES = {
     "shiny wall": WALL.format(turn=90, x=-30, bsdf=SHINY) + WALL.format(turn=-60, x=40, bsdf=matt(0.0, 0.9, 0.3)),
     "bent wall": OBJECT + WALL.format(turn=-60, x=40, bsdf=matt(0.9, 0.2, 0.5)),
 }
-QUICK = ("coloured sphere", "shiny wall")
-"""Of both ways to tell what surfaces turn: the sphere by cosines alone, and a glossy wall, whose material is asked for
-each pair, beside one that is black in a line."""
+QUICK = ("coloured sphere",)
+"""What surfaces turn is told by cosines alone there; a glossy wall's material is asked for each pair, and the matt one
+beside it is black in a line."""
 
 
 def by_line(light: Deposits) -> list[list[float]]:
