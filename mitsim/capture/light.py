@@ -367,10 +367,7 @@ def trace_lines(
     groups = [_Group(simulation, labels, stream, len(benches)) for stream in streams]
     rounds = first_round(simulation)
     while True:
-        with Behind(_filed) as filing:
-            for group in groups:
-                group.sample(rounds, filing)
-            filing.wait()
+        _trace(groups, samples_of(simulation, rounds))
         lights, most, near = list[Light](), 0.0, 1.0
         looks = [_looked(_line_of(groups, line, each, plan, seed), lighting, followed) for line, each in enumerate(own)]
         more = sampling.excess([light for light, _ in looks]) if sampling.excess else 1.0
@@ -411,10 +408,7 @@ def traced_again(light: Light, simulation: Simulation, purpose: str = "scene") -
     """
     streams = [integer(light.seed, "transport", purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, light.labels, stream) for stream in streams]
-    with Behind(_filed) as filing:
-        for group in groups:
-            group.trace(light.samples, filing)
-        filing.wait()
+    _trace(groups, light.samples)
     flux = np.mean([group.flux() for group in groups], axis=0)
     return replace(light, groups=tuple(group.light() for group in groups), simulation=simulation, flux=flux)
 
@@ -512,9 +506,12 @@ Filing = Callable[[], None]
 """Adds light of one line to what a group has."""
 
 
-def _filed(filing: Filing) -> None:
-    """Do it."""
-    filing()
+def _trace(groups: Sequence[_Group], wanted: Mapping[str, int]) -> None:
+    """Trace until every group has so many samples as are ``wanted`` of each stage by its name, and file all of it."""
+    with Behind[Filing](lambda file: file()) as filing:
+        for group in groups:
+            group.trace(wanted, filing)
+        filing.wait()
 
 
 class _Group:
@@ -527,18 +524,6 @@ class _Group:
         self.paths = 0
         self._sums: list[dict[str, FiledLight]] = [{} for _ in range(lines)]
         self._flux = [{name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")} for _ in range(lines)]
-
-    def sample(self, rounds: float, filing: Behind[Filing]) -> None:
-        """Trace until this many times the samples that the plan predicted are done.
-
-        Parameters
-        ----------
-        rounds
-            times.
-        filing
-            as for :meth:`trace`.
-        """
-        self.trace(samples_of(self.simulation, rounds), filing)
 
     def trace(self, wanted: Mapping[str, int], filing: Behind[Filing]) -> None:
         """Trace until so many samples as are ``wanted`` of each stage by its name are done.

@@ -7,6 +7,8 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 """Real numbers in double precision."""
+SeparableTerm = tuple[FloatArray, FloatArray]
+"""Left (m, n) and right (m', n') of one of the products that an operator from scene pixels to a sensor is a sum of."""
 Labels = npt.NDArray[np.int64]
 """Index of the class or row that each item belongs to."""
 

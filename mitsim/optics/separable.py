@@ -13,11 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.optics.shadow import SeparableTerms
 
-Pair = tuple[FloatArray, FloatArray]
-"""A separable term."""
 _LEFT_OUT = 0.03
 """Part of what factors lack that its terms may leave out, rms: a thousandth of an energy. Two or three terms hold the
 rest of FlatCam's masks and of MURA in three lines."""
@@ -98,7 +96,7 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
     return Lacking([split(number) for number in range(count)], float(beyond[0] / np.sqrt(_energy(whole))))
 
 
-def _of_stripes(terms: SeparableTerms) -> Pair:
+def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
     """The factors that stripes give of an operator (:mod:`mitsim.reconstruct.calibration`): with its uniform response
     sum_k (L_k 1) (R_k 1)^T split into a v^T, stripes h 1^T into u v^T with u = sum_k L_k h <R_k 1, v> / |v|^2, so the
     left factor is the sum of L_k with these weights; and the right one likewise."""
@@ -110,14 +108,14 @@ def _of_stripes(terms: SeparableTerms) -> Pair:
     )
 
 
-def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], Pair]]:
+def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], SeparableTerm]]:
     """Singular values of an operator, and what gives the term (of factors of equal norm) of the one of a number."""
     (left, small_left), (right, small_right) = (
         np.linalg.qr(np.stack([np.ravel(pair[side]) for pair in terms], axis=1)) for side in (0, 1)
     )
     turn_left, values, turn_right = np.linalg.svd(small_left @ small_right.T)
 
-    def split(number: int) -> Pair:
+    def split(number: int) -> SeparableTerm:
         root = np.sqrt(values[number])
         return (
             (root * left @ turn_left[:, number]).reshape(terms[0][0].shape),

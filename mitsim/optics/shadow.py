@@ -32,14 +32,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.arrays import ByValue, FloatArray, SeparableTerm
 from mitsim.core.errors import MitsimError
 from mitsim.optics.profile import Steps
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import Mask
 from mitsim.rig.plate import Plate
 
-SeparableTerms = list[tuple[FloatArray, FloatArray]]
+SeparableTerms = list[SeparableTerm]
 EVEN = ((0.0, 0.0), (0.0, 0.0))
 """The tilt of a mask that has none."""
 Places = tuple[tuple[int, ...], tuple[int, ...]]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.framefile import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
@@ -26,8 +26,6 @@ from mitsim.rig.patterns import PatternFamily, parse_patterns
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
 
-Pair = tuple[FloatArray, FloatArray]
-"""A separable term: left (m, n) and right (m', n')."""
 _LACKING = "lacking"
 """What channels of a factor's file begin with that hold terms which it lacks; their number follows."""
 _LIGHT = ("projector.lines_nm", "projector.radiant_shares")
@@ -62,10 +60,10 @@ class Factors:
     status: Status
     name: str = "in memory"
     estimate: Estimate | None = None
-    lacking: tuple[Pair, ...] = ()
+    lacking: tuple[SeparableTerm, ...] = ()
 
     @classmethod
-    def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[Pair] = ()) -> Factors:
+    def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
         """The factors of an estimate.
 
         Parameters

@@ -17,9 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.reconstruct.detail import Model
-from mitsim.reconstruct.factors import Pair
 from mitsim.reconstruct.sides import Side
 
 
@@ -28,7 +27,7 @@ class Lack:
     """What ``terms`` beside a ``model``'s factors, centred as these are, do to its ``image`` (n, n'); one or more."""
 
     model: Model
-    terms: tuple[Pair, ...]
+    terms: tuple[SeparableTerm, ...]
     image: FloatArray
 
     @property
