@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.capture.bench import Bench
@@ -25,7 +24,7 @@ from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.projector import Spectrum
 from mitsim.transport.cells import CellGrid, aligned_grid
 from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
-from mitsim.transport.ledger import Ledger
+from mitsim.transport.ledger import Ledger, LitSums
 
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which
@@ -306,12 +305,12 @@ class Trays:
         smooth = self.smooth.file(deposits.where(indirect), labels, samples)
         return self._light(deposits, samples, fine=fine, smooth=smooth)
 
-    def file_smooth(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
+    def file_smooth(self, ledger: Ledger, counted: LitSums) -> FiledLight:
         """Light in a ``ledger`` of :meth:`smooth_ledgers`, from what it ``counted``."""
         smooth, received, outside = ledger.filed(counted)
         return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
 
-    def file_anchors(self, ledger: Ledger, counted: npt.NDArray[np.uint64]) -> FiledLight:
+    def file_anchors(self, ledger: Ledger, counted: LitSums) -> FiledLight:
         """Light in a ``ledger`` of :meth:`anchors_ledgers` beyond its mean, from what it ``counted``."""
         light, *_ = ledger.filed(counted)
         return self._light(None, 1, followed=self._less_mean(self.followed.bundle, light))

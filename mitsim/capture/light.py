@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
@@ -27,7 +26,7 @@ from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.transport.histogram import Deposits
-from mitsim.transport.ledger import Ledger
+from mitsim.transport.ledger import Ledger, LitSums
 
 if TYPE_CHECKING:
     from mitsim.core.job import Job
@@ -557,7 +556,7 @@ class _Group:
             self._flux[line][name] += self.simulation.flux(deposits, 1)
         self._add(name, stage.file(deposits, self.labels, 1), line)
 
-    def _file_ledger(self, name: str, stage: Stage, ledger: Ledger, counted: npt.NDArray[np.uint64], line: int) -> None:
+    def _file_ledger(self, name: str, stage: Stage, ledger: Ledger, counted: LitSums, line: int) -> None:
         """Add light of a stage and a line that its ledger ``counted``."""
         assert stage.file_ledger is not None
         self._add(name, stage.file_ledger(ledger, counted), line)

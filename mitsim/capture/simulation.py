@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from mitsim.capture.effects import Physics
 from mitsim.capture.filing import FiledLight, Trays
@@ -25,7 +24,7 @@ from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.lamps import Counted, LampTracer, Together
-from mitsim.transport.ledger import Ledger
+from mitsim.transport.ledger import Ledger, LitSums
 from mitsim.transport.neighbours import NeighbourTracer
 from mitsim.transport.receiver import SensorPoints
 
@@ -49,7 +48,7 @@ class Stage:
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
     ledgers: Callable[[Labels, int], tuple[Ledger, ...]] = lambda labels, lines: ()
-    file_ledger: Callable[[Ledger, npt.NDArray[np.uint64]], FiledLight] | None = None
+    file_ledger: Callable[[Ledger, LitSums], FiledLight] | None = None
 
     def trace(self, seed: int, first: int, samples: int, ledgers: Sequence[Ledger] = ()) -> Deposits:
         """Light of some samples, but for what is filed in the ``ledgers``.

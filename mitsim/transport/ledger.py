@@ -30,6 +30,10 @@ _MOST_BITS = 52
 A place would hold 4096 such paths."""
 
 
+LitSums = tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint64]]
+"""Increasing numbers of the sums that are not zero, and these: of corner, a tenth of its ledger's memory."""
+
+
 class Ledger:
     """Sums of light by row and place.
 
@@ -120,26 +124,30 @@ class Ledger:
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
-    def fetched(self) -> npt.NDArray[np.uint64]:
-        """The sums so far, on the host."""
-        return np.array(self.sums)
+    def fetched(self) -> LitSums:
+        """The sums so far, on the host; the ledger is empty then."""
+        lit = dr.compress(self.sums != 0)
+        units = dr.gather(mi.UInt64, self.sums, lit)
+        dr.eval(lit, units)
+        self.sums = dr.zeros(mi.UInt64, len(self.sums))
+        return np.array(lit), np.array(units)
 
-    def filed(self, counted: npt.NDArray[np.uint64] | None = None) -> tuple[sparse.csr_array, float, float]:
+    def filed(self, counted: LitSums | None = None) -> tuple[sparse.csr_array, float, float]:
         """(rows + lamps, places) light of sums that were ``counted``, the last rows empty; all that was received, and
         what lay outside [W m^-2].
 
         MitsimError where light is NaN, infinite, or four million times ``one``.
         """
-        counted = self.fetched() if counted is None else counted
-        if counted[-1]:
+        lit, units = self.fetched() if counted is None else counted
+        if len(lit) and lit[-1] == self._rows * self._width:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        lit = np.flatnonzero(counted[:-1])
-        light = counted[lit] * self._unit
+        light = units * self._unit
         # What lay outside has the last place. All places fit 32 bits, in which matrices take half the time.
-        inside = int(np.searchsorted(lit, self._bundle.size * self._rows))
-        places, row = np.divmod(lit[:inside].astype(np.int32), np.int32(self._rows))
+        inside = int(np.searchsorted(lit, np.uint32(self._bundle.size * self._rows)))
+        places = (lit[:inside] // np.uint32(self._rows)).astype(np.int32)
+        row = lit[:inside].astype(np.int32) - places * np.int32(self._rows)
         starts = np.append(0, np.cumsum(np.bincount(places, minlength=self._bundle.size))).astype(np.int32)
         shape = self._rows + self._bundle.lamps, self._bundle.size
         filed = sparse.csc_array((light[:inside], row, starts), shape=shape).tocsr()
