@@ -90,7 +90,7 @@ def traced(stage: Stage, labels: np.ndarray, seed: int, samples: int, device: bo
     ledgers = stage.ledgers(labels, 1) if device else ()
     light = stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
     for ledger in ledgers if stage.file_ledger else ():
-        light = light + stage.file_ledger(ledger, ledger.fetched()) / samples
+        light = light + stage.file_ledger(ledger, ledger.fetched(), samples)
     dr.sync_thread()
     return light
 

@@ -305,14 +305,26 @@ class Trays:
         smooth = self.smooth.file(deposits.where(indirect), labels, samples)
         return self._light(deposits, samples, fine=fine, smooth=smooth)
 
-    def file_smooth(self, ledger: Ledger, counted: LitSums) -> FiledLight:
-        """Light in a ``ledger`` of :meth:`smooth_ledgers`, from what it ``counted``."""
-        smooth, received, outside = ledger.filed(counted)
+    def file_smooth(self, ledger: Ledger, counted: LitSums, samples: int) -> FiledLight:
+        """Light in a ledger of :meth:`smooth_ledgers`, per sample.
+
+        Parameters
+        ----------
+        ledger, counted, samples
+            as for :meth:`mitsim.transport.ledger.Ledger.filed`.
+        """
+        smooth, received, outside = ledger.filed(counted, samples)
         return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
 
-    def file_anchors(self, ledger: Ledger, counted: LitSums) -> FiledLight:
-        """Light in a ``ledger`` of :meth:`anchors_ledgers` beyond its mean, from what it ``counted``."""
-        light, *_ = ledger.filed(counted)
+    def file_anchors(self, ledger: Ledger, counted: LitSums, samples: int) -> FiledLight:
+        """Light in a ledger of :meth:`anchors_ledgers` beyond its mean, per sample.
+
+        Parameters
+        ----------
+        ledger, counted, samples
+            as for :meth:`mitsim.transport.ledger.Ledger.filed`.
+        """
+        light, *_ = ledger.filed(counted, samples)
         return self._light(None, 1, followed=self._less_mean(self.followed.bundle, light))
 
     def file_sharp(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:

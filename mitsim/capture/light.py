@@ -514,14 +514,14 @@ def _trace(groups: Sequence[_Group], wanted: Mapping[str, int]) -> None:
 
 
 class _Group:
-    """One independent estimate of the light, by line: the sum over its samples so far."""
+    """One independent estimate of the light, by line and stage: the mean over its samples so far."""
 
     def __init__(self, simulation: Simulation, labels: Labels, seed: int, lines: int = 1) -> None:
         self.simulation, self.labels = simulation, labels
         self.seed, self._lines = seed, lines
         self.done: dict[str, int] = {}
         self.paths = 0
-        self._sums: list[dict[str, FiledLight]] = [{} for _ in range(lines)]
+        self._means: list[dict[str, FiledLight]] = [{} for _ in range(lines)]
         self._flux = [{name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")} for _ in range(lines)]
 
     def trace(self, wanted: Mapping[str, int], filing: Behind[Filing]) -> None:
@@ -536,43 +536,53 @@ class _Group:
             paths. All is there when it has been waited for.
         """
         for name, stage in self.simulation.tracers().items():
-            seed = integer(self.seed, stage.stream)
-            more = self.done.get(name, 0) < wanted.get(name, 0)
-            ledgers = stage.ledgers(self.labels, self._lines) if more else ()
-            while (done := self.done.get(name, 0)) < wanted.get(name, 0):
-                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), wanted[name] - done)
+            samples = wanted.get(name, 0)
+            if self.done.get(name, 0) >= samples:
+                continue
+            seed, ledgers = integer(self.seed, stage.stream), stage.ledgers(self.labels, self._lines)
+            if name in self.done:
+                filing.wait()
+                self._spread(name, samples / self.done[name])
+            while (done := self.done.get(name, 0)) < samples:
+                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), samples - done)
                 deposits = stage.trace(seed, done, count, ledgers)
                 lights = enumerate(deposits.by_line(self._lines))
-                filing.give([partial(self._file, name, stage, light, line) for line, light in lights])
+                filing.give([partial(self._file, name, stage, light, line, samples) for line, light in lights])
                 self.done[name] = done + count
                 self.paths += count * stage.tracer.lanes
             if ledgers:
-                held = [(ledger, ledger.fetched()) for ledger in ledgers]
-                filing.give([partial(self._file_ledger, name, stage, *each, line) for line, each in enumerate(held)])
+                held = enumerate([(ledger, ledger.fetched(), samples) for ledger in ledgers])
+                filing.give([partial(self._file_ledger, name, stage, each, line) for line, each in held])
 
-    def _file(self, name: str, stage: Stage, deposits: Deposits, line: int) -> None:
+    def _spread(self, name: str, growth: float) -> None:
+        """Make the light of a stage the mean over so many times the samples, of which no others are filed yet."""
+        for means, fluxes in zip(self._means, self._flux, strict=True):
+            means[name] /= growth
+            if name in fluxes:
+                fluxes[name] /= growth
+
+    def _file(self, name: str, stage: Stage, deposits: Deposits, line: int, samples: int) -> None:
         """Add light of a stage and a line, and the flux of each pixel where it is direct light."""
         if name in self._flux[line]:
-            self._flux[line][name] += self.simulation.flux(deposits, 1)
-        self._add(name, stage.file(deposits, self.labels, 1), line)
+            self._flux[line][name] += self.simulation.flux(deposits, samples)
+        self._add(name, stage.file(deposits, self.labels, samples), line)
 
-    def _file_ledger(self, name: str, stage: Stage, ledger: Ledger, counted: LitSums, line: int) -> None:
-        """Add light of a stage and a line that its ledger ``counted``."""
+    def _file_ledger(self, name: str, stage: Stage, held: tuple[Ledger, LitSums, int], line: int) -> None:
+        """Add light of a stage and a line that its ledger ``held``, of so many samples."""
         assert stage.file_ledger is not None
-        self._add(name, stage.file_ledger(ledger, counted), line)
+        self._add(name, stage.file_ledger(*held), line)
 
     def _add(self, name: str, light: FiledLight, line: int) -> None:
-        sums = self._sums[line]
-        sums[name] = sums[name] + light if name in sums else light
+        means = self._means[line]
+        means[name] = means[name] + light if name in means else light
 
     def light(self, line: int = 0) -> FiledLight:
         """Mean over the samples, of a ``line``."""
-        return reduce(add, (light / self.done[name] for name, light in self._sums[line].items()))
+        return reduce(add, self._means[line].values())
 
     def flux(self, line: int = 0) -> FloatArray:
         """(n^2,) mean over the samples, of a ``line``."""
-        fluxes = self._flux[line]
-        return np.asarray(sum(fluxes[name] / done for name, done in self.done.items() if name in fluxes))
+        return np.asarray(sum(self._flux[line].values()))
 
 
 def pinhole_view(bench: Bench, board_reflectance: float, seed: int) -> FloatArray:

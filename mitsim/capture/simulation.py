@@ -39,8 +39,8 @@ class Stage:
     """A tracer, the samples of it that the plan predicted, how its light is filed, and its random stream's name.
 
     ``file`` takes deposits, labels and the number of samples. ``ledgers`` makes, from labels and a number of lines,
-    what indirect light of each line is filed in on the device, where that has room, and ``file_ledger`` takes one and
-    its sums on the host; none for other light.
+    what indirect light of each line is filed in on the device, where that has room, and ``file_ledger`` takes one,
+    its sums on the host and the number of samples; none for other light.
     """
 
     tracer: DirectTracer | IndirectTracer | FromCamera
@@ -48,7 +48,7 @@ class Stage:
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
     ledgers: Callable[[Labels, int], tuple[Ledger, ...]] = lambda labels, lines: ()
-    file_ledger: Callable[[Ledger, LitSums], FiledLight] | None = None
+    file_ledger: Callable[[Ledger, LitSums, int], FiledLight] | None = None
 
     def trace(self, seed: int, first: int, samples: int, ledgers: Sequence[Ledger] = ()) -> Deposits:
         """Light of some samples, but for what is filed in the ``ledgers``.

@@ -132,18 +132,28 @@ class Ledger:
         self.sums = dr.zeros(mi.UInt64, len(self.sums))
         return np.array(lit), np.array(units)
 
-    def filed(self, counted: LitSums | None = None) -> tuple[sparse.csr_array, float, float]:
-        """(rows + lamps, places) light of sums that were ``counted``, the last rows empty; all that was received, and
-        what lay outside [W m^-2].
+    def filed(self, counted: LitSums | None = None, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
+        """(rows + lamps, places) light per sample, the last rows empty; all that was received, and what lay outside
+        [W m^-2].
 
-        MitsimError where light is NaN, infinite, or four million times ``one``.
+        Parameters
+        ----------
+        counted
+            sums that were fetched; None: those that are there.
+        samples
+            that they are of.
+
+        Raises
+        ------
+        MitsimError
+            where light is NaN, infinite, or four million times ``one``.
         """
         lit, units = self.fetched() if counted is None else counted
         if len(lit) and lit[-1] == self._rows * self._width:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        light = units * self._unit
+        light = units * (self._unit / samples)
         # What lay outside has the last place. All places fit 32 bits, in which matrices take half the time.
         inside = int(np.searchsorted(lit, np.uint32(self._bundle.size * self._rows)))
         places = (lit[:inside] // np.uint32(self._rows)).astype(np.int32)
