@@ -19,24 +19,31 @@ USERS = ("mitsim.capture.run", "mitsim.capture.session", "mitsim.capture.render"
 _kept: dict[str, Any] = {}
 
 
-def question(bench: Any, lighting: Any, accuracy: float, seed: int, switches: Mapping[str, bool]) -> str:
+def question(bench: Any, lighting: Any, accuracy: float, seed: int, switches: Mapping[str, bool], lines: int) -> str:
     """A digest of all that decides a plan: what is seen, by which rig, in which light, and how well."""
     from mitsim.core.framefile import checksum
 
     files = sorted(checksum(path) for path in bench.loaded.files)
     light = lighting.labels.tobytes(), lighting.weights.tobytes(), lighting.weights.shape
     seen = str(bench.loaded.scene), files, bench.variant, repr(bench.rig)
-    return hashlib.sha256(repr((seen, light, accuracy, seed, sorted(switches.items()))).encode()).hexdigest()
+    return hashlib.sha256(repr((seen, light, accuracy, seed, sorted(switches.items()), lines)).encode()).hexdigest()
 
 
 def keeping(make_plan: Callable[..., Any]) -> Callable[..., Any]:
     """``make_plan`` that answers the same question from memory."""
 
     @wraps(make_plan)
-    def kept(bench: Any, lighting: Any, accuracy: float, seed: int, switches: Mapping[str, bool] | None = None) -> Any:
-        asked = question(bench, lighting, accuracy, seed, switches or {})
+    def kept(
+        bench: Any,
+        lighting: Any,
+        accuracy: float,
+        seed: int,
+        switches: Mapping[str, bool] | None = None,
+        lines: int = 1,
+    ) -> Any:
+        asked = question(bench, lighting, accuracy, seed, switches or {}, lines)
         if asked not in _kept:
-            _kept[asked] = make_plan(bench, lighting, accuracy, seed, switches)
+            _kept[asked] = make_plan(bench, lighting, accuracy, seed, switches, lines)
         return _kept[asked]
 
     return kept

@@ -26,6 +26,7 @@ import numpy as np
 from mitsim.capture.colour import ColourBench, line_alone, plan_lines
 from mitsim.capture.evidence import Settings
 from mitsim.capture.plan import ColourCandidate, ColourChoice, Plan
+from mitsim.capture.prices import traced_for
 from mitsim.capture.request import check_untimed
 from mitsim.capture.run import plan_request
 from mitsim.capture.simulation import Simulation
@@ -46,9 +47,6 @@ _NONE = 1e-6
 """Difference that single precision may leave of none (photograph: 3e-8)."""
 _PART = 0.5
 """Part of the accuracy that colours may take: the rest of the frames then keeps 0.87 of it, at a third more paths."""
-_FILED = 0.2
-"""What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
-photograph, benchmarks/colour.py)."""
 _ONCE, _TRACED = ("start", "plan"), ("transport", "truth")
 """Stages of a prediction that lines share, and those in which they share paths; of the others each has its own."""
 
@@ -111,7 +109,8 @@ def choose_colour(bench: Bench, request: Request) -> Coloured:
         plan = plan_lines(ColourBench.of(own, RUN), left)
     plan = plan.taking(plan=plan.predicted["plan"] + looked)
     candidates = tuple(
-        ColourCandidate(name, error, _seconds(plan.predicted, runs[name])) for name, error in errors.items()
+        ColourCandidate(name, error, _seconds(plan.predicted, runs[chosen], runs[name]))
+        for name, error in errors.items()
     )
     return Coloured(_told(plan, ColourChoice(chosen, candidates), request), own)
 
@@ -129,11 +128,20 @@ def _in_greys(bench: Bench) -> bool:
     return not bench.loaded.coloured and bench.sensor.quantum_efficiency_curve is None
 
 
-def _seconds(predicted: Mapping[str, float], runs: int) -> float:
-    """Seconds of so many ``runs``, from those of one that were ``predicted`` by stage."""
+def _seconds(predicted: Mapping[str, float], runs: int, others: int) -> float:
+    """Seconds of so many other runs, from those of some.
+
+    Parameters
+    ----------
+    predicted
+        seconds by stage.
+    runs, others
+        that they are of, and that are asked for.
+    """
     shared = sum(predicted.get(stage, 0.0) for stage in _ONCE)
     traced = sum(predicted.get(stage, 0.0) for stage in _TRACED)
-    return shared + (1 + _FILED * (runs - 1)) * traced + runs * (sum(predicted.values()) - shared - traced)
+    own = sum(predicted.values()) - shared - traced
+    return shared + traced_for(others) / traced_for(runs) * traced + others / runs * own
 
 
 def _told(plan: Plan, choice: ColourChoice, request: Request) -> Plan:

@@ -41,8 +41,10 @@ from mitsim.capture.prices import (
     connections,
     efforts,
     entries,
+    filing_seconds,
     optics_seconds,
     priced,
+    traced_for,
     truth_seconds,
 )
 from mitsim.core.arrays import FloatArray
@@ -393,8 +395,9 @@ class _Table:
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:
         """(m,) work of one sample in every group, by kind of light."""
+        lines = traced_for(self.evidence.forming.lines)
         return {
-            name: GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.numbers)
+            name: lines * GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.numbers)
             for name, effort in efforts(self.evidence, self.effects).items()
         }
 
@@ -443,7 +446,7 @@ class _Table:
         """(m,) seconds at fixed paces."""
         tracing = sum(self.samples[name] * price for name, price in self._prices.items())
         forming = self.evidence.forming
-        filing = FIXED.filed * GROUPS * self._entries
+        filing = filing_seconds(forming, self.numbers, self._entries, FIXED)
         shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
         return np.asarray(tracing + filing + shown)
 

@@ -177,10 +177,11 @@ def plan_lines(colours: ColourBench, request: Request) -> Plan:
     check_untimed(request.seconds)
     lighting = colours.whole.family(request.patterns, request.seed).lighting
     roughest = colours.lit_by_lamps(request.effects, request.seed).roughest(request.seed, _lit(lighting))
-    plan = plan_request(roughest, request)
+    lines = len(colours.manifest.channels)
+    plan = plan_request(roughest, request, lines)
     if roughest.lamplight is not None and "ambient" not in plan.settings.effects:
         # Beside a weaker line lamps may count.
-        plan = plan_request(roughest, request.changed(effects={**request.effects, "ambient": True}))
+        plan = plan_request(roughest, request.changed(effects={**request.effects, "ambient": True}), lines)
     return plan
 
 

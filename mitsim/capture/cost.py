@@ -10,7 +10,7 @@ from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
 from mitsim.capture.exposer import frames_at_once
 from mitsim.capture.prices import Numbers, entries
 from mitsim.capture.rasters import raster_bytes
-from mitsim.core.resources import Cost
+from mitsim.core.resources import Cost, workers
 from mitsim.optics.frames import PROBES, frames_in_memory
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.plate import FEW
@@ -58,7 +58,7 @@ def frames_bytes(classes: int, shots: int, pixels: float) -> float:
 
 
 def frames_cost(
-    bench: Bench, settings: Settings, lighting: Lighting, seconds: float = 0.0, on_disk: float = 0.0
+    bench: Bench, settings: Settings, lighting: Lighting, seconds: float = 0.0, on_disk: float = 0.0, lines: int = 1
 ) -> Cost:
     """Memory, disk and time of a capture.
 
@@ -74,21 +74,22 @@ def frames_cost(
         that it takes.
     on_disk
         bytes of frames that are there already.
+    lines
+        whose light is traced together; their frames are formed one line after another.
     """
     shots, classes = lighting.weights.shape
     rows, pixels = bench.geometry.frame_shape[0], math.prod(bench.geometry.frame_shape)
-    lines = 1 if bench.lines is None else len(bench.lines.shares)
     files = shots * (_BYTES_PER_PIXEL * pixels + _BYTES_PER_ROW * rows + _HEADER_BYTES)
     truth = float(_BYTES_PER_PIXEL * bench.n**2 + _BYTES_PER_ROW * bench.n + _HEADER_BYTES)
     return Cost(
         seconds=seconds,
-        memory_bytes=lines
-        * (light_bytes(bench, classes, settings) + frames_bytes(classes, shots, bench.geometry.frame_side)),
-        disk_bytes=max(files + truth - on_disk, 0.0),
+        memory_bytes=light_bytes(bench, classes, settings, lines)
+        + frames_bytes(classes, shots, bench.geometry.frame_side),
+        disk_bytes=max(lines * (files + truth) - on_disk, 0.0),
     )
 
 
-def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
+def light_bytes(bench: Bench, classes: int, settings: Settings, lines: int = 1) -> float:
     """Memory of tracing light, and of filing it.
 
     Parameters
@@ -97,6 +98,8 @@ def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
         what is simulated.
     classes
         of projector pixels, that light is filed by.
+    lines
+        that share the paths: the light of each is held.
     """
     filed = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
     paths = min(LANES_AT_ONCE, _paths(bench.n**2, settings))
@@ -109,7 +112,8 @@ def light_bytes(bench: Bench, classes: int, settings: Settings) -> float:
             0.0 if settings.raster else factors,
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells})),
         )
-    return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + GROUPS * filed * _ENTRY_BYTES + paths * _DEPOSIT_BYTES
+    held = lines * GROUPS * filed * _ENTRY_BYTES + min(lines, workers()) * paths * _DEPOSIT_BYTES
+    return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + held
 
 
 def _paths(pixels: int, settings: Settings) -> float:

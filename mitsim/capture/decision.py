@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from mitsim.capture.choice import Choice, cheapest, predicted
 from mitsim.capture.effects import EFFECTS, Effect
-from mitsim.capture.evidence import GROUPS, Estimate, Evidence, Settings
+from mitsim.capture.evidence import Estimate, Evidence, Settings
 from mitsim.capture.losses import known_losses
 from mitsim.capture.plan import Plan, PlanRow, State
 from mitsim.capture.prices import (
@@ -22,6 +22,7 @@ from mitsim.capture.prices import (
     Paces,
     checking_seconds,
     entries,
+    filing_seconds,
     optics_seconds,
     paces_of,
     priced,
@@ -150,10 +151,10 @@ def _stages(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, f
     """Seconds of transport, truth and optics."""
     forming, numbers = evidence.forming, Numbers.of(settings)
     tracing = tracing_seconds(evidence, settings, paces)
-    filed = GROUPS * entries(evidence.direct.paths, forming.classes, numbers, settings)
+    filed = entries(evidence.direct.paths, forming.classes, numbers, settings)
     return {
         "transport": sum(tracing.values())
-        + paces.filed * float(filed)
+        + float(filing_seconds(forming, numbers, filed, paces))
         + float(checking_seconds(forming, numbers, paces)),
         "truth": truth_seconds(evidence, settings, paces),
         "optics": float(optics_seconds(forming, numbers, paces)),

@@ -278,6 +278,8 @@ class Forming:
         raster cells that a pixel has at least, where a shadow is drawn on one.
     drawing
         seconds of drawing a shadow on as few, without diffraction and with it, for each layer.
+    lines
+        that share traced paths, each with frames of its own.
     """
 
     pixels: float
@@ -292,6 +294,7 @@ class Forming:
     correlated: tuple[bool, bool] = (False, False)
     phases: float = 16.0
     drawing: tuple[float, float] = (0.0, 0.0)
+    lines: int = 1
 
 
 @dataclass(frozen=True)

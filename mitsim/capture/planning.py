@@ -41,7 +41,12 @@ does not count as if it grew with the paths."""
 
 @single_threaded_blas()
 def make_plan(
-    bench: Bench, lighting: Lighting, accuracy: float, seed: int, switches: Mapping[str, bool] | None = None
+    bench: Bench,
+    lighting: Lighting,
+    accuracy: float,
+    seed: int,
+    switches: Mapping[str, bool] | None = None,
+    lines: int = 1,
 ) -> Plan:
     """Look at the scene for a moment and decide what to simulate.
 
@@ -55,6 +60,8 @@ def make_plan(
         root of the pilot's random streams.
     switches
         effects that are switched on or off by name, whatever they are worth.
+    lines
+        that share the paths, of which the bench shows one; what it takes is told of all.
 
     Raises
     ------
@@ -64,7 +71,7 @@ def make_plan(
     check_accuracy(accuracy)
     _refuse_unfit(bench)
     started = time.perf_counter()
-    look = pilot.Look(bench, lighting, accuracy, seed)
+    look = pilot.Look(bench, lighting, accuracy, seed, lines)
     while True:
         evidence = look.evidence
         worth, part = doubt(accuracy, evidence, switches or {})

@@ -19,6 +19,7 @@ from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, S
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import PROBES, formed_frames, mixes
 from mitsim.rig.plate import FEW
+from mitsim.transport.ledger import MOST_PLACES
 
 ROUNDS, CHECKED_SHOTS = 1.5, 8
 """Rounds that sampling takes, one or two, of followed light one more; and shots that each looks at to see the error of
@@ -103,6 +104,12 @@ layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where s
 (benchmarks/masks.py)."""
 _MANY_ENTRIES = 1.2
 """An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
+_FILED = 0.2
+"""What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
+photograph, benchmarks/colour.py)."""
+_PASSED = 0.4
+"""A place of a ledger, which is emptied and looked through, over an entry of light that is filed (corner in three
+lines: 4e-9 s)."""
 SHARED_COST = 6
 """Paths that a path of shared indirect light takes as long as: corner 5.7, cookie_bag 3.4."""
 
@@ -269,14 +276,14 @@ def _lit_by_occluded(forming: Forming, lit: Number, numbers: Numbers) -> Number:
 
 
 def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: Paces) -> Number:
-    """Seconds of forming so many ``frames``.
+    """Seconds of forming so many ``frames`` of each line.
 
     Parameters
     ----------
     forming, numbers
         what it depends on.
     frames
-        to be formed.
+        to be formed of a line.
     paces
         of this machine, or the fixed ones.
     """
@@ -294,7 +301,7 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
     )
     if mixes(forming.classes, forming.shots, forming.pixels):
         products = products + numbers.mixed * forming.classes * forming.pixels**2
-    return cast(Number, frames * (paces.frame + paces.product * products))
+    return cast(Number, forming.lines * frames * (paces.frame + paces.product * products))
 
 
 def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
@@ -314,7 +321,7 @@ def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
         shadows = cast(Number, shadows + drawing * (numbers.layers + (np.asarray(numbers.layers) > 1)))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)
     seen = paces.pixel * forming.shots * forming.pixels**2
-    return shadows + seen + forming_seconds(forming, numbers, frames, paces)
+    return forming.lines * (shadows + seen) + forming_seconds(forming, numbers, frames, paces)
 
 
 def checking_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
@@ -357,13 +364,19 @@ def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dic
         as for :func:`forming_seconds`.
     """
     return {
-        name: GROUPS
+        name: traced_for(evidence.forming.lines)
+        * GROUPS
         * math.ceil(getattr(settings, f"{name}_samples"))
         * effort.paths
         * getattr(paces, name)
         * float(connections(name, Numbers.of(settings)))
         for name, effort in efforts(evidence, settings.effects).items()
     }
+
+
+def traced_for(lines: int) -> float:
+    """Times what one line takes that tracing and filing take for so many ``lines`` on the same paths."""
+    return 1 + _FILED * (lines - 1)
 
 
 def predicted_rays(pixels: int, samples: float, rate: float) -> float:
@@ -417,6 +430,21 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
     return cast(Number, pixels * found)
 
 
+def filing_seconds(forming: Forming, numbers: Numbers, filed: Number, paces: Paces) -> Number:
+    """Seconds of filing the light of each line.
+
+    Parameters
+    ----------
+    forming, numbers, paces
+        as for :func:`forming_seconds`.
+    filed
+        entries of one group's light.
+    """
+    ledger = forming.classes * np.square(forming.cells * numbers.coarse_cells) * numbers.coarse_layers
+    passed = numbers.indirect * _PASSED * np.where(ledger < MOST_PLACES, ledger, 0.0)
+    return cast(Number, forming.lines * GROUPS * paces.filed * (filed + passed))
+
+
 def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float:
     """Seconds of tracing what a perfect image would show.
 
@@ -427,4 +455,8 @@ def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float
     """
     direct = evidence.spread if settings.anchors > 1 else evidence.direct
     rate = direct.noise.rate
-    return paces.ray * predicted_rays(evidence.direct.paths, settings.direct_samples, rate)
+    return (
+        traced_for(evidence.forming.lines)
+        * paces.ray
+        * predicted_rays(evidence.direct.paths, settings.direct_samples, rate)
+    )

@@ -55,22 +55,32 @@ _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
 
-def plan_request(bench: Bench, request: Request) -> Plan:
-    """The plan of a capture, with the ``request`` that it is for and what it takes on this ``bench``.
+def plan_request(bench: Bench, request: Request, lines: int = 1) -> Plan:
+    """The plan of a capture, with the request that it is for and what it takes on this bench.
 
-    MitsimError when the request does not fit the bench, or no light of the projector reaches the camera.
+    Parameters
+    ----------
+    bench, request
+        what is asked for.
+    lines
+        that share the paths, of which the bench shows one; what it takes is told of all.
+
+    Raises
+    ------
+    MitsimError
+        when the request does not fit the bench, or no light of the projector reaches the camera.
     """
     lighting = bench.family(request.patterns, request.seed).lighting
-    plan = _planned(bench, lighting, request)
-    cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds)
+    plan = _planned(bench, lighting, request, lines)
+    cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, lines=lines)
     return replace(plan, request=request, cost=cost)
 
 
-def _planned(bench: Bench, lighting: Lighting, request: Request) -> Plan:
+def _planned(bench: Bench, lighting: Lighting, request: Request, lines: int) -> Plan:
     """The plan of a capture, with what exposing and writing its frames takes."""
-    exposing, effects = frame_seconds(bench, len(lighting.weights)), request.effects
+    exposing, effects = frame_seconds(bench, lines * len(lighting.weights)), request.effects
     if request.seconds is None:
-        plan = make_plan(bench, lighting, request.accuracy, request.seed, effects)
+        plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines)
     else:
         plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
     return plan.taking(**exposing)
@@ -160,7 +170,7 @@ def capture(
     with _recorder(place, head, resume) as recorder:
         with job.clock.stage("plan"):
             plan = light.plan if light else plan
-            plan = (plan or _planned(bench, lighting, request)).taking(start=starting)
+            plan = (plan or _planned(bench, lighting, request, 1)).taking(start=starting)
         seconds = exposing if light else plan.predicted_seconds
         cost = frames_cost(bench, plan.settings, lighting, seconds, on_disk)
         cost.check(request.patterns, job.limits, place)

@@ -20,7 +20,7 @@ from mitsim.core.arrays import Labels
 from mitsim.core.errors import MitsimError
 from mitsim.transport.histogram import Bundle, Sightings
 
-_MOST_PLACES = 2**26
+MOST_PLACES = 2**26
 """Places of all rows and lines that are held: 0.5 GB."""
 _UNIT_BITS = 30
 """Power of two of units in the light that is passed as one: rounding moves a path's by 5e-10 of it at most, either way,
@@ -72,7 +72,7 @@ class Ledger:
         ledgers
             their number.
         """
-        fits = ledgers * (int(labels.max()) + 1) * (bundle.size + 1) < _MOST_PLACES
+        fits = ledgers * (int(labels.max()) + 1) * (bundle.size + 1) < MOST_PLACES
         return fits and not bundle.between
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:

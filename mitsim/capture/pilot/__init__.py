@@ -89,6 +89,8 @@ class Look:
         where the search for enough anchors, layers and cells may stop.
     seed
         root of the random streams.
+    lines
+        that share the paths, of which the bench shows one.
 
     Raises
     ------
@@ -96,8 +98,8 @@ class Look:
         when no light of the projector reaches the camera.
     """
 
-    def __init__(self, bench: Bench, lighting: Lighting, accuracy: float, seed: int) -> None:
-        self.bench, self.lighting, self.accuracy, self.seed = bench, lighting, accuracy, seed
+    def __init__(self, bench: Bench, lighting: Lighting, accuracy: float, seed: int, lines: int = 1) -> None:
+        self.bench, self.lighting, self.accuracy, self.seed, self._lines = bench, lighting, accuracy, seed, lines
         self.present = effects.present(bench)
         first_look = frozenset(self.present) & effects.names(lambda effect: effect.first_look)
         first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_look))
@@ -241,7 +243,7 @@ class Look:
             shared=shared,
             repeats=repeats,
             from_camera=switched.effort("from_camera"),
-            forming=self.forming,
+            forming=replace(self.forming, lines=self._lines),
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,

@@ -10,13 +10,14 @@ import numpy as np
 
 from mitsim.capture.decision import SceneFacts, decide
 from mitsim.capture.effects import parse_switches
-from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Effort, Evidence, Forming, Noise, Part, Settings
+from mitsim.capture.evidence import LOOKS, Changes, Effort, Evidence, Forming, Noise, Part, Settings
 from mitsim.capture.plan import Plan, PlanRow
 from mitsim.capture.prices import (
     Numbers,
     Paces,
     checking_seconds,
     entries,
+    filing_seconds,
     optics_seconds,
     tracing_seconds,
     truth_seconds,
@@ -79,7 +80,8 @@ def rows(found: Plan) -> dict[str, PlanRow]:
 def stages(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, float]:
     """Seconds of each stage: paths, filing of what they bring, looks at the error; rays of the truth; frames."""
     forming, numbers = evidence.forming, Numbers.of(settings)
-    filing = paces.filed * GROUPS * entries(evidence.direct.paths, forming.classes, numbers, settings)
+    filed = entries(evidence.direct.paths, forming.classes, numbers, settings)
+    filing = filing_seconds(forming, numbers, filed, paces)
     looking = checking_seconds(forming, numbers, paces)
     return {
         "transport": sum(tracing_seconds(evidence, settings, paces).values()) + filing + looking,

@@ -19,18 +19,19 @@ def test_each_part_of_a_question_makes_another(small_scene: Callable[..., Path])
     """A scene that is opened again is the same one. (Planted: each part left out.)"""
     path = small_scene(reflectance=SHADES)
     bench, again, uniform = open_bench(path), open_bench(path), Lighting.uniform(16)
-    asked = question(bench, uniform, 1e-2, 3, {})
-    assert question(again, uniform, 1e-2, 3, {}) == asked
+    asked = question(bench, uniform, 1e-2, 3, {}, 1)
+    assert question(again, uniform, 1e-2, 3, {}, 1) == asked
     dots = parse_patterns("dots:2", 16).lighting
     sensor = bench.sensor.model_copy(update={"read_noise_e": 9.0})
     others = [
-        question(bench, dots, 1e-2, 3, {}),
-        question(bench, dots.shots([0]), 1e-2, 3, {}),
-        question(bench, uniform, 2e-2, 3, {}),
-        question(bench, uniform, 1e-2, 4, {}),
-        question(bench, uniform, 1e-2, 3, {"blur": False}),
-        question(bench.with_board(0.99), uniform, 1e-2, 3, {}),
-        question(replace(bench, rig=replace(bench.rig, sensor=sensor)), uniform, 1e-2, 3, {}),
-        question(open_bench(small_scene(reflectance=SHADES[::-1])), uniform, 1e-2, 3, {}),
+        question(bench, dots, 1e-2, 3, {}, 1),
+        question(bench, dots.shots([0]), 1e-2, 3, {}, 1),
+        question(bench, uniform, 2e-2, 3, {}, 1),
+        question(bench, uniform, 1e-2, 4, {}, 1),
+        question(bench, uniform, 1e-2, 3, {"blur": False}, 1),
+        question(bench.with_board(0.99), uniform, 1e-2, 3, {}, 1),
+        question(bench, uniform, 1e-2, 3, {}, 3),
+        question(replace(bench, rig=replace(bench.rig, sensor=sensor)), uniform, 1e-2, 3, {}, 1),
+        question(open_bench(small_scene(reflectance=SHADES[::-1])), uniform, 1e-2, 3, {}, 1),
     ]
     assert len({asked, *others}) == 1 + len(others)

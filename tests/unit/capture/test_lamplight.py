@@ -361,13 +361,16 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
     )
     lit = SimpleNamespace(roughest=lambda seed, part: alone)
     colours: Any = SimpleNamespace(
-        whole=whole, lit_by_lamps=lambda effects, seed: lit, roughest=lambda seed, part: SimpleNamespace(lamplight=None)
+        manifest=SimpleNamespace(channels=(1, 2, 3)),
+        whole=whole,
+        lit_by_lamps=lambda effects, seed: lit,
+        roughest=lambda seed, part: SimpleNamespace(lamplight=None),
     )
 
-    def plan_request(bench: Any, request: Any) -> Any:
-        planned.append((bench, dict(request.effects)))
+    def plan_request(bench: Any, request: Any, lines: int) -> Any:
+        planned.append((bench, dict(request.effects), lines))
         return SimpleNamespace(settings=SimpleNamespace(effects=frozenset()))
 
     monkeypatch.setattr(colour, "plan_request", plan_request)
     colour.plan_lines(colours, Request.of(patterns="uniform"))
-    assert planned == [(alone, {}), (alone, {"ambient": True})]
+    assert planned == [(alone, {}, 3), (alone, {"ambient": True}, 3)]

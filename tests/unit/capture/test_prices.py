@@ -9,11 +9,14 @@ from mitsim.capture.prices import (
     FIXED,
     Numbers,
     Paces,
+    checking_seconds,
     entries,
+    filing_seconds,
     forming_seconds,
     optics_seconds,
     paces_of,
     tracing_seconds,
+    truth_seconds,
 )
 from mitsim.optics.frames import PROBES
 from tests.unit.capture.invented_evidence import EVIDENCE, plan
@@ -136,3 +139,34 @@ def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
     for classes in (FORMING.classes, 9):
         forming = replace(FORMING, classes=classes)
         assert optics_seconds(forming, ONE, looked) == pytest.approx(FORMING.shots * 50**2)
+
+
+def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
+    """Three lines: two fifths more tracing, and all else three times. (Planted: shadows of one line; filing of one.)"""
+    three = replace(EVIDENCE, forming=replace(EVIDENCE.forming, lines=3))
+    settings = plan(evidence=EVIDENCE).settings
+    numbers = Numbers.of(settings)
+    for seconds in (
+        lambda forming: forming_seconds(forming, numbers, 5.0, FIXED),
+        lambda forming: optics_seconds(forming, numbers, FIXED),
+        lambda forming: checking_seconds(forming, numbers, FIXED),
+        lambda forming: filing_seconds(forming, numbers, 1e6, FIXED),
+    ):
+        assert seconds(three.forming) == pytest.approx(3 * seconds(EVIDENCE.forming))  # type: ignore[no-untyped-call]
+    one, several = (tracing_seconds(evidence, settings, FIXED) for evidence in (EVIDENCE, three))
+    assert several == pytest.approx({name: 1.4 * each for name, each in one.items()})
+    assert truth_seconds(three, settings, FIXED) == pytest.approx(1.4 * truth_seconds(EVIDENCE, settings, FIXED))
+
+
+def test_a_ledger_is_emptied_and_looked_through_where_it_has_room() -> None:
+    """4 classes of 20 x 20 cells in two layers, where light is followed over several surfaces."""
+    numbers = replace(ONE, indirect=1.0, coarse_cells=2.0, coarse_layers=2.0)
+    places = 4 * 20**2 * 2
+    entry = GROUPS * FIXED.filed
+    assert filing_seconds(FORMING, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * places))
+    assert filing_seconds(FORMING, replace(numbers, indirect=0.0), 1000.0, FIXED) == pytest.approx(entry * 1000)
+    most = 2**26 // 800
+    large = replace(FORMING, classes=most)
+    assert filing_seconds(large, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * most * 800))
+    larger = replace(FORMING, classes=most + 1)
+    assert filing_seconds(larger, numbers, 1000.0, FIXED) == pytest.approx(entry * 1000)

@@ -225,8 +225,8 @@ def test_too_few_seconds_flag_the_loosest_plan(bench: Bench) -> None:
     ("asked", "maker", "handed"),
     [
         ({"seconds": 3.0}, "plan_within", (3.0, 5, {"blur": False})),
-        ({"accuracy": 2e-2}, "make_plan", (2e-2, 5, {"blur": False})),
-        ({}, "make_plan", (1e-3, 5, {"blur": False})),
+        ({"accuracy": 2e-2}, "make_plan", (2e-2, 5, {"blur": False}, 1)),
+        ({}, "make_plan", (1e-3, 5, {"blur": False}, 1)),
     ],
 )
 def test_a_plan_is_made_of_what_is_asked(
