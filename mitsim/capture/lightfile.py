@@ -140,6 +140,7 @@ def _ambient(light: Light) -> FloatArray:
     frames = np.zeros((len(light.groups), *light.bench.geometry.frame_shape))
     for filed in light.simulation.filed(light.groups, light.bench.n**2)[1]:
         for frame, group in zip(frames, filed.groups, strict=True):
+            group.sort_indices()
             frame += filed.optics.frame(group.indices, group.data)
     return frames
 

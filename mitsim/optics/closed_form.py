@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise, starmap
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from mitsim.rig.projector import Spectrum
 
 IntArray = npt.NDArray[np.integer]
 Entries = tuple[IntArray, FloatArray]
-"""Distinct indices into (layers, rows, columns), and the light [W m^-2] at each."""
+"""Increasing indices into (layers, rows, columns), and the light [W m^-2] at each."""
 _FILLED = 1 / 8
 """Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
 _HELD = 8
@@ -69,8 +70,8 @@ class _Block:
         lefts, rights = zip(*self.factors, strict=True)
         # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
         if len(lefts[0]) < len(rights[0]):
-            return np.matmul(np.concatenate(lefts).T, np.concatenate([mean @ right for right in rights]), out=out)
-        return np.matmul(np.concatenate([mean.T @ left for left in lefts]).T, np.concatenate(rights), out=out)
+            return np.matmul(_stacked(lefts).T, _stacked([mean @ right for right in rights]), out=out)
+        return np.matmul(_stacked([mean.T @ left for left in lefts]).T, _stacked(rights), out=out)
 
     def probe(self, vectors: FloatArray | None) -> FloatArray:
         """(m, estimates * probes) products of each estimate's frame with ``vectors`` (m', probes); without them the
@@ -218,7 +219,7 @@ class FrameOptics:
         ]
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
-        """(m, m') irradiance of ``light`` [W m^-2] at distinct indices ``flat`` into (layers, *shape)."""
+        """(m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""
         return self.seen([(flat, light)], None)[0]
 
     def probe(self, estimates: Sequence[Entries], vectors: FloatArray | None = None) -> FloatArray:
@@ -274,7 +275,10 @@ class FrameOptics:
                 rows, columns = (np.arange(count) for count in self.shape)
             lights = np.zeros((1 if together else len(parts), len(rows) * len(columns)))
             for number, (place, values) in enumerate(parts):
-                lights[0 if together else number, place] += values
+                if together:
+                    lights[0, place] += values
+                else:
+                    lights[number][place] = values
             if together:
                 lights /= len(parts)
             yield of_depth.block(rows, columns, lights.reshape(-1, len(rows), len(columns)))
@@ -300,9 +304,9 @@ class FrameOptics:
         """What lies in each layer: places in (rows, columns), and light."""
         if len(self._layers) == 1:
             return [(flat, light)]
-        layer, place = np.divmod(flat, self.shape[0] * self.shape[1])
-        chosen = [np.flatnonzero(layer == index) for index in range(len(self._layers))]
-        return [(place[inside], light[inside]) for inside in chosen]
+        starts = np.arange(len(self._layers) + 1, dtype=flat.dtype) * flat.dtype.type(self.shape[0] * self.shape[1])
+        parts = starmap(slice, pairwise(np.searchsorted(flat, starts)))
+        return [(flat[part] - start, light[part]) for start, part in zip(starts, parts, strict=False)]
 
 
 def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
@@ -359,6 +363,11 @@ def _correlation(
     """The shadow of a mask that is drawn on a raster, prepared once."""
     shadow = replace(ShadowGeometry.of(geometry, depth), mask=raster(geometry, depth, spectrum))
     return Correlation(shadow, rows, columns, geometry.pixel_fill_factor)
+
+
+def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
+    """Matrices one above the other; one alone is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _picked(factor: FloatArray | _Stack, rows: IntArray) -> FloatArray:

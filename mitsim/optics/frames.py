@@ -394,6 +394,9 @@ def _formed(
     """
     shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
+    for _, parts in mixed:
+        for part in parts:
+            part.sort_indices()
     count = basis.shape[0]
     frames = np.zeros((count if with_frames else 0, *shape))
     probed = np.zeros((count, shape[0] * groups * (0 if probes is None else probes.shape[1])))
