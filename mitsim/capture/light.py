@@ -367,24 +367,27 @@ def trace_lines(
     rounds = first_round(simulation)
     while True:
         _trace(groups, samples_of(simulation, rounds))
-        lights, most, near = list[Light](), 0.0, 1.0
-        looks = [_looked(_line_of(groups, line, each, plan, seed), lighting, followed) for line, each in enumerate(own)]
-        more = sampling.excess([light for light, _ in looks]) if sampling.excess else 1.0
-        for light, bound in looks:
+        lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
+        last = lines[0].paths >= _MOST_PATHS
+        enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
+        looks = _looks(lines, lighting, followed, enough)
+        lights, most, near = dict[int, Light](), 0.0, 1.0
+        more = sampling.excess([looks[line][0] for line in sorted(looks)]) if sampling.excess else 1.0
+        for line, (light, bound) in looks.items():
             # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
             if sampling.target:
                 target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
             else:
                 target = plan.sampling_target
             seen = more * (light.sampling_error if sampling.target else bound)
-            lights.append(replace(light, reached=seen <= target))
+            lights[line] = replace(light, reached=seen <= target)
             if seen > target:
                 # Capped before the power as well: a target that was set very low would overflow it.
                 most = max(most, min(seen / target, _LARGEST_GROWTH))
             near = min(near, (target / seen) ** 2 if seen > 0 else 1.0)
         progress("transport", near)
-        if all(light.reached for light in lights) or lights[0].paths >= _MOST_PATHS:
-            return lights
+        if last or all(light.reached for light in lights.values()):
+            return [lights[line] for line in range(len(own))]
         rate, least, beyond = (
             (_FOLLOWED_RATE, _LEAST_GROWTH, _BEYOND) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH, 1.0)
         )
@@ -428,6 +431,18 @@ def _line_of(groups: Sequence[_Group], line: int, simulation: Simulation, plan: 
         reached=False,
         samples=dict(groups[0].done),
     )
+
+
+def _looks(lines: Sequence[Light], lighting: Lighting, followed: bool, enough: float) -> dict[int, tuple[Light, float]]:
+    """What :func:`_looked` finds of the light of each line, by its number: of the noisiest first, and of the others
+    when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is."""
+    noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
+    looks = {}
+    for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
+        looks[line] = _looked(lines[line], lighting, followed)
+        if looks[line][1] > enough:
+            break
+    return looks
 
 
 def _mostly_followed(simulation: Simulation) -> bool:

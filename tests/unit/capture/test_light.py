@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -154,6 +155,24 @@ def test_what_is_made_of_all_lines_meets_the_target(bench: Bench, plan: Plan, fa
     target = trace_light(bench, plan, family, 3).sampling_error
     found = trace_light(bench, replace(plan, sampling_target=target), family, 3, Sampling(excess=excess))
     assert set(asked) == {1} and found.reached and found.sampling_error <= target / 2
+
+
+@pytest.mark.parametrize(
+    ("bounds", "looked"), [([3, 1, 1, 0], [2, 0]), ([1, 2, 1, 0], [2, 0, 1, 3]), ([1, 1, 3, 0], [2])]
+)
+def test_lines_are_looked_at_from_the_noisiest_until_one_is_not_good_enough(
+    monkeypatch: pytest.MonkeyPatch, bounds: list[float], looked: list[int]
+) -> None:
+    """Noise of 2, 1 and 3 in 4 of their light, and a dark line; 2 is enough. (Planted: no end; the quietest first.)"""
+    lines: list[Any] = [SimpleNamespace(flux=np.full(3, 4.0), flux_error=np.full(3, noise)) for noise in (2, 1, 3)]
+    lines.append(SimpleNamespace(flux=np.zeros(3), flux_error=np.zeros(3)))
+    monkeypatch.setattr(
+        module, "_looked", lambda light, *_: (light, bounds[[each is light for each in lines].index(True)])
+    )
+    seen = module._looks(lines, Lighting.uniform(1), False, 2.0)
+    assert list(seen) == looked
+    assert all(seen[line][0] is lines[line] and seen[line][1] == bounds[line] for line in looked)
+    assert len(module._looks(lines, Lighting.uniform(1), False, math.inf)) == 4
 
 
 def test_purposes_share_no_random_numbers(bench: Bench, plan: Plan, family: Lighting) -> None:
