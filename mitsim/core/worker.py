@@ -13,8 +13,9 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
@@ -31,7 +32,7 @@ _SPACE_BYTES = 0.7e9
 _SPACE_BYTES_PER_PROCESSOR = 85e6
 """What each processor adds, buffers and stacks of two OpenBLAS; measured."""
 _AGAIN_S = 0.01
-"""After which an interrupt that was dropped comes again, and again: the callback that dropped it is over by then, and
+"""After which an interrupt that was lost comes again, and again: the callback that dropped it is over by then, and
 one that comes just before Python waits for something would not wake it."""
 _LONGEST_ADVICE = 256
 """Bytes; chosen so that any sentence fits."""
@@ -55,8 +56,9 @@ def enter_worker() -> None:
         return
     if "drjit" in sys.modules:
         raise RuntimeError("enter_worker: Dr.Jit is imported already, and its threads do not survive a fork")
-    signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)  # until both processes know what to do with them
     _check_address_space()
+    # Until both processes know what to do with them.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {*_STOPS, signal.SIGCHLD})
     _advice = mmap.mmap(-1, _LONGEST_ADVICE)  # shared: what the worker notes, its parent reads
     reading, writing = os.pipe()
     sys.stdout.flush()
@@ -69,11 +71,12 @@ def enter_worker() -> None:
     atexit.register(_leave)  # before all others, so that it comes after them
     # Signals stay blocked in this thread, so it is the main one that they interrupt.
     threading.Thread(target=_end_with_parent, args=(reading,), daemon=True).start()
+    _insist_on_signals()
     for number in _heeded():
         signal.signal(number, _stop)
     signal.signal(signal.SIGALRM, _again)
     sys.unraisablehook = _unraisable
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {*_STOPS, signal.SIGCHLD})
 
 
 def end_with(status: object) -> None:
@@ -167,6 +170,23 @@ def _stop(number: int, _: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def _insist_on_signals() -> None:
+    """A signal comes again until its handler has run. Python's own C handler only notes it and writes a byte; where
+    that happens just before Python waits for something, nothing ends the wait."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    main = threading.get_ident()
+
+    def insist() -> None:
+        while number := os.read(reading, 1)[0]:
+            while signal.getsignal(number) is _stop:  # which puts another handler in its own place
+                time.sleep(_AGAIN_S)
+                signal.pthread_kill(main, number)
+
+    threading.Thread(target=insist, daemon=True).start()
+
+
 def _again(_: int, __: FrameType | None) -> None:
     signal.setitimer(signal.ITIMER_REAL, 0)
     raise KeyboardInterrupt
@@ -189,19 +209,15 @@ def _end_with_parent(reading: int) -> None:
 def _watch(child: int) -> NoReturn:
     """Wait for the worker, pass signals on, report its end, and exit."""
     asked: list[int] = []
-
-    def forward(number: int, _: FrameType | None) -> None:
-        with suppress(ProcessLookupError):  # it ended between the two
+    # Signals stay blocked and are waited for, the worker's end among them: a handler's call can be late by a wait.
+    signal.signal(signal.SIGCHLD, lambda *_: None)  # some systems drop what is ignored, blocked or not
+    awaited = {*_heeded(), signal.SIGCHLD}
+    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+        number = signal.sigwait(awaited)
+        if number != signal.SIGCHLD:
             os.kill(child, signal.SIGKILL if asked else number)
-        asked.append(number)
-
-    for number in _heeded():
-        signal.signal(number, forward)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
-    _, status = os.waitpid(child, 0)
-    sys.unraisablehook = lambda _: None  # a signal that comes between the lines that follow came too late
-    for number in _STOPS:
-        signal.signal(number, signal.SIG_IGN)
+            asked.append(number)
+    status = ended[1]
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
     killer = os.WTERMSIG(status)

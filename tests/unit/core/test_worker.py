@@ -102,6 +102,40 @@ def test_a_signal_to_the_parent_stops_the_worker(number: signal.Signals) -> None
     assert (*process.communicate(timeout=20), process.returncode) == ("", f"mitsim: {words}\n", 128 + number)
 
 
+LATE = """
+import operator
+from functools import partial
+def just_before(wait, *arguments):
+    # Native calls alone: Python does not look for signals between the two.
+    calls = partial(ctypes.PyDLL(None)["raise"], int(signal.SIGTERM)), partial(wait, *arguments)
+    return [*map(operator.methodcaller("__call__"), calls)][-1]
+"""
+LATE_IN_THE_WORKER = LATE + HEED.replace("time.sleep(60)", "just_before(time.sleep, 20)") + "    end_stopped()\n"
+LATE_IN_THE_PARENT = (
+    LATE
+    + """
+waitpid = os.waitpid
+def once(*given):
+    os.waitpid = waitpid
+    return just_before(waitpid, *given)
+os.waitpid = once
+"""
+)
+
+
+def test_a_signal_just_before_a_wait_ends_it() -> None:
+    """Python notes a signal, and calls the handler once it is back in its own code. (Planted: the worker does not
+    insist; a parent that waits for the worker's end alone.)"""
+    process, _ = started(LATE_IN_THE_WORKER)
+    assert process.communicate(timeout=15) == ("", "mitsim: ended by SIGTERM\n")
+    assert process.returncode == 143
+    program = PROGRAM.replace("enter_worker()\n", LATE_IN_THE_PARENT).format(
+        work=TELL.replace("60", "20").replace("print(os.getpid(), flush=True)", "enter_worker()")
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=15)
+    assert (done.stderr, done.returncode) == ("mitsim: ended by SIGTERM\n", 143)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_a_workers_last_moment_is_told_as_any(number: signal.Signals) -> None:
     """Python gives up its handlers before it ends, and the signal itself ends the worker then. (Planted: told as a
