@@ -218,6 +218,14 @@ WITHOUT_NUMPY = (
     "capture photograph --patterns dots:3 -o r --camera endless.toml",
     "capture photograph --patterns dots:3 -o r --camera slip.toml",
     "capture photograph --patterns hadamard:7 -o r",
+    "capture photograph --patterns dots:200 -o r",
+    "capture photograph --patterns dots:3 -o made/cal --resume",
+    "capture photograph --patterns dots:3 -o made/run --resume --colour lines",
+    "calibrate photograph -o made/run --resume",
+    "calibrate photograph --plan --psnr 35 --patterns dots:200",
+    "plan photograph --patterns dots:1x129",
+    "demo -o r --patterns hadamard:256",
+    "transport photograph -o x.h5 --patterns random:129",
     "plan photograph --colour auto --seconds 5",
     "plan photograph --colour bands:2 --seconds 5",
     "demo -o full",
@@ -237,6 +245,8 @@ WITHOUT_NUMPY = (
     "reconstruct made/run --calibration made/cal -o r --lambda -1",
     "reconstruct made/run --calibration made/cal -o r --method wiener",
     "reconstruct made/run --calibration made/cal -o r --focus map --method tv",
+    "reconstruct made/run --calibration made/cal -o r --focus 400",
+    "reconstruct made/run --calibration made/cal -o r --margin 2",
     "reconstruct made/run --calibration made/cal -o full",
     "reconstruct made/run --calibration made/cal -o none/r",
     "patterns dotz:3 -o p",
@@ -255,6 +265,13 @@ WITHOUT_NUMPY = (
     "study patterns -o s --seed -1",
     "study accuracy photograph -o s -D x=1",
     "study accuracy photograph -o s --over x=1:2:3",
+    "study accuracy photograph -o s --patterns dots:200",
+    "study sweep photograph -o s --over patterns=dots:3,dots:200",
+    "study sweep photograph -o s --patterns dots:200 --over sheet_z=400,410",
+    "study sweep photograph -o s --over sheet_z=400,nan",
+    "study patterns -o s --camera endless.toml",
+    "study all -o s --camera endless.toml",
+    "study drift -o s --camera endless.toml",
     "study accuracy photograph -o full",
     "study calibration photograph -o s --camera endless.toml",
     "study solver -o full",
@@ -313,7 +330,8 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_a_refusal_imports_nothing_heavy(refusing: Path, lines: tuple[str, ...], heavy: set[str]) -> None:
     """And leaves nothing behind. (Planted: the name of the patterns read by `parse_patterns`; the manifest of export
-    read by `packed_run`; outputs looked at once the bench is open; a check of an output that leaves its folder.)"""
+    read by `packed_run`; outputs, patterns or full wells looked at once the bench is open; a check of an output that
+    leaves its folder.)"""
     before = sorted(refusing.rglob("*"))
     program = f"""
 import sys

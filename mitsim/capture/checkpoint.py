@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.jsonfile import plain, read_json, write_json
-from mitsim.core.manifests import MANIFEST
+from mitsim.core.manifests import MANIFEST, resumable
 from mitsim.core.output import PARTS, output_folder, sweep, whole_file
 
 KIND = "calibration"
@@ -116,10 +116,7 @@ def is_finished(output: Path | str, configuration: Mapping[str, Any]) -> bool:
 
 
 def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
-    manifest = read_json(path / MANIFEST)
-    if not isinstance(manifest, dict) or manifest.get("kind") != KIND:
-        raise MitsimError(f"resume=True: {path}/{MANIFEST} is not that of a calibration; use another folder")
-    before = manifest.get("configuration")
+    before = resumable(path, KIND).get("configuration")
     before = before if isinstance(before, dict) else {}
     changed = [key for key in {**configuration, **before} if before.get(key) != configuration.get(key)]
     if changed:

@@ -5,7 +5,7 @@ What can be refused without numpy or the renderer is refused before they are imp
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +14,10 @@ from mitsim.capture.bench import Bench
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
+from mitsim.rig.families import read_name
 from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.outline import Outline
+from mitsim.scene.window import lit_side
 
 if TYPE_CHECKING:
     from mitsim.rig.profile import MaskProfile
@@ -25,7 +27,9 @@ _PITCH_TOLERANCE = 1e-3
 """Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
 
 
-def check_scene(scene: Path | str, defines: Mapping[str, str], outside: bool = False) -> Path:
+def check_scene(
+    scene: Path | str, defines: Mapping[str, str], outside: bool = False, patterns: Iterable[str] = ()
+) -> Path:
     """Where a scene lies, which is refused without the renderer where that is possible.
 
     Parameters
@@ -36,14 +40,20 @@ def check_scene(scene: Path | str, defines: Mapping[str, str], outside: bool = F
         values of its parameters by name.
     outside
         as ``allow_outside_files`` there.
+    patterns
+        families that its projector is to show.
 
     Raises
     ------
     MitsimError
-        for a scene that there is not, a parameter that it does not have, and XML that is not well-formed.
+        for a scene that there is not, a parameter that it does not have, XML that is not well-formed, and patterns that
+        need more pixels than the projector's picture lights.
     """
     path = locate(scene, "scenes", "scene.xml")
-    Outline(path, defines, SceneFiles(path, outside))
+    pictures = Outline(path, defines, SceneFiles(path, outside)).projected
+    n = lit_side(pictures[0]) if len(pictures) == 1 else None
+    for family in patterns:
+        read_name(family, n)
     return path
 
 

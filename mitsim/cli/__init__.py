@@ -53,6 +53,7 @@ from mitsim.cli.options import (
     Variant,
     bench_of,
     check_camera,
+    check_shown,
     check_work,
     job_of,
     number_of,
@@ -150,6 +151,7 @@ def demo(
     request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
     check_study_folder(output, "demo")
     check_camera(camera, request.timing)
+    check_shown([patterns], scene, define, outside)
     with job_of(quiet or as_json) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
@@ -181,6 +183,7 @@ def plan(
 
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     check_colour(colour, variant, projector, seconds)
+    check_shown([patterns], scene, define, outside)
     bench = bench_of(scene, variant_for(colour, variant, camera), camera, projector, define, outside)
     starting = running_seconds()
     plan = plan_of(bench, colour, request).taking(start=starting)
@@ -222,6 +225,7 @@ def capture(
     quiet: Quiet = False,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
+    from mitsim.core.manifests import MANIFEST
     from mitsim.core.resources import memory_from_here, memory_since
 
     request = request_of(
@@ -237,10 +241,12 @@ def capture(
         ambient_shots=ambient_shots,
     )
     traced_in = variant_for(colour, variant, camera)
-    check_work(output, resume, several=by_line(colour) or colour == AUTO)
+    begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
+    check_work(output, resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
     check_colour(colour, variant, projector, seconds)
     if colour != MOSAIC:
         check_camera(camera, mitsim.Request.of(**request).timing)
+    check_shown([patterns], scene, define, outside)
     advise(RESUME)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):

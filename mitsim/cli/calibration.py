@@ -29,6 +29,7 @@ from mitsim.cli.options import (
     Variant,
     bench_of,
     check_camera,
+    check_shown,
     check_work,
     is_given,
     job_of,
@@ -137,12 +138,13 @@ def calibrate(
             raise MitsimError(f"--colour {colour}: --plan is for light that is not told apart; leave one of them out")
         wanted = Wanted.of(psnr, patterns, output, resume)
         check_camera(camera, exposure)
+        check_shown([wanted.patterns], scene, define, outside)
         with job_of(quiet or as_json, max_seconds, max_memory) as job:
             with job.clock.stage("open scene"):
                 bench = bench_of(scene, variant, camera, projector, define, outside)
             return wanted.planned(bench, session, request, job, as_json)
     folder, traced_in = check_no_plan(psnr, patterns, output), variant_for(colour, variant, camera)
-    check_work(folder, resume, several=colour != NO or bool(session.depths))
+    check_work(folder, resume, "calibration", several=colour != NO or bool(session.depths))
     if write_frames is not None:
         check_output(write_frames)
     check_colour(colour, variant, projector)

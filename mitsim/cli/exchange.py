@@ -26,6 +26,7 @@ from mitsim.cli.options import (
     Seed,
     Variant,
     bench_of,
+    check_shown,
     job_of,
     request_of,
 )
@@ -226,6 +227,7 @@ def transport(
 
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     prepare_output(output, overwrite, "file")
+    check_shown([patterns], scene, define, outside)
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)

@@ -66,7 +66,7 @@ def reconstruct(
     from mitsim.core.colours import JOINT, is_coloured, is_mosaic
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
     from mitsim.core.output import check_output
-    from mitsim.reconstruct.asked import IMAGE_FILE, check_asked
+    from mitsim.reconstruct.asked import IMAGE_FILE, check_asked, check_parallax
 
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
@@ -85,7 +85,9 @@ def reconstruct(
             raise MitsimError(f"{option} {value}: {run} is not coloured; leave out {option}")
     # Refused before the solver is imported, which takes half a second.
     read_manifest(run, RunManifest)
-    read_manifest(calibration, CalibrationManifest)
+    manifest = read_manifest(calibration, CalibrationManifest)
+    if depth is not None or margin:
+        check_parallax(manifest.parallax, str(calibration))
     check_output(output, overwrite=(output / IMAGE_FILE).is_file())
     from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.study.quality import reconstruct as reconstruct_folder

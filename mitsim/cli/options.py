@@ -69,11 +69,12 @@ DAY = 86400.0
 
 def variant_of(name: str) -> str:
     """The ``name``, refused when it is none that light can be traced in; every verb checks it alike."""
-    from mitsim.core.environment import VARIANTS
+    from mitsim.core.environment import VARIANTS, check_driver
 
-    # CUDA has the same kinds; whether there is a GPU shows when the variant is loaded.
+    # CUDA has the same kinds; whether a driver has a GPU too shows when the variant is loaded.
     if name.replace("cuda_", "llvm_", 1) not in VARIANTS:
         raise MitsimError(f"--variant {name!r}: use {', '.join(VARIANTS)}")
+    check_driver(name)
     return name
 
 
@@ -155,15 +156,19 @@ def check_setup(scope: Scope, scene: str | None) -> None:
     """MitsimError where the files that a ``scope`` names cannot be used, before the renderer is imported; a study
     without a ``scene`` of its own may take others."""
     from mitsim.capture.opening import check_devices, check_scene
+    from mitsim.capture.request import Exposure
     from mitsim.core.configuration import load_model
     from mitsim.rig.sensor import load_sensor
     from mitsim.study.asked import NO_SCENE
 
     camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
-    load_sensor(camera)
+    # A study in colour may see through colour filters; all fill a part of the full well.
+    Exposure().check(load_sensor(camera).model_copy(update={"mosaic": None}), camera)
     if scene or scope.measures:
-        varied = {name: values[0] for name, values in scope.sweep if scope.measures and name not in NO_SCENE}
-        check_scene(scope.setup.scene, {**dict(scope.setup.parameters), **varied}, scope.setup.outside)
+        knobs = dict(scope.sweep) if scope.measures else {}
+        varied = {name: values[0] for name, values in knobs.items() if name not in NO_SCENE}
+        shown = knobs.get("patterns", (scope.patterns,) if scope.measures else ())
+        check_scene(scope.setup.scene, {**dict(scope.setup.parameters), **varied}, scope.setup.outside, shown)
     from mitsim.rig.projector import ProjectorModel  # last: it imports numpy
 
     load_model(projector, ProjectorModel)
@@ -183,20 +188,40 @@ def recipe_for(name: str, recipe: Path | None) -> SessionRecipe | None:
     return load_recipe(recipe)
 
 
-def check_work(output: Path, resume: bool, several: bool = False) -> None:
+def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> None:
     """MitsimError, before the renderer is imported, where a RUN or CAL folder cannot be written.
 
     Parameters
     ----------
     output, resume
         the folder, and whether work in it is to go on.
+    kind
+        capture or calibration.
     several
         whether it is to hold several such folders.
     """
-    from mitsim.core.manifests import MANIFEST
+    from mitsim.core.manifests import MANIFEST, resumable
     from mitsim.core.output import check_output
 
-    check_output(output, overwrite=resume and (several or (output / MANIFEST).is_file()))
+    begun = (output / MANIFEST).is_file()
+    if resume and begun and not several:
+        resumable(output, kind)
+    check_output(output, overwrite=resume and begun != several)
+
+
+def check_shown(patterns: Sequence[str], scene: str, define: Sequence[str] | None, outside: bool) -> None:
+    """MitsimError, before the renderer is imported, for ``patterns`` that the scene's projector has too few pixels for.
+
+    Parameters
+    ----------
+    patterns
+        names of families.
+    scene, define, outside
+        as for :func:`bench_of`.
+    """
+    from mitsim.capture.opening import check_scene
+
+    check_scene(scene, defines_of(define), outside, patterns)
 
 
 def check_camera(camera: str | None, exposure: Exposure) -> None:

@@ -25,6 +25,7 @@ from mitsim.cli.options import (
     bench_of,
     check_camera,
     check_setup,
+    check_shown,
     job_of,
     recipe_for,
     scope_of,
@@ -108,6 +109,7 @@ def study(
                 check_study_folder(output, name)
                 if name in EXPOSED:
                     check_camera(camera, request.timing)
+                check_shown([patterns], _only(scenes) or "photograph", define, outside)
                 with job.clock.stage("open scene"):
                     bench = bench_of(_only(scenes) or "photograph", variant, camera, projector, define, outside)
             result = run_study(bench, output, request, job)

@@ -1,10 +1,12 @@
 """This machine: a variant's name in, Mitsuba ready to use out; and the checks behind `mitsim doctor`."""
 
+import ctypes
 import os
 import platform
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -24,6 +26,8 @@ _CHILD_SECONDS = 120
 """Longest time for a check; chosen so: all of them take some ten, on a busy machine several times that."""
 _FEWEST_THREADS = 2
 """With a pool of one thread, Mitsuba 3.9.1 waits for ever when it reads an OpenEXR file."""
+_DRIVERS, _DRIVER_FOLDERS = ("libcuda.so", "libcuda.so.1"), ("x86_64-linux-gnu", "aarch64-linux-gnu", "wsl/lib")
+"""Names and folders in which Dr.Jit 1.4 looks for the driver."""
 
 _RENDER = """
 from mitsim.core.environment import load_variant
@@ -78,8 +82,7 @@ def _loaded(name: str) -> ModuleType:
     if name not in variants:
         raise MitsimError(f"variant: got {name!r}; this Mitsuba has {', '.join(variants)}; choose one of these")
     if name.startswith("cuda_") and not has_gpu():
-        llvm_name = name.replace("cuda_", "llvm_", 1)
-        raise MitsimError(f"variant {name}: Dr.Jit finds no NVIDIA GPU and driver here; use {llvm_name}")
+        raise _without_gpu(name)
     try:
         mitsuba.set_variant(name)
     except ImportError as error:
@@ -106,6 +109,27 @@ def compiled_arrays() -> tuple[ModuleType, ModuleType]:
         except ImportError as error:
             raise MitsimError(f"drjit: cannot be imported ({error}); run: {_reinstall('mitsuba')}") from error
     return drjit, drjit.llvm
+
+
+def check_driver(variant: str) -> None:
+    """MitsimError for a cuda_ ``variant`` where no NVIDIA driver is that Dr.Jit, which is not imported, could find."""
+    if variant.startswith("cuda_") and not _has_driver():
+        raise _without_gpu(variant)
+
+
+def _has_driver() -> bool:
+    if os.environ.get("DRJIT_LIBCUDA_PATH") or not sys.platform.startswith("linux"):
+        return True  # Dr.Jit knows
+    for name in _DRIVERS:
+        with suppress(OSError):
+            ctypes.CDLL(name)
+            return True
+    return any(any(Path("/usr/lib", folder).glob("libcuda.so.*")) for folder in _DRIVER_FOLDERS)
+
+
+def _without_gpu(variant: str) -> MitsimError:
+    llvm_name = variant.replace("cuda_", "llvm_", 1)
+    return MitsimError(f"variant {variant}: Dr.Jit finds no NVIDIA GPU and driver here; use {llvm_name}")
 
 
 def has_gpu() -> bool:

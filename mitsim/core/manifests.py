@@ -441,11 +441,17 @@ def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
     return validated(model, data, f"{place}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
 
 
+def resumable(folder: Path, kind: str) -> dict[str, Any]:
+    """The manifest in ``folder``, of work of a ``kind`` that is finished or not; MitsimError when it holds none."""
+    data = read_json(folder / MANIFEST)
+    if not isinstance(data, dict) or data.get("kind") != kind:
+        raise MitsimError(f"resume=True: {folder}/{MANIFEST} is not that of a {kind}; use another folder")
+    return data
+
+
 def read_head(folder: Path) -> RunHead:
     """The head of the run in ``folder``, finished or not; MitsimError when it holds none."""
-    data = read_json(folder / MANIFEST)
-    if not isinstance(data, dict) or data.get("kind") != "capture":
-        raise MitsimError(f"resume=True: {folder}/{MANIFEST} is not that of a capture; use another folder")
+    data = resumable(folder, "capture")
     return validated(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
 
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, MitsimError
+
+if TYPE_CHECKING:
+    from mitsim.core.manifests import Parallax
 
 TIKHONOV, MARKOV, TV = METHODS = ("tikhonov", "markov", "tv")
 """Of solving."""
@@ -32,6 +36,16 @@ def check_asked(lam: float | str, method: str, focus: float | str | None, margin
         raise ArgumentError("margin", f"{margin}: give a whole number of cells, at least 0")
     if margin and (focus is not None or method != TIKHONOV):
         raise ArgumentError("margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus")
+
+
+def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
+    """The ``parallax`` that a ``calibration`` states; MitsimError where it states none."""
+    if parallax is None:
+        raise MitsimError(
+            f"focus: calibration {calibration} does not state its parallax, as none did before; calibrate again, or "
+            "add it to the manifest"
+        )
+    return parallax
 
 
 def check_joint(lam: float | str) -> None:

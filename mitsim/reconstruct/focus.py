@@ -27,6 +27,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
 from mitsim.core.measurement import Ambient, Measurement
 from mitsim.core.runs import Capture
+from mitsim.reconstruct.asked import check_parallax
 from mitsim.reconstruct.factors import Factors
 
 _NEIGHBOURS = 4
@@ -83,12 +84,7 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
 
 def stated_parallax(factors: Factors) -> Parallax:
     """How ``factors`` move with depth; MitsimError where their calibration does not state it."""
-    parallax = factors.manifest.parallax
-    if parallax is None:
-        raise MitsimError(
-            f"focus: calibration {factors.name} does not state its parallax, as none did before; calibrate again, or "
-            "add it to the manifest"
-        )
+    parallax = check_parallax(factors.manifest.parallax, factors.name)
     if min(factors.left.shape[1], factors.right.shape[1]) < _NEIGHBOURS:
         raise MitsimError(
             f"focus: calibration {factors.name} has {factors.left.shape[1]} x {factors.right.shape[1]} projector "

@@ -40,9 +40,11 @@ class Margin:
         MitsimError where they do not state their parallax, and for more cells than the window, or the sensor, tells of.
         """
         parallax, sides = stated_parallax(factors), (factors.left, factors.right)
+        if self.cells > (most := min(factor.shape[1] for factor in sides)):
+            raise ArgumentError("margin", f"{self.cells}: give at most {most}, the projector's pixels a side")
         widened = [FactorOfDepths(factor, parallax, axis).beyond(self.cells) for axis, factor in enumerate(sides)]
         part = min((known.stop - known.start) / len(factor) for factor, (_, known) in zip(sides, widened, strict=True))
-        if self.cells > min(factor.shape[1] for factor in sides) or part < LEAST_PART:
+        if part < LEAST_PART:
             raise ArgumentError(
                 "margin",
                 f"{self.cells}: {max(part, 0):.0%} of the sensor know the shadow of all these cells; give fewer",

@@ -3,6 +3,7 @@ imported."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from math import prod
 
@@ -28,6 +29,8 @@ OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "lambda
     column for column, _ in MEASURES.values()
 }
 """Columns of every study's table, which are no knob."""
+_NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
+"""As Python and Mitsuba read them."""
 _LISTED = ("patterns", "exposure", "seed")
 """Knobs whose values are a list, whatever stands between its commas."""
 _MOST = 10_000
@@ -76,6 +79,9 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
         raise MitsimError(f"--over {taken.pop()}: is a column of every study's table; give the parameter another name")
     if (points := pictures * prod(len(values) for values in knobs.values())) > _MOST:
         raise MitsimError(f"study sweep: {points} points; give at most {_MOST}")
+    for name, text in ((name, text) for name, texts in knobs.items() for text in texts):
+        if _NOT_FINITE.fullmatch(text):
+            raise MitsimError(f"--over {name}={text}: give finite numbers")
     for text in knobs.get("exposure", ()):
         if text not in CONVENTIONS:
             raise MitsimError(f"--over exposure={text}: use {', '.join(CONVENTIONS)}")

@@ -85,6 +85,13 @@ class Outline:
     MitsimError
         for what is no well-formed scene XML, too large or nested too deep, for files that ``files`` does not allow,
         and for parameters that are missing, unknown or not plain.
+
+    Attributes
+    ----------
+    path
+        the scene's XML.
+    projected
+        files that objects inside its projectors name.
     """
 
     def __init__(self, path: Path, defines: Mapping[str, str], files: SceneFiles) -> None:
@@ -94,6 +101,7 @@ class Outline:
         self.path = path
         self._tags: dict[tuple[int, int, str], Tag] = {}
         self._places: dict[tuple[str, str, str], Tag] = {}
+        self.projected: list[Path] = []
         self._opened = self._elements = 0
         for name, value in defines.items():
             if "$" in value or "\\" in value or not value.isprintable():
@@ -173,6 +181,10 @@ class Outline:
                 self._files.spectrum(tag, beside, texts["filename"])
             elif name in _NUMBERS:
                 _check_numbers(tag, texts)
+            elif (name, texts.get("name")) == ("string", "filename"):
+                outer = (self._tags[file, at, ""].attributes for at in open_tags[:-1])
+                if any(attributes.get("type") == "projector" for attributes in outer):
+                    self.projected.append(self._files.folder / texts.get("value", ""))
 
         parser.XmlDeclHandler = declared
         parser.StartDoctypeDeclHandler = doctype

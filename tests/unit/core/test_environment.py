@@ -44,6 +44,22 @@ def test_without_a_gpu_a_cuda_variant_is_refused_in_one_line() -> None:
     assert "MitsimError variant cuda_ad_rgb: Dr.Jit finds no NVIDIA GPU" in done.stdout and "llvm_ad_rgb" in done.stdout
 
 
+def test_without_a_driver_a_cuda_variant_is_refused_before_drjit_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dr.Jit takes any library that its variable names. (Planted: a driver seen everywhere; the variable ignored.)"""
+    monkeypatch.setattr(environment, "_DRIVERS", ("libnone.so",))
+    monkeypatch.setattr(environment, "_DRIVER_FOLDERS", ("none",))
+    monkeypatch.delenv("DRJIT_LIBCUDA_PATH", raising=False)
+    if sys.platform.startswith("linux"):
+        with pytest.raises(MitsimError, match=r"^variant cuda_ad_rgb: .* no NVIDIA GPU .*; use llvm_ad_rgb$"):
+            environment.check_driver("cuda_ad_rgb")
+    environment.check_driver("llvm_ad_rgb")
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", "/somewhere/libcuda.so")
+    environment.check_driver("cuda_ad_rgb")
+    monkeypatch.delenv("DRJIT_LIBCUDA_PATH")
+    monkeypatch.setattr(environment, "_DRIVERS", ("libc.so.6",))
+    environment.check_driver("cuda_ad_rgb")
+
+
 def test_an_old_llvm_never_reaches_mitsuba() -> None:
     old = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
     if not old.exists():
