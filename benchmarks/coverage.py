@@ -27,7 +27,8 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import estimate
 from mitsim.capture.light import Light
 from mitsim.capture.opening import open_bench
-from mitsim.capture.session import LitSession, Session
+from mitsim.capture.responses import LitSession
+from mitsim.capture.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.reconstruct.factors import Factors

@@ -69,11 +69,12 @@ CONTRIBUTING
 
 
 def face() -> str:
-    """Markdown that documents every name of `mitsim.__all__`: functions, and classes with their public members."""
+    """Markdown that documents every name of `mitsim.__all__`: functions, and classes with their public members, those
+    of our own base classes among them."""
     blocks = []
     for name in sorted(getattr(mitsim, "__all__", ()), key=lambda name: (name[0].isupper(), name)):
         kind = "autoclass" if inspect.isclass(getattr(mitsim, name)) else "autofunction"
-        members = "   :members:\n" if kind == "autoclass" else ""
+        members = "   :members:\n   :inherited-members: Exception, BaseModel\n" if kind == "autoclass" else ""
         blocks.append(f"```{{eval-rst}}\n.. {kind}:: mitsim.{name}\n{members}```")
     return "\n\n".join(blocks)
 

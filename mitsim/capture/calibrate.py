@@ -20,8 +20,9 @@ from mitsim.capture.kept_frames import MOST_TIFF, KeptFrames
 from mitsim.capture.light import Light
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Exposure
+from mitsim.capture.responses import LitSession, Response
 from mitsim.capture.run import digital_scale
-from mitsim.capture.session import LitSession, Response, Session
+from mitsim.capture.session import Session
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError

@@ -19,8 +19,8 @@ import numpy as np
 
 from mitsim.capture.exposer import Exposer
 from mitsim.capture.request import Exposure
+from mitsim.capture.responses import LitSession
 from mitsim.capture.run import digital_scale
-from mitsim.capture.session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest

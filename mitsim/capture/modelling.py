@@ -15,8 +15,9 @@ import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.fitting import GAIN_STEP, STEPS, Fitted, Shown, fit_placement
+from mitsim.capture.responses import LitSession
 from mitsim.capture.run import digital_scale
-from mitsim.capture.session import LitSession, Session
+from mitsim.capture.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job

@@ -1,6 +1,6 @@
 """What a calibration session takes: its bench, shots and settings in, seconds by stage and bytes out, before it begins.
 
-The reason of each figure is how :class:`mitsim.capture.session.LitSession` works.
+The reason of each figure is how :class:`mitsim.capture.responses.LitSession` works.
 """
 
 from __future__ import annotations

@@ -22,23 +22,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channels, Metadata
 from mitsim.core.manifests import CalibrationManifest, RunManifest, ShotFile
 from mitsim.exchange.coloured import Coloured, unpacked_colours
-from mitsim.exchange.matlab import (
-    COLOURED,
-    Variables,
-    array_in,
-    calibration_in,
-    colours_in,
-    dn_per_rate,
-    endings,
-    factors_in_dn,
-    lines_in,
-    matrix_in,
-    of_folders,
-    read_variables,
-    run_in,
-    text_in,
-    write_variables,
-)
+from mitsim.exchange.matlab_file import Variables, array_in, matrix_in, read_variables, text_in, write_variables
+from mitsim.exchange.matlab_lines import COLOURED, colours_in, endings, lines_in
+from mitsim.exchange.matlab_variables import calibration_in, dn_per_rate, factors_in_dn, of_folders, run_in
 from mitsim.exchange.packed import FACTORS, Packed, checked_channel, shots_of, unpacked_run
 from mitsim.exchange.planes import PLANES, check_channel
 

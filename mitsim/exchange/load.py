@@ -49,7 +49,9 @@ def _hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
 @contextmanager
 def _matlab(path: Path, channel: str | None) -> Iterator[Loaded]:
     from mitsim.exchange.flatcam import flatcam_calibration, read_flatcam, read_flatcam_lines
-    from mitsim.exchange.matlab import COLOURED, ELECTRONS, FILTERED, names_in, read_matlab, read_matlab_lines
+    from mitsim.exchange.matlab import ELECTRONS, read_matlab, read_matlab_lines
+    from mitsim.exchange.matlab_file import names_in
+    from mitsim.exchange.matlab_lines import COLOURED, FILTERED
 
     if channel is not None:
         yield Loaded(None, flatcam_calibration(path, channel))

@@ -222,7 +222,7 @@ class _Reading:
 class _Readings:
     """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read.
 
-    Measurements of all patterns are as in a simulated session: :meth:`mitsim.capture.session.LitSession.noisy`.
+    Measurements of all patterns are as in a simulated session: :meth:`mitsim.capture.responses.LitSession.noisy`.
     """
 
     session: SessionFrames

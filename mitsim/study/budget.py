@@ -24,7 +24,7 @@ import numpy as np
 
 from mitsim.capture import partial
 from mitsim.capture.partial import Anatomy
-from mitsim.capture.session import LitSession
+from mitsim.capture.responses import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors

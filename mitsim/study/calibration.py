@@ -9,20 +9,19 @@ image that is solved, and what of it is not explained (:mod:`mitsim.study.budget
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.capture.light import Light
 from mitsim.capture.request import Exposure, Request
+from mitsim.capture.responses import LitSession
 from mitsim.capture.run import digital_scale
-from mitsim.capture.session import LitSession, Session
+from mitsim.capture.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -32,314 +31,17 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.calibration import Estimate, decibels
 from mitsim.reconstruct.factors import Factors
 from mitsim.rig.board import BoardShape
-from mitsim.rig.drift import WORDS, Drift
+from mitsim.rig.drift import Drift
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
-from mitsim.study import plots
-from mitsim.study.budget import (
-    CAPTURE,
-    DRIFT,
-    SCENE,
-    SOLVER,
-    SURE,
-    UNEXPLAINED,
-    LossRow,
-    entry_variances,
-    losses,
-)
-from mitsim.study.charts import bars
-from mitsim.study.drift import SESSION, DriftStand, squared_error
+from mitsim.study.budget import UNEXPLAINED, entry_variances, losses
+from mitsim.study.calibration_findings import CalibrationFindings, CauseRow, EntryRow, SingularRow
+from mitsim.study.drift import DriftStand
 from mitsim.study.exposures import LitScene
 from mitsim.study.knobs import reformed, without
-from mitsim.study.page import Part
-from mitsim.study.table import Mean, Table
 
 _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 """Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
-_APART = 0.3
-"""Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
-and bias and angle to first order do not hold."""
-_WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", SCENE: "light of the scene",
-          DRIFT: "drift", SOLVER: "the solver", UNEXPLAINED: "anywhere"}  # fmt: skip
-"""Where a loss comes from, in words."""
-_NO_DRIFT = " The recipe has no table [drift]: calibration/drift.toml is one that has."
-_SAID_DB = 0.005
-"""Loss from which it is told in text: less is 0.00 there."""
-_SHOWN_DEVIATIONS = 4.0
-"""Range of the maps: one of 16 000 entries lies beyond."""
-
-
-@dataclass(frozen=True)
-class EntryRow:
-    """Error of a factor's entries [its rms]: found, predicted from the noise, and the largest in predicted deviations;
-    ``chi_square`` is the mean square of all in these."""
-
-    factor: str
-    error: float
-    predicted_error: float
-    largest: float
-    chi_square: float
-
-
-@dataclass(frozen=True)
-class SingularRow:
-    """A singular value of a factor and of the same with noise, its predicted standard error and bias, how far it is
-    off in standard errors beyond the bias; and the angle [rad] of its two vectors, predicted and found."""
-
-    factor: str
-    number: int
-    value: float
-    noisy: float
-    standard_error: float
-    bias: float
-    off: float
-    predicted_angle: float
-    angle: float
-
-
-@dataclass(frozen=True)
-class CauseRow:
-    """Separability residual without one cause; ``part`` is the root of what it takes away from the squared residual,
-    below 0 where the residual grows without it."""
-
-    cause: str
-    residual: float
-    part: float
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationFindings:
-    """What a session came to.
-
-    Attributes
-    ----------
-    entries, singular, causes
-        rows of the report.
-    maps
-        (m, n) error of each factor's entries in predicted deviations, by factor.
-    residual
-        separability residual of the expected frames, and of the noisy ones.
-    session
-        frames, seconds of exposure, photoelectrons and photons.
-    image
-        of a capture with these factors: ``patterns``, ``psnr_db``, ``predicted_psnr_db`` of all sources together, and
-        ``frames``, ``exposure_seconds``, ``photoelectrons`` and ``photons`` of the capture; empty where none was made.
-    losses
-        what each source of noise, the scene's light and each drift costs it, and what is not explained.
-    not_predicted
-        drifts whose cost is not, each with the reason.
-    """
-
-    entries: tuple[EntryRow, ...]
-    singular: tuple[SingularRow, ...]
-    causes: tuple[CauseRow, ...]
-    maps: dict[str, FloatArray]
-    residual: tuple[float, float]
-    session: dict[str, float]
-    image: dict[str, Any] = field(default_factory=dict)
-    losses: tuple[LossRow, ...] = ()
-    not_predicted: tuple[str, ...] = ()
-    title: ClassVar[str] = "What limits a calibration session"
-
-    def payload(self) -> dict[str, Any]:
-        """The JSON of the command line."""
-        return {
-            "separability_residual": self.residual[1],
-            "noise_free_residual": self.residual[0],
-            "entries": [asdict(row) for row in self.entries],
-            "singular": [asdict(row) for row in self.singular],
-            "causes": [asdict(row) for row in self.causes],
-            "session": self.session,
-            "image": self.image,
-            "losses": [asdict(row) for row in self.losses],
-            "not_predicted": self.not_predicted,
-            "warnings": self.warnings,
-        }
-
-    @property
-    def warnings(self) -> list[str]:
-        """That the sources do not make the image's squared error, where chance does not either."""
-        return [
-            f"losses: {_judged(row)}, {100 * row.squared_error / squared_error(self.image['psnr_db']):+.1f} % of its "
-            "squared error, which may have a share in every other row; look for what the scene or the camera has that "
-            "no row names"
-            for row in self.losses
-            if row.of == UNEXPLAINED and abs(row.squared_error) > SURE * row.deviation
-        ]
-
-    def lines(self) -> list[str]:
-        """For people."""
-        entries = [
-            f"{row.factor:>5} factor: error {row.error:.2e}, predicted {row.predicted_error:.2e}; chi-square "
-            f"{row.chi_square:.3f} an entry, largest {row.largest:.1f} deviations"
-            for row in self.entries
-        ]
-        offs = np.array([row.off for row in self.singular if row.predicted_angle < _APART])
-        causes = [
-            f"{row.cause:>16}: {abs(row.part):.1e} ({decibels(abs(row.part)):.1f} dB)"
-            + (" less without it" if row.part > 0 else " more without it")
-            if row.part
-            else f"{row.cause:>16}: nothing"
-            for row in self.causes
-        ]
-        return [
-            *entries,
-            f"singular values: {len(offs)} of {len(self.singular)} stand apart from others"
-            + (f", rms {np.sqrt(np.mean(offs**2)):.2f} standard errors off" if len(offs) else ""),
-            f"separability residual {self.residual[1]:.2e}, {self.residual[0]:.2e} without noise; by cause:",
-            *causes,
-            f"{self.session['frames']:.0f} frames, {self.session['exposure_seconds']:.3g} s of exposure, "
-            f"{self.session['photons']:.3g} photons on the sensor",
-            *self._image_lines(),
-        ]
-
-    def _image_lines(self) -> Iterator[str]:
-        if not self.image:
-            return
-        image = self.image
-        yield (
-            f"image under {image['patterns']}: PSNR {image['psnr_db']:.2f} dB, {image['predicted_psnr_db']:.2f} as "
-            f"all its sources say, {image['frames']} frames, "
-            f"{image['exposure_seconds']:.3g} s of exposure, {image['photons']:.3g} photons; it loses by"
-        )
-        yield from (
-            f"{row.name:>42}: {row.lost_db:z.2f} +- {row.error_db:.2f} dB"
-            for row in self.losses
-            if abs(row.lost_db) >= _SAID_DB or row.of == UNEXPLAINED
-        )
-        yield from (_judged(row) for row in self.losses if row.of == UNEXPLAINED)
-        yield from (f"not predicted: {text}" for text in self.not_predicted)
-
-    def figures(self) -> dict[str, Figure]:
-        """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
-        parts = {row.cause: row.part for row in self.causes if row.part > 0}
-        found = {
-            f"{name}.png": plots.deviations(values, _SHOWN_DEVIATIONS, f"{name} factor")
-            for name, values in self.maps.items()
-        }
-        rows = {
-            name: np.array(
-                [(row.value, row.noisy - row.bias, row.standard_error) for row in self.singular if row.factor == name]
-            )
-            for name in self.maps
-        }
-        found["singular.png"] = plots.singular_errors(rows)
-        if parts:
-            found["causes.png"] = plots.error_bars(parts)
-        rated = {row.name: Mean(row.lost_db, row.error_db, 1) for row in self.losses if abs(row.lost_db) >= _SAID_DB}
-        if rated:
-            found["losses.png"] = bars(rated, "PSNR lost [dB]")
-        return found
-
-    def parts(self) -> Sequence[Part]:
-        """Of the page: what an image loses, light and time, errors of the factors, what is not separable."""
-        found = [self._light_part()]
-        if self.losses:
-            found.insert(0, self._losses_part())
-        entries = [
-            (
-                row.factor,
-                f"{row.error:.2e}",
-                f"{row.predicted_error:.2e}",
-                f"{row.chi_square:.3f}",
-                f"{row.largest:.1f}",
-            )
-            for row in self.entries
-        ]
-        found.append(
-            Part(
-                "Errors of the factors",
-                "Noisy factors against those of expected frames of the same light: relative error, found and predicted "
-                "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
-                "in predicted deviations. Maps: sensor pixels down, scene pixels across. Then each "
-                "singular value's error, beside its predicted standard error.",
-                ("Factor", "Relative error", "Predicted", "Chi-square an entry", "Largest [deviations]"),
-                tuple(entries),
-                (*self.maps_files, "singular.png"),
-            )
-        )
-        causes = [
-            (row.cause, f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}") for row in self.causes
-        ]
-        found.append(
-            Part(
-                "What is not separable",
-                f"No separable camera explains {self.residual[1]:.2e} of the noisy responses, {self.residual[0]:.2e} "
-                "of those without noise (relative rms). Without each cause alone, so much is left; its part is the "
-                "root of the difference of the squares, below 0 where more is left without it.",
-                ("Cause", "Residual without it", "Part"),
-                tuple(causes),
-                ("causes.png",),
-            )
-        )
-        return found
-
-    @property
-    def maps_files(self) -> tuple[str, ...]:
-        """Figures of the maps."""
-        return tuple(f"{name}.png" for name in self.maps)
-
-    def _losses_part(self) -> Part:
-        whole, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
-        rest = [row for row in self.losses if row.of == UNEXPLAINED]
-        ordered = sorted((row for row in self.losses if row not in rest), key=lambda row: -row.lost_db)
-        rows = [
-            (
-                _WHERE[row.of],
-                WORDS.get(row.source, row.source),
-                row.amount,
-                _with_error(row.lost_db, row.error_db, ""),
-                ""
-                if row.of == DRIFT
-                else _with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
-            )
-            for row in [*(row for row in ordered if abs(row.lost_db) >= _SAID_DB), *rest]
-        ]
-        small = ", ".join(row.name for row in ordered if abs(row.lost_db) < _SAID_DB)
-        untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
-        said = "".join(f" {_judged(row).capitalize()}." for row in rest)
-        return Part(
-            "What an image loses",
-            f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
-            f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{said} "
-            "Noise, light of the scene and solver: what the image would gain without that source alone, and the "
-            "source's part of the squared error; these parts add up to the whole, decibels do not. Below 0: the image "
-            "would be worse without it. Drift between calibration and capture, by the amounts of the recipe: what the "
-            "image would lose. Noise and drift are predicted in closed form with lambda as it is. Light of the scene "
-            "is what factors, measured on an even white board, do not hold of it, found from frames without noise. "
-            "The uncertainty is one standard error: noise is drawn once, and the part that is not explained may "
-            "belong to any source. Nonuniformity: the session has seen the same pixels, so its "
-            "factors hold what the pixels of a row or of a column have alike, and the image loses by the rest. "
-            "Rendering is the simulation's own sampling, which no camera has."
-            + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
-            + untold
-            + (f" Below {_SAID_DB:g} dB each: {small}." if small else ""),
-            ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
-            tuple(rows),
-            ("losses.png",),
-        )
-
-    def _light_part(self) -> Part:
-        columns = {"session": self.session, "capture": self.image}
-        names = ("frames", "exposure_seconds", "photoelectrons", "photons")
-        rows = [
-            (where, *(f"{facts[name]:.4g}" for name in names)) for where, facts in columns.items() if "frames" in facts
-        ]
-        return Part(
-            "Light and time",
-            "Frames, their exposure without read-out, and what the whole sensor gets in all of them. How much a wanted "
-            "PSNR needs: mitsim calibrate SCENE --plan --psnr DB.",
-            ("", "Frames", "Exposure [s]", "Photoelectrons", "Photons"),
-            tuple(rows),
-        )
-
-    def tables(self) -> dict[str, Table]:
-        """By file name."""
-        return {
-            "singular.csv": Table(tuple(asdict(row) for row in self.singular)),
-            "causes.csv": Table(tuple(asdict(row) for row in self.causes)),
-            "losses.csv": Table(tuple(asdict(row) for row in self.losses)),
-        }
 
 
 def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | None = None) -> CalibrationFindings:
@@ -379,22 +81,6 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     rows, refused = losses(stand, lit, _factors(lit, clean))
     told = sum(row.squared_error for row in rows if row.of != UNEXPLAINED)
     return replace(found, image=_image(stand, told), losses=tuple(rows), not_predicted=tuple(refused))
-
-
-def _judged(row: LossRow) -> str:
-    """What is to be said of what is not explained."""
-    errors = abs(row.squared_error) / row.deviation if row.deviation else 0.0
-    if errors <= 1:
-        return "what is not explained is within its standard error"
-    size = f"what is not explained is {errors:.1f} of its standard errors"
-    if errors <= SURE:
-        return f"{size}, of which chance makes {math.erfc(errors / math.sqrt(2)):.1%} of all studies see as much"
-    return f"{size}: the sources do not make the image's error, and a cause is missing"
-
-
-def _with_error(value: float, error: float, unit: str) -> str:
-    # Zero has no sign.
-    return f"{value:z.2f} \N{PLUS-MINUS SIGN} {error:.2f}{unit}".replace("-", "\N{MINUS SIGN}")
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:

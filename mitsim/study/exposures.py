@@ -22,7 +22,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.exposer import Exposer, peak_irradiance
 from mitsim.capture.light import Light
 from mitsim.capture.request import Exposure
-from mitsim.capture.session import DARK, READ, ROUNDING, SHOT
+from mitsim.capture.responses import DARK, READ, ROUNDING, SHOT
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
@@ -38,7 +38,7 @@ from mitsim.study.metrics import Quality, psnr
 
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS
 NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
-"""Sources of noise beside those of :mod:`mitsim.capture.session`."""
+"""Sources of noise beside those of :mod:`mitsim.capture.responses`."""
 DIM_E = 5600
 """Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
 dots, mask at 2000 um: 22.8 and 34.8 (`benchmarks/noise_reading.py --distance 2`)."""

@@ -18,7 +18,8 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.fitting import fit_placement
 from mitsim.capture.foreseen import Foreseen
 from mitsim.capture.modelling import model_of, modelled_factors, simulated
-from mitsim.capture.session import LitSession, Session
+from mitsim.capture.responses import LitSession
+from mitsim.capture.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.reconstruct.factors import Factors

@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.capture.calibrate import estimate
 from mitsim.capture.foreseen import Foreseen
-from mitsim.capture.session import LitSession
+from mitsim.capture.responses import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.reconstruct.calibration import Estimate

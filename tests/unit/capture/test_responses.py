@@ -19,8 +19,9 @@ import pytest
 from mitsim.capture.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.capture.checkpoint import Checkpoint
 from mitsim.capture.exposer import Exposer
+from mitsim.capture.responses import LitSession, _Shot
 from mitsim.capture.run import digital_scale
-from mitsim.capture.session import LitSession, Session, _Shot
+from mitsim.capture.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.optics.frames import Frame

@@ -14,7 +14,7 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import read_frame
-from mitsim.exchange import matlab
+from mitsim.exchange import matlab, matlab_file
 from mitsim.exchange.export import export_run
 from mitsim.exchange.load import import_file
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
@@ -169,7 +169,7 @@ def test_files_that_are_none_are_refused_and_no_folder_is_left(tmp_path: Path) -
 
 
 def test_a_run_larger_than_such_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matlab, "LARGEST_VARIABLE", 1000)
+    monkeypatch.setattr(matlab_file, "LARGEST_VARIABLE", 1000)
     with pytest.raises(MitsimError, match=r"data_coded takes .* hdf5"):
         export_run(made(tmp_path).run, "mat", tmp_path / "all.mat")
     assert not (tmp_path / "all.mat").exists()

@@ -23,7 +23,8 @@ from mitsim.reconstruct.perturbation import Expected, Noise
 from mitsim.rig.patterns import Lighting
 from mitsim.rig.recipe import load_recipe
 from mitsim.study.budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gained, session_rendering
-from mitsim.study.calibration import CalibrationFindings, _row, judged, measure, singular_rows, spent
+from mitsim.study.calibration import _row, judged, measure, singular_rows, spent
+from mitsim.study.calibration_findings import CalibrationFindings
 from mitsim.study.page import build_findings
 from tests.unit.capture.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
