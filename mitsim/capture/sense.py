@@ -22,7 +22,7 @@ from mitsim.core.framefile import Channel, finite_channel, read_frame, write_fra
 from mitsim.core.output import whole_file
 from mitsim.core.seeds import stream
 from mitsim.core.versions import versions
-from mitsim.rig.sensor import SensorModel
+from mitsim.rig.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak
 
 _LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
@@ -150,6 +150,12 @@ def sense(
     seconds = asked.seconds
     if seconds is None:
         seconds = exposure_for_peak(float(light.max()), asked.fraction, sensor, wavelength_nm)
+        shortest, longest = EXPOSURE_S
+        if not shortest <= seconds <= longest:
+            raise MitsimError(
+                f"image: its brightest pixel, {light.max():g} W/m^2, fills the sensor in {seconds:g} s; exposures are "
+                f"{shortest:g} to {longest:g} s; check the image's unit and scale"
+            )
     electrons = electrons_from_irradiance(light, seconds, sensor, wavelength_nm)
     shot, read = (stream(seed, "sense", noise) for noise in ("shot", "read"))
     digital = expose(electrons, seconds, sensor, shot, read)
@@ -166,8 +172,12 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
     path = Path(path)
     check_image(path)
     if path.suffix.lower() == ".npy":
+        if channel is not None:
+            raise MitsimError(f"image {path}: an array has no channel {channel!r}; name none")
         try:
             values = np.load(path, allow_pickle=False)
+            if not isinstance(values, np.ndarray) or values.dtype.kind not in "buif":
+                raise TypeError(f"{getattr(values, 'dtype', 'several')} are no real numbers")
             return np.asarray(values, dtype=np.float64), ()
         except (ValueError, TypeError, EOFError) as error:
             raise MitsimError(f"image {path}: not an array of numbers ({error}); save one by numpy.save") from error

@@ -167,6 +167,10 @@ FORMATS: dict[str, Format] = {
 """Formats by the name that `--format` takes."""
 
 
+_ENDINGS = {".h5": ("hdf5",), ".hdf5": ("hdf5",), ".mat": ("mat", "flatcam")}
+"""Formats by how names end that `mitsim import` takes them by."""
+
+
 def export_run(
     run: Path | str,
     format: str,
@@ -200,8 +204,9 @@ def export_run(
     Raises
     ------
     MitsimError
-        before anything is written, for an unknown format, a missing calibration, a place that holds something, a
-        folder that is none, or a calibration of other lines; and for a run that the format cannot hold.
+        before anything is written, for an unknown format, a missing calibration, a place that holds something or is
+        called as one of another format, a folder that is none, or a calibration of other lines; and for a run that the
+        format cannot hold.
     """
     if format not in FORMATS:
         raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
@@ -213,6 +218,10 @@ def export_run(
     if calibration is not None and chosen.calibration == "none":
         raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
+    if format not in _ENDINGS.get(ending := place.suffix.lower(), (format,)):
+        raise MitsimError(
+            f"output {place}: {ending} is of {' and '.join(_ENDINGS[ending])}, not of {format}; rename it"
+        )
     lines = _lines(folder, factors)
     filtered = is_mosaic(folder)
     if filtered and not chosen.filters:

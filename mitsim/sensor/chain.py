@@ -74,12 +74,10 @@ def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorMode
             "check that light reaches the sensor"
         )
     if not np.isfinite(model.full_well_e):
-        raise MitsimError(f"exposure: sensor {model.name!r} has no full well to fill; choose exposure_s instead")
+        raise MitsimError(f"exposure: sensor {model.name!r} has no full well to fill; give it in seconds")
     rate = peak_irradiance * _electrons_per_joule_m2(model, wavelength_nm)
     if rate == 0:
-        raise MitsimError(
-            f"exposure: sensor {model.name!r} is blind at {wavelength_nm:g} nm; choose exposure_s instead"
-        )
+        raise MitsimError(f"exposure: sensor {model.name!r} is blind at {wavelength_nm:g} nm; give it in seconds")
     return float(fraction * model.superpixel_full_well_e / (rate + model.superpixel_dark_current_e_per_s))
 
 

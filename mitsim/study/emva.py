@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from mitsim.capture.sensing import check_wavelength
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
 from mitsim.rig.sensor import SensorModel
@@ -43,6 +44,7 @@ class Procedure:
             if not least <= value <= most:
                 raise ArgumentError(name, f"{value}: give a whole number from {least} to {most}")
         check_root(self.seed)
+        check_wavelength(self.wavelength_nm)
 
 
 def efficiency_of(sensor: SensorModel, procedure: Procedure) -> float:

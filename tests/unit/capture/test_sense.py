@@ -103,9 +103,18 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "bad.npy").write_text("no array")
     with pytest.raises(MitsimError, match="not an array"):
         read_image(tmp_path / "bad.npy")
+    for values in (np.full((2, 2), 1 + 1j), np.full((2, 2), "1")):  # (planted: imaginary parts dropped)
+        np.save(tmp_path / "bad.npy", values)
+        with pytest.raises(MitsimError, match=r"not an array .* no real numbers"):
+            read_image(tmp_path / "bad.npy")
+    with pytest.raises(MitsimError, match="an array has no channel 'R'"):
+        read_image(tmp_path / "bad.npy", "R")
     for image in (np.array([[1.0, -1.0]]), np.array([[math.nan]]), np.ones(3), np.ones((0, 2))):
         with pytest.raises(MitsimError, match="image"):
             sense(image, CAMERA)
+    for scale in (1e300, 1e-30):  # (planted: exposures of 1e-303 s taken)
+        with pytest.raises(MitsimError, match=r"exposures are 1e-12 to .*; check the image's unit"):
+            sense(np.full((2, 2), scale), CAMERA)
     with pytest.raises(MitsimError, match="quantum_efficiency"):
         sense(IMAGE, sensor(quantum_efficiency=None))
     with pytest.raises(MitsimError, match="wavelength"):

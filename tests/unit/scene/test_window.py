@@ -13,11 +13,11 @@ from mitsim.scene.window import lit_side
 
 def picture(path: Path, mode: str, size: tuple[int, int] = (6, 6), value: int = 1) -> Path:
     """Texels of a ``value``, ``size`` rows and columns of them from row 3 and column 5 on, else dark."""
-    texels = np.zeros((16, 24), dtype=np.uint8)
+    texels = np.zeros((16, 16), dtype=np.uint8)
     texels[3 : 3 + size[0], 5 : 5 + size[1]] = value
     image = Image.fromarray(texels)
     if mode == "RGB":  # blue alone is lit
-        image = Image.merge("RGB", (Image.new("L", (24, 16)), Image.new("L", (24, 16)), image))
+        image = Image.merge("RGB", (Image.new("L", (16, 16)), Image.new("L", (16, 16)), image))
     elif mode != "L":
         image = image.convert(mode)
     image.save(path)
@@ -32,7 +32,7 @@ def test_the_lit_square_is_the_window(tmp_path: Path, mode: str) -> None:
 
 def test_what_only_the_renderer_tells_is_left_to_it(tmp_path: Path) -> None:
     """A window that is no square, alpha, a dark picture, one that is no PNG, and none at all. (Planted: a box of alpha,
-    which is lit everywhere.)"""
+    which is 255 everywhere.)"""
     assert lit_side(picture(tmp_path / "x.png", "L", (6, 5))) is None
     assert lit_side(picture(tmp_path / "x.png", "RGBA")) is None
     assert lit_side(picture(tmp_path / "x.png", "L", value=0)) is None
