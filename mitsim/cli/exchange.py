@@ -33,6 +33,7 @@ from mitsim.cli.options import (
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.seeds import check_root
 from mitsim.rig.families import NAMES, read_name
 
 app = typer.Typer()
@@ -171,6 +172,7 @@ def patterns(
     quiet: Quiet = False,
 ) -> int:
     """Draw patterns, or a calibration's stripes, as pictures to show on a real projector."""
+    check_root(seed)
     if family != "stripes":
         read_name(family, projector_pixels)  # refused before numpy is imported
     from mitsim.exchange.drawn import SESSION, cells_told, draw_family, draw_stripes, session_of

@@ -10,6 +10,7 @@ from mitsim.core.errors import ArgumentError
 from mitsim.core.imagelist import Raw, Wanted, image_files
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.plainfile import check_plain
+from mitsim.core.seeds import check_root
 from mitsim.exchange.planes import check_channel
 from mitsim.rig.families import read_name
 from mitsim.rig.sensor import check_exposure, load_sensor
@@ -70,6 +71,9 @@ class RealCapture:
     def check(self, source: Path) -> None:
         """MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
         check_exposure(self.exposure_s)
+        check_root(self.seed)
+        if self.n is not None and self.n < 1:
+            raise ArgumentError("projector_pixels", f"{self.n}: give 1 or more, those a side")
         if self.channel is not None:
             check_channel(self.channel)
         if self.ambient_shots is not None and (self.ambient is None or self.ambient_shots < 1):
