@@ -15,17 +15,17 @@ from mitsim.rig.families import read_name
 MEASURES = {
     "psnr": ("psnr_db", "PSNR [dB]"),
     "ssim": ("ssim", "SSIM [1]"),
-    "misfit": ("misfit", "unexplained part of the measurements [1]"),
-    "chi_square": ("chi_square", "chi-square a datum [1]"),
+    "misfit": ("misfit", "misfit: part of the measurements that no image explains [1]"),
+    "chi_square": ("chi_square", "chi-square of a measurement, 1 where the model fits [1]"),
     "uncertainty": ("uncertainty", "standard uncertainty, rms [reflectance]"),
-    "lambda": ("lambda", "lambda [(electrons/s)^2]"),
+    "lambda": ("lambda", "lambda, weight of the regularisation [(electrons/s)²]"),
 }
 """Column of the table and axis, by what people ask for."""
 CONVENTIONS = ("equal peak", "equal frame", "equal total")
 """Exposures: see :mod:`mitsim.study.exposures`."""
 NO_SCENE = ("patterns", "exposure", "seed", "accuracy")
 """What a sweep may vary besides parameters of the scene."""
-OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "lambda", "psnr_db", "ssim"} | {
+OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", "lambda", "psnr_db", "ssim"} | {
     column for column, _ in MEASURES.values()
 }
 """Columns of every study's table, which are no knob."""

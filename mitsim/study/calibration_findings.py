@@ -19,6 +19,7 @@ from mitsim.study.charts import bars
 from mitsim.study.drift import SESSION, squared_error
 from mitsim.study.page import Part
 from mitsim.study.table import Mean, Table
+from mitsim.study.typeset import with_error
 
 _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
@@ -26,6 +27,31 @@ and bias and angle to first order do not hold."""
 _WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", SCENE: "light of the scene",
           DRIFT: "drift", SOLVER: "the solver", UNEXPLAINED: "anywhere"}  # fmt: skip
 """Where a loss comes from, in words."""
+_HAS, _WOULD = "has lost by noise, light and solver", "would lose by a drift"
+"""What becomes of the image, as the figure calls it."""
+_LOSS_NOTES = (
+    "Noise, light of the scene and solver: what the image would gain without that source alone, and the source's "
+    "part of the squared error. These parts add up to the whole, decibels do not. Below 0: the image would be worse "
+    "without it.",
+    "Drift between calibration and capture, by the amounts of the recipe: what the image would lose, each alone.",
+    "Noise and drift are predicted in closed form with lambda as it is. Light of the scene is what factors, measured "
+    "on an even white board, do not hold of it, found from frames without noise.",
+    "The uncertainty is one standard error: noise is drawn once, and the part that is not explained may belong to "
+    "any source; none is told where it is below 0.005.",
+    "Nonuniformity: the session has seen the same pixels, so its factors hold what the pixels of a row or of a "
+    "column have alike, and the image loses by the rest. Rendering is the simulation's own sampling, which no camera "
+    "has.",
+)
+"""How the table of losses is to be read."""
+_CAUSES = {
+    "noise": "noise of the sensor",
+    "black-level": "light that black pixels leak",
+    "diffraction": "diffraction at the mask",
+    "anchors": "light that changes over the sensor",
+    "layers": "shadows that change with depth",
+    "cells": "light that changes inside projector pixels",
+}
+"""Causes of what is not separable, in words; others have names that say it."""
 _NO_DRIFT = " The recipe has no table [drift]: calibration/drift.toml is one that has."
 _SAID_DB = 0.005
 """Loss from which it is told in text: less is 0.00 there."""
@@ -103,7 +129,7 @@ class CalibrationFindings:
     image: dict[str, Any] = field(default_factory=dict)
     losses: tuple[LossRow, ...] = ()
     not_predicted: tuple[str, ...] = ()
-    title: ClassVar[str] = "What limits a calibration session"
+    title: ClassVar[str] = "What limits a calibration session and its image"
 
     def payload(self) -> dict[str, Any]:
         """The JSON of the command line."""
@@ -176,9 +202,9 @@ class CalibrationFindings:
 
     def figures(self) -> dict[str, Figure]:
         """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
-        parts = {row.cause: row.part for row in self.causes if row.part > 0}
+        parts = {_cause(row): row.part for row in self.causes if row.part > 0}
         found = {
-            f"{name}.png": plots.deviations(values, _SHOWN_DEVIATIONS, f"{name} factor")
+            f"{name}.png": plots.deviations(values, _SHOWN_DEVIATIONS, f"Errors of the {name} factor")
             for name, values in self.maps.items()
         }
         rows = {
@@ -190,8 +216,11 @@ class CalibrationFindings:
         found["singular.png"] = plots.singular_errors(rows)
         if parts:
             found["causes.png"] = plots.error_bars(parts)
-        rated = {row.name: Mean(row.lost_db, row.error_db, 1) for row in self.losses if abs(row.lost_db) >= _SAID_DB}
-        if rated:
+        rated: dict[str, dict[str, Mean]] = {_HAS: {}, _WOULD: {}}
+        for row in self.losses:
+            if abs(row.lost_db) >= _SAID_DB:
+                rated[_WOULD if row.of == DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
+        if any(rated.values()):
             found["losses.png"] = bars(rated, "PSNR lost [dB]")
         return found
 
@@ -213,17 +242,19 @@ class CalibrationFindings:
         found.append(
             Part(
                 "Errors of the factors",
-                "Noisy factors against those of expected frames of the same light: relative error, found and predicted "
+                "The left factor takes rows of the scene to rows of the sensor, the right one columns. Noisy factors "
+                "against those of frames without noise of the same light: relative error, found and predicted "
                 "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
-                "in predicted deviations. Maps: sensor pixels down, scene pixels across. Then each "
-                "singular value's error, beside its predicted standard error.",
+                "in predicted standard deviations. Then each singular value's error, beside its predicted standard "
+                "error.",
                 ("Factor", "Relative error", "Predicted", "Chi-square an entry", "Largest [deviations]"),
                 tuple(entries),
                 (*self.maps_files, "singular.png"),
             )
         )
         causes = [
-            (row.cause, f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}") for row in self.causes
+            (_cause(row), f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}")
+            for row in self.causes
         ]
         found.append(
             Part(
@@ -252,10 +283,10 @@ class CalibrationFindings:
                 _WHERE[row.of],
                 WORDS.get(row.source, row.source),
                 row.amount,
-                _with_error(row.lost_db, row.error_db, ""),
+                with_error(row.lost_db, row.error_db),
                 ""
                 if row.of == DRIFT
-                else _with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
+                else with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
             )
             for row in [*(row for row in ordered if abs(row.lost_db) >= _SAID_DB), *rest]
         ]
@@ -265,22 +296,13 @@ class CalibrationFindings:
         return Part(
             "What an image loses",
             f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
-            f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{said} "
-            "Noise, light of the scene and solver: what the image would gain without that source alone, and the "
-            "source's part of the squared error; these parts add up to the whole, decibels do not. Below 0: the image "
-            "would be worse without it. Drift between calibration and capture, by the amounts of the recipe: what the "
-            "image would lose. Noise and drift are predicted in closed form with lambda as it is. Light of the scene "
-            "is what factors, measured on an even white board, do not hold of it, found from frames without noise. "
-            "The uncertainty is one standard error: noise is drawn once, and the part that is not explained may "
-            "belong to any source. Nonuniformity: the session has seen the same pixels, so its "
-            "factors hold what the pixels of a row or of a column have alike, and the image loses by the rest. "
-            "Rendering is the simulation's own sampling, which no camera has."
+            f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{said}"
             + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
-            + untold
-            + (f" Below {_SAID_DB:g} dB each: {small}." if small else ""),
+            + untold,
             ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
             tuple(rows),
             ("losses.png",),
+            (*_LOSS_NOTES, *([f"Below {_SAID_DB:g} dB each: {small}."] if small else [])),
         )
 
     def _light_part(self) -> Part:
@@ -317,6 +339,6 @@ def _judged(row: LossRow) -> str:
     return f"{size}: the sources do not make the image's error, and a cause is missing"
 
 
-def _with_error(value: float, error: float, unit: str) -> str:
-    # Zero has no sign.
-    return f"{value:z.2f} \N{PLUS-MINUS SIGN} {error:.2f}{unit}".replace("-", "\N{MINUS SIGN}")
+def _cause(row: CauseRow) -> str:
+    """The cause of a ``row`` in words."""
+    return _CAUSES.get(row.cause, row.cause.replace("-", " "))

@@ -90,6 +90,7 @@ class CampaignResult:
             ]
         heads = self.section.heads if self.section else HEADS
         said = [f"{claim.verdict}: {claim.claim} ({claim.told(heads)})" for claim in self.claims]
+        said += self.section.warnings if self.section else ()
         return [*said, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
 
 
@@ -229,7 +230,7 @@ class _Campaign:
         results.table.write(folder / f"{experiment.name}.csv")
         write_figures(folder, figures)
         section = Section.of(experiment, self.study, self.scope, claims, figures, results)
-        build_page([section], folder / f"{experiment.name}.html", experiment.title)
+        build_page([section], folder / f"{experiment.name}.html", section.title)
         rows = tuple(dict(row) for row in results.table.rows)
         found = CampaignResult(self.study, str(folder), there, 0, seconds, rows, claims, tuple(figures), section)
         self._write(folder, status="complete", **found.payload())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from textwrap import wrap
+from textwrap import fill, wrap
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ _ROW = 0.27
 """Inches of a row of a waterfall: a line of text, and a third of one between two."""
 _COLUMNS = (14.0, 92.0)
 """Points from a waterfall to the numbers beside it: "-23.1 ± 0.2" has 60."""
+_UPRIGHT_LETTERS = 36
+"""Of a line along a figure of curves."""
 _LETTERS = 122
 """Of a line below a figure, small ones."""
 _END, _QUIET = "#c7d2de", "#6b7280"
@@ -61,6 +63,10 @@ def curves(
         whether every x that was measured has a tick.
     title
         of all panels.
+
+    Notes
+    -----
+    A curve alone needs no name: an empty one has no line in the legend.
     """
     figure, _ = figure_of(0.46 * WIDTH)
     figure.clear()
@@ -76,7 +82,7 @@ def curves(
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
         axes.tick_params(labelsize=FONT - 1)
-        label_axes(axes, x, y if axes is places[0][0] else "")
+        label_axes(axes, x, fill(y, _UPRIGHT_LETTERS) if axes is places[0][0] else "")
         if log:
             axes.set_xscale("log")
         if ticks:
@@ -89,11 +95,10 @@ def curves(
     shown_by_name: dict[str, Any] = {}
     for axes in places[0]:  # a panel may lack curves that another has
         shown_by_name |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-    labels = [name for name in names if name in shown_by_name]
-    handles = [shown_by_name[name] for name in labels]
-    figure.legend(
-        handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=min(len(labels), 4)
-    )
+    labels = [name for name in names if name and name in shown_by_name]
+    if labels:
+        handles, columns = [shown_by_name[name] for name in labels], min(len(labels), 4)
+        figure.legend(handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
     if title:
         figure.suptitle(title, fontsize=FONT + 1)
     return figure
@@ -161,18 +166,33 @@ def paired(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: 
     return figure
 
 
-def bars(values: Mapping[str, Mean], x: str) -> Figure:
-    """A bar and its error for each of some ``values``, the largest on top; ``x`` names the axis, with its unit."""
-    ordered = sorted(values.items(), key=lambda item: item[1].value)
-    figure, axes = figure_of(0.9 + _ROW * len(ordered))
-    rows, lengths = np.arange(len(ordered)), [mean.value for _, mean in ordered]
-    axes.barh(rows, lengths, 0.66, xerr=[mean.error for _, mean in ordered], color=_END, capsize=3)
-    axes.set_yticks(rows, [typeset(name) for name, _ in ordered])
+def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
+    """A bar and its error for each value, the largest on top.
+
+    Parameters
+    ----------
+    kinds
+        values by name, by what they are: two kinds at most, each in its colour.
+    x
+        name of the axis, with its unit.
+    """
+    values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
+    ordered = sorted(values, key=lambda value: value[0].value)
+    figure, axes = figure_of(1.2 + _ROW * len(ordered))
+    for colour, kind in zip((BLUE, _END), kinds, strict=False):
+        own = [(row, mean) for row, (mean, _, of) in enumerate(ordered) if of == kind]
+        if own:
+            rows, means = zip(*own, strict=True)
+            errors = [mean.error for mean in means]
+            axes.barh(rows, [mean.value for mean in means], 0.66, xerr=errors, color=colour, capsize=3, label=kind)
+    axes.set_yticks(range(len(ordered)), [typeset(name) for _, name, _ in ordered])
     axes.tick_params(axis="y", length=0)
-    most = max(mean.value + mean.error for _, mean in ordered)
-    least = min([0.0, *(1.1 * (mean.value - mean.error) for _, mean in ordered if mean.value < 0)])
+    most = max(mean.value + mean.error for mean, _, _ in ordered)
+    least = min([0.0, *(1.1 * (mean.value - mean.error) for mean, _, _ in ordered if mean.value < 0)])
     axes.set_xlim(least, 1.1 * most or 1.0)
     axes.set_ylim(-0.6, len(ordered) - 0.4)
+    if len({kind for _, _, kind in ordered}) > 1:
+        axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     label_axes(axes, x, "", grid="x")
     return figure
 

@@ -91,3 +91,8 @@ def label(name: str) -> str:
     kind, _, size = name.partition(":")
     count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
     return f"{count} {'Hadamard' if kind == 'hadamard' else kind}" if count else kind.capitalize()
+
+
+def in_text(name: str) -> str:
+    """The same inside a sentence: "uniform", "49 dots", "64 Hadamard"."""
+    return label(name)[:1].lower() + label(name)[1:]

@@ -158,8 +158,10 @@ class _Evidence:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the demo is flagged: those of its frames and factors, and an image that is none."""
-        return self.shots.warnings + self.factors.warnings + _no_image(self.families[self.main])
+        """Why the demo is flagged: those of its frames and factors, and an image that is none or that its frames do not
+        fit."""
+        main = self.families[self.main]
+        return self.shots.warnings + self.factors.warnings + _misfit(main) + _no_image(main)
 
 
 def _page(evidence: _Evidence) -> ReportData:
@@ -167,7 +169,7 @@ def _page(evidence: _Evidence) -> ReportData:
     bench, session = light.bench, factors.manifest.result
     headline, detail = verdict(evidence.families[evidence.main], evidence.families["uniform"])
     unexplained = session["unexplained_residual"]  # JSON has no infinity: None
-    beyond = "" if unexplained is None else f" Beyond the sensor's noise, {unexplained:.1e} of them is left."
+    beyond = "" if not unexplained else f" Beyond the sensor's noise, {unexplained:.1e} of the responses is left."
     return ReportData(
         title=f"Coded-illumination lensless imaging: {bench.loaded.path.parent.name}",
         verdict=headline,
@@ -192,6 +194,7 @@ def _page(evidence: _Evidence) -> ReportData:
             ),
         ),
         accuracy=light.plan.accuracy,
+        error=shots.manifest.total_error,
         effects=light.plan.effects,
         configuration=_configuration(evidence),
         seeds={"root": light.seed},
@@ -204,6 +207,13 @@ def _page(evidence: _Evidence) -> ReportData:
         ),
         warnings=evidence.warnings,
     )
+
+
+def _misfit(family: FamilyResult) -> tuple[str, ...]:
+    if family.rendered is None or family.rendered.trust is None or not family.rendered.trust.cause:
+        return ()
+    # What the image can be used for all the same, rank and condition, is no warning.
+    return (f"{family.label}: {family.rendered.status.partition('. ')[0]}",)
 
 
 def _no_image(family: FamilyResult) -> tuple[str, ...]:

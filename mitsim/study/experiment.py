@@ -94,6 +94,8 @@ class Found:
     arrays: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
+KNOBS = "{knobs}"
+"""In the title of a study that sweeps: what varies."""
 HEADS = "Paper", "Idealised", "Rendered"
 """Of the columns of a page's table of claims."""
 
@@ -218,6 +220,10 @@ class Experiment:
         of a claim's three figures; one without a head has no column.
     tables
         from all results, for the page; all numbers are in the study's CSV and JSON as well.
+    traced
+        whether light is traced, to an accuracy that the page states.
+    note
+        what the reader of its figures has to know beside their titles and axes.
     """
 
     name: str
@@ -230,6 +236,8 @@ class Experiment:
     tables: Callable[[Results], Sequence[PageTable]] = lambda results: ()
     about: str = ""
     heads: tuple[str, str, str] = HEADS
+    note: str = ""
+    traced: bool = True
 
 
 def grouped(points: Sequence[Point]) -> list[Point]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mitsim.core.output import whole_file
 from mitsim.core.pictures import data_uri
-from mitsim.study.typeset import scientific, typeset
+from mitsim.study.typeset import scientific, sentence, typeset
 
 _DPI, _SHOWN_DPI = 220, 110
 """Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
@@ -26,7 +26,7 @@ def rendered(template: str, filters: Mapping[str, Callable[..., str]] | None = N
     template
         file of ``mitsim/study/templates``.
     filters
-        of its own, by name, beside ``sci`` of a number and ``typeset`` of a text.
+        of its own, by name, beside ``sci`` of a number, ``typeset`` of a text and ``sentence`` of a warning.
     **shown
         what it shows, by the names that it has there; one that is missing is an error.
     """
@@ -34,7 +34,8 @@ def rendered(template: str, filters: Mapping[str, Callable[..., str]] | None = N
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters.update({"sci": scientific, "typeset": typeset, **(filters or {})})
+    own = {"sci": scientific, "typeset": typeset, "sentence": sentence}
+    environment.filters.update({**own, **(filters or {})})
     return environment.get_template(template).render(**shown)
 
 

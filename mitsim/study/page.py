@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from mitsim.core.versions import versions
-from mitsim.study.experiment import HEADS, Claim, Experiment, PageTable, Results, Scope
+from mitsim.study.experiment import HEADS, KNOBS, Claim, Experiment, PageTable, Results, Scope, Setup
 from mitsim.study.html import rendered, shown_figure, write_html
 from mitsim.study.pictures import TEST_IMAGES
 
@@ -20,8 +21,9 @@ _NUMBER = re.compile(r"[+-]?\d|nothing$")
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``about``
-    and ``heads`` are the experiment's; ``quick``: of a few points alone."""
+    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``about``,
+    ``heads`` and ``note`` are the experiment's; ``quick``: of a few points alone; ``warnings`` are on what was
+    measured; ``prints``: over how many test images means are."""
 
     name: str
     title: str
@@ -34,6 +36,9 @@ class Section:
     heads: tuple[str, str, str] = HEADS
     tables: tuple[PageTable, ...] = ()
     quick: bool = False
+    note: str = ""
+    warnings: tuple[str, ...] = ()
+    prints: int = 1
 
     @classmethod
     def of(
@@ -54,35 +59,42 @@ class Section:
         claims, figures, results
             what it came to.
         """
-        prints = set(results.table.distinct("picture")) & set(TEST_IMAGES)
-        means = f", over {len(prints)} test images" if len(prints) > 1 else ""
+        prints = sorted(set(results.table.distinct("picture")) & set(TEST_IMAGES))
+        of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
         setup = scope.setup
         command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
-        good = f"frames before noise good to {setup.accuracy:g} (relative rms)"
+        accuracies = sorted({point.setup.accuracy for point in experiment.points(scope)} if experiment.traced else ())
+        asked = " or ".join(f"{each:g}" for each in accuracies)
+        good = f"; frames before noise asked to be good to {asked} (relative rms)" if accuracies else ""
         return cls(
             name=experiment.name,
-            title=experiment.title,
+            title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
             question=experiment.question,
             claims=tuple(claims),
             pictures={name: shown_figure(figure) for name, figure in figures.items()},
-            count=f"{len(results.table)} measurements{means}; {good}",
+            count=f"{len(results.table)} measurements{of}{good}",
             command=" ".join(command),
             about=experiment.about,
             heads=experiment.heads,
             tables=tuple(experiment.tables(results)),
             quick=scope.quick,
+            note=experiment.note,
+            warnings=flagged(experiment.name, results),
+            prints=len(prints),
         )
 
 
 @dataclass(frozen=True)
 class Part:
-    """Of a page of one study: a table of ``rows`` under ``head``, in words, and ``figures`` by file name."""
+    """Of a page of one study: a table of ``rows`` under ``head``, in words, ``figures`` by file name, and ``notes``
+    that say how these are to be read."""
 
     title: str
     lead: str
     head: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     figures: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def numeric(self) -> tuple[bool, ...]:
@@ -91,7 +103,33 @@ class Part:
         return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
 
 
-def build_findings(name: str, title: str, where: str, parts: Sequence[Part], figures: Mapping[str, Figure]) -> str:
+def flagged(name: str, results: Results) -> tuple[str, ...]:
+    """That images of the study ``name`` are flagged in its ``results``, how many and what for; empty where none is."""
+    # An image may have many rows, such as a transfer function's.
+    rows = {
+        (row.get("point"), row.get("exposure"), row.get("psnr_db")): row
+        for row in results.table.rows
+        if row.get("flagged") is not None
+    }
+    found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
+    if not found:
+        return ()
+    reasons = Counter(reason for each in found for reason in each.split("; ") if reason)
+    told = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
+    return (
+        f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, and "
+        f"count all the same (column flagged of {name}.csv){': ' if told else ''}{told}.",
+    )
+
+
+def build_findings(
+    name: str,
+    title: str,
+    where: str,
+    parts: Sequence[Part],
+    figures: Mapping[str, Figure],
+    warnings: Sequence[str] = (),
+) -> str:
     """The page of a study of one bench, as HTML.
 
     Parameters
@@ -104,11 +142,12 @@ def build_findings(name: str, title: str, where: str, parts: Sequence[Part], fig
         of the page, in order.
     figures
         by file name.
+    warnings
+        why its findings may not be trusted, for its head.
     """
     pictures = {file: shown_figure(figure) for file, figure in figures.items()}
-    return rendered(
-        "findings.html", name=name, title=title, where=where, parts=parts, pictures=pictures, versions=versions()
-    )
+    shown = {"title": title, "where": where, "parts": parts, "pictures": pictures, "warnings": warnings}
+    return rendered("findings.html", name=name, versions=versions(), **shown)
 
 
 def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
@@ -132,5 +171,9 @@ def _options(scope: Scope) -> list[str]:
     given = [f"{option} {value}" for option, value in named.items() if value]
     given += [f"-D {name}={value}" for name, value in setup.parameters]
     given += [f"--over {name}={','.join(values)}" for name, values in scope.sweep]
+    given += [f"--measure {','.join(scope.measures)}"] if scope.measures else []
+    given += [f"--patterns {scope.patterns}"] if scope.patterns != Scope.patterns else []
     given += [f"--recipe {scope.recipe}"] if scope.recipe else []
-    return [*given, *(["--quick"] if scope.quick else [])]
+    given += [f"--seed {scope.seeds[0]}"] if scope.seeds[0] != Scope.seeds[0] else []
+    given += [f"--variant {setup.variant}"] if setup.variant != Setup.variant else []
+    return [*given, *(["--allow-outside-files"] if setup.outside else []), *(["--quick"] if scope.quick else [])]

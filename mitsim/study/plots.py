@@ -19,7 +19,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.study.table import Mean
-from mitsim.study.typeset import scientific, typeset
+from mitsim.study.typeset import reflectance, scientific, typeset
 
 if TYPE_CHECKING:
     from mitsim.study.solver_cost import SolverRow
@@ -71,7 +71,7 @@ def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
     titled = {"stated: standard uncertainty": uncertainty, "actual: |image \N{MINUS SIGN} truth|": error}
     for axes, (title, values) in zip(panels, titled.items(), strict=True):
         drawn = axes.imshow(values, vmin=0, vmax=largest, cmap="viridis", interpolation="none")
-        axes.set_title(f"{title}\nrms {scientific(float(np.sqrt(np.mean(np.square(values)))))}", fontsize=FONT)
+        axes.set_title(f"{title}\nrms {reflectance(float(np.sqrt(np.mean(np.square(values)))))}", fontsize=FONT)
         axes.set_xlabel("column [projector pixel]", fontsize=FONT - 1)
         axes.tick_params(labelsize=FONT - 2)
     panels[0].set_ylabel("row [projector pixel]", fontsize=FONT - 1)

@@ -7,6 +7,7 @@ carries no time of writing, so the same data give the same bytes.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +27,7 @@ from mitsim.study.html import figure_uri, rendered, write_html
 from mitsim.study.metrics import Quality
 from mitsim.study.table import Mean
 from mitsim.study.trust import Trust
-from mitsim.study.typeset import DASH, scientific
+from mitsim.study.typeset import DASH, reflectance, sentence
 
 _PATTERN_CORNER = 40
 """Projector pixels a side that are shown of a pattern, so that single ones can be told apart."""
@@ -34,6 +35,8 @@ _SMALLEST = 384
 """Pixels a side of a picture: the width of a column of the page, on a screen of two dots a pixel."""
 _FIGURE_DPI = 160
 """Figures are 8.6 inches wide: 1376 pixels, what the page's width shows on the same screen."""
+_TELLS_DB = 0.5
+"""A gain that counts: a tenth of the squared error."""
 _WORTH_TELLING = 0.01
 """Part of the total time below which a stage has no line of its own: its bar would be three pixels wide."""
 
@@ -86,7 +89,7 @@ class ReportData:
     errors are shown as a picture. ``frames`` are (m, m) [DN] by caption, ``exposure`` says which convention the
     reconstructions used, ``calibration`` is what `calibrate --json`
     says of the session, and its ``status``. ``accuracy`` and ``effects`` are the plan's. ``warnings`` say why the
-    results are flagged, at the head of the page.
+    results are flagged, at the head of the page. ``error`` is of the expected frames, all in all.
     """
 
     title: str
@@ -102,6 +105,7 @@ class ReportData:
     calibration: Mapping[str, Any] | None = None
     budget: tuple[BudgetRow, ...] = ()
     accuracy: float | None = None
+    error: float | None = None
     effects: tuple[PlanRow, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     configuration: Mapping[str, object] = field(default_factory=dict)
@@ -125,7 +129,11 @@ def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
     gain = ours - theirs
     name = baseline.label[:1].lower() + baseline.label[1:]
     beat = f"{best.label} beat {name} by {gain:.1f} dB"
-    headline = beat if gain >= 0 else f"{best.label}: {-gain:.1f} dB below {name}"
+    headline = (
+        beat if gain >= _TELLS_DB else f"{best.label}: {abs(gain):.1f} dB {'above' if gain >= 0 else 'below'} {name}"
+    )
+    if gain >= 0 and best.rendered.trust and best.rendered.trust.cause:
+        headline += ", but part of their light fits no image"
     if not best.rendered.quality.is_image:
         headline = f"{best.label}: no image, {ours:.1f} dB"
     detail = f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors."
@@ -148,7 +156,7 @@ def render_html(report: ReportData) -> str:
     filters: dict[str, Callable[..., str]] = {
         "chi": lambda value: DASH if value is None else shown(value),
         "db": _decibel,
-        "rms": _rms,
+        "rms": reflectance,
         "seconds": _seconds,
         "trouble": _trouble,
         "reflectance": _reflectance,
@@ -226,15 +234,10 @@ def _decibel(value: float | None) -> str:
     return DASH if value is None else f"{value:.1f} dB"
 
 
-def _rms(value: float) -> str:
-    """Of a column of errors in reflectance: four places, as all of them are below 1 and few below 0.001."""
-    return f"{value:.4f}" if value >= 1e-3 else scientific(value)
-
-
 def _seconds(value: float) -> str:
     return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
 
 
 def _trouble(status: str) -> str:
-    """The solver's sentence unless it says that nothing is missing: those sentences begin with "Solved: "."""
-    return "" if status.startswith("Solved: ") else status
+    """How the solver's sentence begins, unless it says that nothing is missing: those begin with "Solved: "."""
+    return "" if status.startswith("Solved: ") else sentence(re.split(r"; |\. ", status)[0])

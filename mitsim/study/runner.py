@@ -135,7 +135,7 @@ def run_study(
 
             where = f"Scene {bench.loaded.path.parent.name}, " if bench else ""
             where += f"patterns {patterns}, seed {request.seed}."
-            page = build_findings(name, findings.title, where, findings.parts(), figures)
+            page = build_findings(name, findings.title, where, findings.parts(), figures, result.warnings)
             with whole_file(folder / f"{name}.html") as part:
                 part.write_text(page, encoding="utf-8")
         for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():

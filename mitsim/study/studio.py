@@ -20,7 +20,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.status import Status
 from mitsim.rig.patterns import PatternFamily
 from mitsim.study.experiment import Point, Setup
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
@@ -48,6 +50,8 @@ class Image:
         whether its run or the solver warned.
     trust
         where it is known: the unexplained part of the measurements, their chi-square, the image's standard uncertainty.
+    reason
+        of a flagged image: what it is flagged for.
     """
 
     image: FloatArray
@@ -57,6 +61,7 @@ class Image:
     exposure_s: float
     flagged: bool
     trust: Mapping[str, float | None] = field(default_factory=dict)
+    reason: str = ""
 
     @classmethod
     def of(
@@ -72,8 +77,9 @@ class Image:
             as for :meth:`mitsim.study.exposures.Unexposed.solve`.
         """
         solution = frames.solve(seconds, lam, binning)
-        quality, good = frames.lit.quality(solution.image), solution.status.verdict.good
-        return cls(solution.image, quality, solution.lam, len(frames.family.shots), seconds, not good)
+        quality, reason = frames.lit.quality(solution.image), reason_of(solution.status)
+        shots = len(frames.family.shots)
+        return cls(solution.image, quality, solution.lam, shots, seconds, bool(reason), reason=reason)
 
     def row(self) -> dict[str, Value]:
         """As a table has it."""
@@ -84,8 +90,16 @@ class Image:
             "shots": self.shots,
             "exposure_s": self.exposure_s,
             "flagged": self.flagged,
+            "reason": self.reason,
             **self.trust,
         }
+
+
+def reason_of(status: Status, misfit: Misfit | None = None) -> str:
+    """What an image of this ``status`` and ``misfit`` is flagged for, reasons apart by "; "; empty where it is not."""
+    cause = f", likely cause: {misfit.cause.value[0]}" if misfit and misfit.flagged and misfit.cause else ""
+    own = () if status.verdict.good else (f"{status.verdict.value}{cause}",)
+    return "; ".join((*own, *(text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in status.flags)))
 
 
 class Studio:
@@ -203,7 +217,8 @@ class Studio:
             "uncertainty": None if told is None else float(np.sqrt(np.square(told).mean())),
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
-        return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust)
+        reason = reason_of(found.status, misfit)
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust, reason)
 
     def _calibrated(self, blank: Setup, seed: int) -> Factors:
         """By this studio, or by another that was first: factors in memory are as a file has them."""

@@ -15,6 +15,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.output import whole_file
 
 Value = str | int | float | bool | None
+_SEEN = 0.05
+"""Error from which one place shows it: less would be 0.0, which is no error."""
 
 
 class Mean(NamedTuple):
@@ -25,9 +27,10 @@ class Mean(NamedTuple):
     of: int
 
     def __str__(self) -> str:
-        return (
-            f"{self.value:.1f}" if math.isnan(self.error) else f"{self.value:.1f} \N{PLUS-MINUS SIGN} {self.error:.1f}"
-        )
+        if math.isnan(self.error):
+            return f"{self.value:.1f}"
+        places = 1 if self.error >= _SEEN else 2
+        return f"{self.value:.{places}f} \N{PLUS-MINUS SIGN} {self.error:.{places}f}"
 
 
 @dataclass(frozen=True)

@@ -38,9 +38,34 @@ def rounded(value: float, error: float) -> str:
     return f"{round(value, places) + 0.0:.{max(places, 0)}f}"
 
 
+def reflectance(value: float) -> str:
+    """An error in reflectance, its ``value``: four places, as all are below 1 and few below 0.001."""
+    return f"{value:.4f}" if value >= 1e-3 else scientific(value)
+
+
+def with_error(value: float, error: float, unit: str = "") -> str:
+    """A number and its standard error, neither finer than 0.01: to the second digit of the error, without one that
+    rounds to nothing.
+
+    Parameters
+    ----------
+    value, error, unit
+        in one unit, which stands behind both.
+    """
+    places = min(max(1 - math.floor(math.log10(error)), 0), 2) if error > 0 else 2
+    told = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
+    # Zero has no sign.
+    return f"{value:z.{places}f}".replace("-", "\N{MINUS SIGN}") + told + unit
+
+
+def sentence(text: str) -> str:
+    """A warning ``text`` of the command line as a sentence: a capital first, a full stop last."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
 def typeset(text: str) -> str:
-    """A ``text`` for people: 4.9e-03 as a power of ten, +- as one sign, 512 x 512 with a times sign, um with a Greek
-    letter."""
+    """A ``text`` for people: 4.9e-03 as a power of ten and 4.9e-02 without one, +- as one sign, 512 x 512 with a times
+    sign, um with a Greek letter."""
     text = _POWER.sub(_power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
     text = _SIZE.sub(rf"\1\2{_TIMES}\2", text)
     return re.sub(r"(?<=[\d\[(] )um\b|(?<=[\[(/])um\b", "\N{GREEK SMALL LETTER MU}m", text)
@@ -50,5 +75,7 @@ def _power(found: re.Match[str]) -> str:
     mantissa, exponent = found[1], int(found[2])
     if not float(mantissa):
         return "0"
+    if mantissa != "1" and 1e-2 <= float(found[0]) < 1e4:  # as ``scientific`` prints it, with the digits that it has
+        return f"{float(found[0]):.{max(len(mantissa.partition('.')[2]) - exponent, 0)}f}"
     power = f"10{str(exponent).translate(_SUPERSCRIPT)}"
     return power if float(mantissa) == 1 and "." not in mantissa else f"{mantissa}{_TIMES}{power}"

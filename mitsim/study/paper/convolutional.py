@@ -171,9 +171,9 @@ def _judged(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
         from a point spread function to what is said of it, and whether the claim holds for it.
     """
     said = {psf: judge(psf) for psf in rows.distinct("psf")}
-    told = {psf: f"{psf} psf: {text}" for psf, (text, _) in said.items()}
+    told = {psf: f"{psf} PSF: {text}" for psf, (text, _) in said.items()}
     holds = verdict(all(each for _, each in said.values()))
-    return Claim(claim, paper, told.get(MEASURED, "no measured psf: -D psf=FILE"), told[TRACED], holds)
+    return Claim(claim, paper, told.get(MEASURED, ""), told[TRACED], holds)
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
@@ -187,7 +187,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             {"": lines},
             "frames",
             log=True,
-            title=f"PSNR by the number of frames, exposure {exposure}, all light, best lambda",
+            title=f"PSNR by the number of frames, exposure {exposure}, best lambda",
         )
     drawn["seconds.png"] = _seconds(speed, psfs)
     few = [each for each in quality.distinct("patterns") if each in (1, 9, 49)]
@@ -200,7 +200,8 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             if len(kept) == len(few):
                 grid[f"{name or 'scene'}, {psf}"] = kept
     if grid:
-        drawn["images.png"] = image_grid(grid, [f"{count} frame{'s' if count > 1 else ''}" for count in few])
+        columns = [f"{count} frame{'s' if count > 1 else ''}" for count in few]
+        drawn["images.png"] = image_grid(grid, columns, f"Images, exposure {EQUAL_FRAME}, best lambda")
     return drawn
 
 
@@ -230,4 +231,9 @@ EXPERIMENT = Experiment(
     "A diffuser for a mask",
     "What do dots bring to a DiffuserCam, and is there no direct solution?",
     _points, _measure, _claims, _figures,
+    note="A frame is the scene convolved with the camera's point spread function (PSF), that of a rendered diffuser "
+    "and, with -D psf=FILE, a measured one besides, which then stands under Idealised; no light of a scene is "
+    "traced. The sensor gets all light. Best lambda: that of the highest PSNR. Times are processor seconds on one "
+    "thread.",
+    traced=False,
 )  # fmt: skip

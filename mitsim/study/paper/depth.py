@@ -36,6 +36,9 @@ ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.
 DEEP = {"cards": ("dots:7", "dots:7x14"), "cookie_bag": ("dots:7", "dots:7x16")}
 """Scenes of many depths, and patterns whose period is too short for them, and long enough."""
 NONE, AUTO, MAP, OWN = FOCUS = ("none", "auto", "map", "own calibration")
+_FOCUSED = {
+    NONE: "factors as calibrated at 400 mm", AUTO: "depth found (--focus auto)", OWN: "calibrated at its own depth"
+}  # fmt: skip
 _SMALL_MM = 5.0
 """What a small variation of depth is taken for: the bag's folds."""
 _ROBUST_DB = 3.0
@@ -119,10 +122,11 @@ def _claims(results: Results) -> Sequence[Claim]:
     ]  # fmt: skip
     own, auto = (table.where(focus=focus, patterns="dots:7").means("psnr_db", "depth") for focus in (OWN, AUTO))
     worst = min(auto[depth].value - own[depth].value for depth in own)
+    which = f"worst of {len(own)} depths" if len(own) > 1 else f"{min(own):g} mm"
     claims.append(
         Claim(
             "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
-            "", "", f"{worst:+.1f} dB at worst, of {len(own)} depths", verdict(worst > -_ROBUST_DB),
+            "", "", f"{worst:+.1f} dB at {which}", verdict(worst > -_ROBUST_DB),
         )
     )  # fmt: skip
     return [*claims, *(_mapped(table.where(scene=scene), scene) for scene in DEEP if len(table.where(scene=scene)))]
@@ -136,7 +140,9 @@ def _mapped(rows: Table, scene: str) -> Claim:
         for focus in (NONE, MAP)
     }
     flagged = all(row["flagged"] for row in rows.where(patterns=short, focus=MAP).rows)
-    gains = ", ".join(f"{label(name)} {means[name, NONE]:.1f} to {means[name, MAP]:.1f} dB" for name in (short, long))
+    gains = "; ".join(
+        f"{label(name)} {means[name, NONE]:.1f} dB, with depths {means[name, MAP]:.1f} dB" for name in (short, long)
+    )
     better = means[long, MAP] > means[long, NONE] + _ROBUST_DB and flagged
     return Claim(
         f"A depth for each pixel (--focus map) mends {scene}, and is flagged where dots are too near to each other",
@@ -151,16 +157,22 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         f"{baseline:g} mm": ideal.where(patterns="dots:7", along="columns", baseline=baseline).means("psnr_db", "depth")
         for baseline in ideal.distinct("baseline")
     }
-    drawn = {"baseline.png": curves({"idealised, 49 dots, by baseline": by_baseline}, "depth of the plane [mm]")}
+    axis = "depth of the plane [mm]"
+    title = "Idealised plane, 49 dots, by the distance between camera and projector"
+    drawn = {"baseline.png": curves({"": by_baseline}, axis, title=title)}
     own = {
         name: rows.where(along="columns", baseline=60.0).means("psnr_db", "depth")
         for name, rows in by_patterns(ideal).items()
     }
-    drawn["patterns.png"] = curves({"idealised, 60 mm, by patterns": own}, "depth of the plane [mm]")
+    title = "Idealised plane, projector 60 mm beside the camera, by patterns"
+    drawn["patterns.png"] = curves({"": own}, axis, title=title)
     focus = {
-        name: rendered.where(patterns="dots:7", focus=name).means("psnr_db", "depth") for name in (NONE, AUTO, OWN)
+        _FOCUSED[name]: rendered.where(patterns="dots:7", focus=name).means("psnr_db", "depth")
+        for name in (NONE, AUTO, OWN)
     }
-    drawn["focus.png"] = curves({"rendered, 60 mm, 49 dots, by focus": focus}, "depth of the sheet [mm]")
+    drawn["focus.png"] = curves(
+        {"": focus}, "depth of the sheet [mm]", title="Rendered sheet, projector 60 mm beside the camera, 49 dots"
+    )
     lines = {
         f"{scene}, {label(family)}": table.where(scene=scene, patterns=family)
         for scene in DEEP
@@ -168,7 +180,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     }
     shown: list[Value] = [NONE, MAP]
     if grid := pictured(results, lines, "focus", shown):
-        drawn["images.png"] = image_grid(grid, ["one depth", "a depth for each pixel"], "rendered, 60 mm")
+        drawn["images.png"] = image_grid(
+            grid, ["one depth", "a depth for each pixel"], "Rendered scenes of many depths"
+        )
     return drawn
 
 

@@ -77,7 +77,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         lines = by_print(table.where(patterns=family, exposure=EQUAL_FRAME))
         if grid := pictured(results, lines, "mask_distance", distances):
             drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
-                grid, [f"{each} mm" for each in distances], f"{label(family)}, {EQUAL_FRAME}, by sensor to mask"
+                grid, [f"{float(each):g} mm" for each in distances], f"{label(family)}, exposure {EQUAL_FRAME}"
             )
     return drawn
 

@@ -152,7 +152,7 @@ def _both(rows: Table) -> tuple[Mean, Mean]:
 def _claims(results: Results) -> Sequence[Claim]:
     return [
         Claim(
-            f"{name}: its loss is predicted to {AGREE_DB:g} dB", "", f"{_said(predicted)} dB lost",
+            f"{name}: loss predicted within {AGREE_DB:g} dB", "", f"{_said(predicted)} dB lost",
             f"{_said(measured)} dB lost", verdict(abs(measured.value - predicted.value) <= AGREE_DB),
         )
         for name, (measured, predicted) in _losses(results.table).items()
@@ -184,7 +184,7 @@ EXPERIMENT = Experiment(
     about="PSNR that an image loses when one thing moves after the calibration. Measured: frames after the drift, "
     "solved with the factors and lambda from before it, against the same noise without the drift; one standard error "
     "over sessions and noise. Predicted: closed forms of these factors, the truth and the mean noise; no frame is "
-    "formed. Their uncertainty is what they leave out of the image without a drift, such as detail inside projector "
-    "pixels.",
+    "formed. Their uncertainty, the bars of the figure, is what they leave out of the image without a drift, such as "
+    "detail inside projector pixels.",
     heads=("", "Predicted", "Measured"),
 )  # fmt: skip

@@ -142,7 +142,8 @@ def _claims(results: Results) -> Sequence[Claim]:
                     f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
                     "",
                     "",
-                    f"{reached} dB by {enough[0] if enough else max(means)} frames, measured {best} dB by {most}",
+                    f"{reached} dB with {enough[0] if enough else max(means)} frames; measured factors {best} dB with "
+                    f"{most}",
                     "confirmed" if enough else "not confirmed",
                 )
             )
@@ -160,7 +161,8 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             }
             for name in FACTORS
         }
-    return {"psnr.png": curves(panels, "frames of the calibration session", log=True)}
+    title = "PSNR by the frames of the calibration session"
+    return {"psnr.png": curves(panels, "frames of the calibration session", log=True, title=title)}
 
 
 EXPERIMENT = Experiment(
@@ -170,8 +172,9 @@ EXPERIMENT = Experiment(
     _points, _measure, _claims, _figures,
     about="PSNR of images with three kinds of factors. Measured: each number of them by a session of striped light. "
     "Wave and geometric: the closed-form shadow of the mask, with diffraction and without, whose distance, shift, "
-    "rotation, magnification and gain are fitted to a few frames of that session. The mask is 50 um too far off and 37 "
-    "and 21 um beside its place. A session's brightest pixel fills the stated part of the full well; the images' "
-    "frames are bright. Bars are one standard error over seeds.",
+    "rotation, magnification and gain are fitted to a few frames of that session. The mask is 50 um too far off and "
+    "37 and 21 um beside its place. A session's brightest pixel fills the stated part of the full well; the images' "
+    "frames are bright. Bars are one standard error over seeds. Frames are simulated with the very shadow that the "
+    "wave model has: what a real mask has beside it only measured factors hold.",
     heads=("", "", "PSNR"),
 )  # fmt: skip

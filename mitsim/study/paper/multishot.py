@@ -21,7 +21,7 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED, LitScene, Unexposed
 from mitsim.study.paper.measure import TOLERANCE_DB, by_print, judged, panels, pictured, shown, stated
 from mitsim.study.pictures import QUICK_IMAGES
-from mitsim.study.studio import Image, Studio
+from mitsim.study.studio import Image, Studio, reason_of
 from mitsim.study.sweepcam import MovedMask, Places, ideal_places
 from mitsim.study.table import Table
 
@@ -86,8 +86,8 @@ def _moved(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
     for exposure in EXPOSURES:
         seconds = mask.seconds(rows, columns, exposure)
         found = mask.solve(rows, columns, seconds)
-        quality, good = lit.quality(found.image), found.status.verdict.good
-        images[exposure] = Image(found.image, quality, found.lam, point["frames"], seconds, not good)
+        quality, reason = lit.quality(found.image), reason_of(found.status)
+        images[exposure] = Image(found.image, quality, found.lam, point["frames"], seconds, bool(reason), reason=reason)
     return images
 
 
@@ -151,7 +151,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     names = {UNIFORM: "49 uniform", SWEPT: "SweepCam, 49", DOTS: "49 dots"}
     shown = table.where(exposure=EQUAL_FRAME, frames=_FRAMES)
     if grid := pictured(results, by_print(shown), "patterns", list(names)):
-        drawn["images.png"] = image_grid(grid, list(names.values()), f"exposure {EQUAL_FRAME}")
+        drawn["images.png"] = image_grid(grid, list(names.values()), f"Images of 49 frames, exposure {EQUAL_FRAME}")
     return drawn
 
 

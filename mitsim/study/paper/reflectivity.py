@@ -157,16 +157,16 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         for subject in swept:
             found = peak.where(subject=subject).rows
             images = [_shown(results, row, name, "psnr_db") for row in found]
-            drawn[f"images_{subject}.png"] = image_grid(
-                {subject: images}, [f"alpha {row['roughness']}" for row in found]
-            )
+            columns = [f"alpha {row['roughness']}" for row in found]
+            drawn[f"images_{subject}.png"] = image_grid({subject: images}, columns, f"By roughness, {name}")
     rows = [row for row in peak.rows if row["subject"] not in swept]
     names = [str(row["subject"]).replace("_", " ") for row in rows]
     shown = [(*_truths(results, row), *_images(results, row, results.table)) for row in rows]
     titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in FAMILIES)]
-    drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles)
+    drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
     causes = [[_shown(results, row, cause, f"{cause}_db") for cause in CAUSES] for row in rows]
-    drawn["causes_shipped.png"] = image_grid(dict(zip(names, causes, strict=True)), list(_NAMES.values()))
+    title = f"Errors against matt paint by cause, {label(_DRAWN[0])}, {_DRAWN[1]}: grey is no error"
+    drawn["causes_shipped.png"] = image_grid(dict(zip(names, causes, strict=True)), list(_NAMES.values()), title)
     return drawn
 
 
@@ -200,4 +200,9 @@ EXPERIMENT = Experiment(
     "Gloss",
     "What do shiny surfaces do to the image, and by which cause?",
     _points, _measure, _claims, _figures,
+    note="Each scene has a twin of matt paint, the truth that errors are taken against; apparent is what the glossy "
+    "scene shows, its mean over the sensor, the truth of the images' decibels. As the matt scene: exposed as long as "
+    "the twin, so that highlights saturate. Decibels of a cause are the PSNR that its errors alone would leave. "
+    "Gloss over pixels: brightness that is not the matt one; gloss over sensor: light of a projector pixel that "
+    "changes over the sensor.",
 )  # fmt: skip

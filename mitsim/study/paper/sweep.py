@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 
 from mitsim.study.asked import MEASURES, NO_SCENE, OTHERS, check_sweep, number_of
 from mitsim.study.charts import curves
-from mitsim.study.experiment import Claim, Experiment, Point, Results, Scope, Setup, grouped
+from mitsim.study.experiment import KNOBS, Claim, Experiment, PageTable, Point, Results, Scope, Setup, grouped
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED
 from mitsim.study.paper.measure import imaged
-from mitsim.study.table import Value
+from mitsim.study.table import Table, Value
+from mitsim.study.typeset import DASH, scientific
 
 
 def _points(scope: Scope) -> Sequence[Point]:
@@ -44,8 +45,7 @@ def _claims(_: Results) -> Sequence[Claim]:
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     """Each measure over the first knob that has numbers; a curve for each value of the others."""
-    table = results.table
-    knobs = [name for name in table.columns if name not in OTHERS and len(table.distinct(name)) > 1]
+    table, knobs = results.table, _knobs(results.table)
     numeric = [name for name in knobs if all(_is_number(value) for value in table.distinct(name))]
     if not numeric:
         return {}
@@ -56,11 +56,36 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         shown = {}
         for values in product(*(table.distinct(other) for other in others)):
             chosen = table.where(**dict(zip(others, values, strict=True)))
-            label = ", ".join(f"{other} {value}" for other, value in zip(others, values, strict=True)) or "all"
+            label = ", ".join(f"{other} {value}" for other, value in zip(others, values, strict=True))
             means = {value: chosen.where(**{along: value}) for value in chosen.distinct(along)}
             shown[label] = {float(value): rows.mean(column) for value, rows in means.items() if rows.numbers(column)}
-        drawn[f"{name}.png"] = curves({"": shown}, along.replace("_", " "), axis)
+        drawn[f"{name}.png"] = curves({"": shown}, along, axis)
     return drawn
+
+
+def _tables(results: Results) -> Sequence[PageTable]:
+    """Each measure at each setting, and how many images of it are flagged."""
+    table, knobs, rows = results.table, _knobs(results.table), []
+    for values in product(*(table.distinct(name) for name in knobs)):
+        chosen = table.where(**dict(zip(knobs, values, strict=True)))
+        if chosen.rows:
+            told = [_told(chosen, MEASURES[name][0]) for name in results.measures]
+            count = sum(bool(row.get("flagged")) for row in chosen.rows)
+            rows.append((", ".join(map(str, values)) or DASH, *told, f"{count} of {len(chosen)}"))
+    heads = ", ".join(knobs), *(name.replace("_", "-") for name in results.measures), "flagged"
+    return [PageTable("Measures by setting, PSNR in dB", heads, tuple(rows))]
+
+
+def _told(rows: Table, column: str) -> str:
+    """Mean of a ``column``; a dash where it has no number."""
+    if not rows.numbers(column):
+        return DASH
+    return str(rows.mean(column)) if column == MEASURES["psnr"][0] else scientific(rows.mean(column).value)
+
+
+def _knobs(table: Table) -> list[str]:
+    """Columns of a ``table`` that were varied."""
+    return [name for name in table.columns if name not in OTHERS and len(table.distinct(name)) > 1]
 
 
 def _is_number(value: Value) -> bool:
@@ -71,4 +96,13 @@ def _is_number(value: Value) -> bool:
     return True
 
 
-EXPERIMENT = Experiment("sweep", "A sweep", "What does a knob do to the image?", _points, imaged, _claims, _figures)
+EXPERIMENT = Experiment(
+    "sweep",
+    f"Sweep of {KNOBS}",
+    "What does it do to the image?",
+    _points, imaged, _claims, _figures, _tables,
+    about="Rendered frames with the sensor's noise, exposed at equal peak unless the exposure varies (the brightest "
+    "pixel fills the same part of the full well), and the images that mitsim reconstruct makes of them, with "
+    "factors calibrated by a session of the same camera. Parameters have the names and units of the scene file, "
+    "where lengths are in mm.",
+)  # fmt: skip

@@ -155,4 +155,9 @@ EXPERIMENT = Experiment(
     "From the idealised model to rendered frames",
     "What does each physical effect cost in decibels: alone, in order, and left out of the whole?",
     _points, _measure, _claims, _figures,
+    about="An image of 49 dots, exposed at equal peak, from the idealised model (even light on a plane, the mask's "
+    "geometric shadow, factors known) to rendered frames, one physical effect after the other. Model assumed: the "
+    "solver keeps the idealised camera's factors. Model calibrated: it has factors of a session with the same "
+    "effects.",
+    heads=("", "Before", "After"),
 )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mitsim.study.charts import curves, image_grid, paired
+from mitsim.study.charts import bars, curves, image_grid, paired
 from mitsim.study.table import Mean
 
 
@@ -62,3 +62,22 @@ def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
     )
     assert [container.has_xerr for container in both.axes[0].containers if hasattr(container, "has_xerr")] == [True]
     assert [tick.get_text() for tick in both.axes[0].get_yticklabels()] == ["mask, 2 \N{GREEK SMALL LETTER MU}m"]
+
+
+def test_a_curve_alone_has_no_legend_and_a_long_name_of_an_axis_two_lines() -> None:
+    """(Planted: one line, which a figure cut off.)"""
+    curve = {"1": Mean(1.0, 0.1, 2), "2": Mean(2.0, 0.1, 2)}
+    figure = curves({"": {"": curve}}, "x [mm]", "misfit: part of the measurements that no image explains [1]")
+    assert not figure.legends and "\n" in figure.axes[0].get_ylabel()
+
+
+def test_what_an_image_has_lost_and_would_lose_are_told_apart() -> None:
+    """Bars of two kinds are in one order, each kind in its colour. (Planted: one colour.)"""
+    kinds = {"has lost": {"noise": Mean(2.0, 0.1, 1)}, "would lose": {"b": Mean(3.0, 0.1, 1), "a": Mean(1.0, 0.1, 1)}}
+    (axes,) = bars(kinds, "lost [dB]").axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "noise", "b"]
+    legend = axes.get_legend()
+    assert legend and [text.get_text() for text in legend.get_texts()] == ["has lost", "would lose"]
+    assert len({patch.get_facecolor() for patch in axes.patches}) == 2
+    single = bars({"has lost": kinds["has lost"], "would lose": {}}, "lost [dB]").axes[0]
+    assert single.get_legend() is None

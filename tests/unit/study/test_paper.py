@@ -11,11 +11,13 @@ from mitsim.core.errors import MitsimError
 from mitsim.study import EXPERIMENTS, PAPER, find_experiment
 from mitsim.study.asked import measures_of, values_of
 from mitsim.study.campaign import Where, run_experiment
-from mitsim.study.experiment import IMAGE, Results, Scope, Setup
+from mitsim.study.experiment import IMAGE, Point, Results, Scope, Setup
+from mitsim.study.page import Section, build_page, flagged
 from mitsim.study.paper.measure import judged, pictured, stated
 from mitsim.study.points import batches
 from mitsim.study.table import Table
 
+TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))
 
 
@@ -82,6 +84,54 @@ def test_images_are_those_of_their_rows() -> None:
     grid = pictured(found, lines, "number", (2, 1), "number {number}")
     assert list(grid) == ["a"]
     assert [(image[0, 0], caption) for image, caption in grid["a"]] == [(1, "number 2"), (0, "number 1")]
+
+
+def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
+    """An image of many rows, such as a transfer function's, counts once. (Planted: nothing said; rows counted.)"""
+    same = {"exposure": "equal peak", "psnr_db": 20.0}
+    rows = [
+        {"point": "a", "flagged": True, "reason": "misfit, likely cause: depth; The capture was flagged: dim", **same},
+        *[{"point": "b", "flagged": True, "reason": "misfit, likely cause: depth", **same}] * 5,
+        {"point": "c", "flagged": False, "reason": "", **same},
+        {"point": "d", "square": 1.0},
+    ]
+    (text,) = flagged("toy", Results(Table(tuple(rows))))
+    assert text.startswith("2 of 3 images are flagged") and "toy.csv" in text
+    assert text.endswith(f": 2 {TIMES} misfit, likely cause: depth; 1 {TIMES} The capture was flagged: dim.")
+    assert not flagged("toy", Results(Table(tuple(rows[-2:]))))
+
+
+def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_path: Path) -> None:
+    """Knobs without numbers have no figure, and a table all the same. (Planted: --measure and --patterns left out;
+    the lead of the paper's claims.)"""
+    knob, measures = ("mask", ("separable", "flatcam")), ("psnr", "misfit")
+    scope = Scope(Setup(), (None,), (3,), sweep=(knob,), measures=measures, patterns="dots:4")
+    experiment = find_experiment("sweep")
+    values = zip(experiment.points(scope), (31.24, 20.0), (0.0, 0.05), (False, True), strict=True)
+    rows = [
+        {"point": point.key, **point.row(psnr_db=psnr, misfit=misfit, flagged=off, reason="misfit" if off else "")}
+        for point, psnr, misfit, off in values
+    ]
+    results = Results(Table(tuple(rows)), measures=measures)
+    assert not experiment.figures(results)
+    section = Section.of(experiment, "sweep", scope, (), {}, results)
+    page = build_page([section], tmp_path / "sweep.html", section.title).read_text()
+    said = (
+        "mitsim study sweep photograph --over mask=separable,flatcam --measure psnr,misfit --patterns dots:4 --seed 3"
+    )
+    assert section.command == said and "Sweep of mask" in page and "Zheng" not in page
+    assert "1 of 2 images are flagged" in page
+    (table,) = section.tables
+    assert table.rows == (("separable", "31.2", "0", "0 of 1"), ("flatcam", "20.0", "0.0500", "1 of 1"))
+
+
+@pytest.mark.parametrize("name", ["reflectivity", "separation"])
+def test_a_page_states_the_accuracy_that_light_was_traced_to(name: str) -> None:
+    """(Planted: that of the scope, three times as fine.)"""
+    experiment = find_experiment(name)
+    point: Point = experiment.points(WHOLE)[0]
+    results = Results(Table(({"point": point.key},)))
+    assert "good to 0.003 " in Section.of(experiment, name, WHOLE, (), {}, results).count
 
 
 @pytest.mark.parametrize(

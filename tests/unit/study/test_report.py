@@ -338,3 +338,24 @@ def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
     page = build_findings("toy", "A study", "Scene toy", [part], {"a.png": Figure(figsize=(3.0, 2.0))})
     assert page.count('<th class="n">') == 2 and page.count('<td class="n">') == 4
     assert "512 \u00d7 512 pixels" in page and "2.8\u00d710\u00b9\u00b2" in page and "wide small" in page
+
+
+def test_warnings_of_findings_stand_at_the_head_and_notes_below_the_figures() -> None:
+    """(Planted: warnings on the command line alone.)"""
+    part = Part("Title", "the lead", notes=("how to read it",))
+    page = build_findings("toy", "A study", "Scene toy", [part], {}, ["losses: a cause is missing"])
+    head, body = page.split("</header>")
+    assert "Losses: a cause is missing." in head and body.index("the lead") < body.index("how to read it")
+
+
+def test_a_gain_that_does_not_count_and_light_that_fits_no_image_are_in_the_headline() -> None:
+    """(Planted: "beat" by 0.3 dB, and nothing of a misfit.)"""
+    families = example().families
+    best, theirs = families[3], families[0]
+    assert best.rendered and theirs.rendered and best.rendered.trust
+    near = replace(best.rendered.quality, psnr_db=theirs.rendered.quality.psnr_db + 0.3)
+    trust = replace(best.rendered.trust, cause="")
+    small = replace(best, rendered=replace(best.rendered, quality=near, trust=trust))
+    assert R.verdict(small, theirs)[0] == "49 dots: 0.3 dB above uniform"
+    misfit = replace(best, rendered=replace(best.rendered, trust=replace(trust, cause="depth")))
+    assert R.verdict(misfit, theirs)[0].endswith("dB, but part of their light fits no image")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.study.table import Table
+from mitsim.study.table import Mean, Table
 
 ROWS = tuple(
     {"model": model, "patterns": patterns, "psnr_db": value, "seed": seed}
@@ -49,3 +49,9 @@ def test_a_csv_has_all_columns_and_comes_back(tmp_path: Path) -> None:
     assert list(rows[0]) == ["model", "patterns", "psnr_db", "seed", "note"]
     assert [float(row["psnr_db"]) for row in rows] == [20, 23, 26, 21, 40, 1.5] and rows[-1]["note"] == "a, b"
     assert rows[0]["note"] == "" and rows[-1]["model"] == ""
+
+
+def test_an_error_of_a_mean_is_never_nought() -> None:
+    """(Planted: one place whatever the error, so 0.04 dB was 0.0.)"""
+    assert str(Mean(23.41, 0.04, 2)) == "23.41 \N{PLUS-MINUS SIGN} 0.04"
+    assert str(Mean(23.41, 0.94, 2)) == "23.4 \N{PLUS-MINUS SIGN} 0.9" and str(Mean(23.41, math.nan, 1)) == "23.4"
