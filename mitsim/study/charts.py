@@ -128,7 +128,8 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
             axes.set_yticks([])
             axes.set_xlabel(caption, fontsize=FONT - 2)
             if index == 0:
-                axes.set_title(column, fontsize=FONT - 1)
+                lines = [fill(line, int(size / _LETTER)) for line in column.split("\n")]
+                axes.set_title("\n".join(lines), fontsize=FONT - 1)
         fits = len(name) * _LETTER <= size + _CAPTION
         line[0].set_ylabel(name if fits else name.replace(", ", ",\n"), fontsize=FONT - 1)
     if title:

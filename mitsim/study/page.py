@@ -146,8 +146,16 @@ def build_findings(
         why its findings may not be trusted, for its head.
     """
     pictures = {file: shown_figure(figure) for file, figure in figures.items()}
-    shown = {"title": title, "where": where, "parts": parts, "pictures": pictures, "warnings": warnings}
-    return rendered("findings.html", name=name, versions=versions(), **shown)
+    return rendered(
+        "findings.html",
+        name=name,
+        title=title,
+        where=where,
+        parts=parts,
+        pictures=pictures,
+        warnings=warnings,
+        versions=versions(),
+    )
 
 
 def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:

@@ -137,8 +137,9 @@ def _claims(results: Results) -> Sequence[Claim]:
     def worst(levels: Mapping[str, float]) -> bool:
         return levels[DISC] < _PLAIN_DB and levels[DISC] == min(levels.values())
 
+    plain = " and ".join(name.replace("_", " ") for name in there if name != DISC)  # a quick study has no blade
     return [
-        claim("Gift card and metal blade come out well", "quite good", well),
+        claim(f"{plain.capitalize()} come{'s' * (len(there) == 2)} out well", "quite good", well),
         claim("The compact disc is the worst, with severe artefacts", "severe artefacts", worst),
     ]
 
@@ -200,6 +201,7 @@ EXPERIMENT = Experiment(
     "Gloss",
     "What do shiny surfaces do to the image, and by which cause?",
     _points, _measure, _claims, _figures,
+    heads=("Paper", "", "Rendered"),
     note="Each scene has a twin of matt paint, the truth that errors are taken against; apparent is what the glossy "
     "scene shows, its mean over the sensor, the truth of the images' decibels. As the matt scene: exposed as long as "
     "the twin, so that highlights saturate. Decibels of a cause are the PSNR that its errors alone would leave. "

@@ -44,6 +44,13 @@ def test_a_grid_has_a_title_of_its_own_and_one_for_each_column() -> None:
     assert [axes.get_ylabel() for axes in figure.axes] == ["one", "", "two", ""]
 
 
+def test_long_titles_of_columns_take_two_lines() -> None:
+    """(Planted: one; "as the matt scene" then ran into its neighbour.)"""
+    cells = [(np.zeros((4, 4)), "")] * 6
+    figure = image_grid({"card": cells}, ["49 dots\nas the matt scene"] * 6)
+    assert figure.axes[0].get_title() == "49 dots\nas the matt\nscene"
+
+
 def test_a_title_stands_above_all_panels() -> None:
     """(Planted: the last panel's own.)"""
     figure = curves({"left": {"a": {"1": Mean(1.0, 0.1, 2)}}, "right": {"a": {}}}, "x [mm]", title="both")
