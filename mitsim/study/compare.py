@@ -94,5 +94,5 @@ def label(name: str) -> str:
 
 
 def in_text(name: str) -> str:
-    """The same inside a sentence: "uniform", "49 dots", "64 Hadamard"."""
+    """What people call the patterns ``name`` inside a sentence: "uniform", "49 dots", "64 Hadamard"."""
     return label(name)[:1].lower() + label(name)[1:]
