@@ -33,8 +33,8 @@ def test_claims_of_invented_results(psfs: tuple[str, ...]) -> None:
     uniform, dots, slower, direct, even_so = EXPERIMENT.claims(results(psfs))
     assert uniform.verdict == "confirmed" and dots.verdict == "confirmed only at equal frame"
     assert slower.verdict == direct.verdict == even_so.verdict == "confirmed"
-    assert direct.rendered == "rendered psf: 13 times as long"
-    assert ("-D psf=FILE" in direct.idealised) == (len(psfs) == 1)
+    assert direct.rendered == "rendered PSF: 13 times as long"
+    assert bool(direct.idealised) == (len(psfs) == 2) and "-D psf=FILE" in EXPERIMENT.note
 
 
 def test_a_slow_direct_solver_and_dim_dots_are_told() -> None:
@@ -49,7 +49,7 @@ def test_a_cropped_sensor_is_told_apart() -> None:
     cropped = {**whole.table.where(part="speed", patterns=49).rows[0], "sensor": "cropped", "direct_s": 2.0}
     _, _, _, direct, at_the_edge, _ = EXPERIMENT.claims(Results(Table((*whole.table.rows, cropped))))
     assert direct.verdict == "confirmed" and at_the_edge.verdict == "not confirmed"
-    assert at_the_edge.rendered == "rendered psf: 2 times as long"
+    assert at_the_edge.rendered == "rendered PSF: 2 times as long"
 
 
 def test_a_measured_point_spread_function_is_a_parameter_of_the_study_alone() -> None:

@@ -71,8 +71,8 @@ def test_few_frames_suffice_where_their_image_is_as_good_as_the_longest_sessions
     """Within 0.5 dB of 51.0. (Planted: the shortest session's image; the mean over all frames.)"""
     wave_claim, geometric = EXPERIMENT.claims(results(wave))
     assert wave_claim.verdict == "confirmed" and geometric.verdict == "not confirmed"
-    assert f"by {enough} frames, measured 51.0 \N{PLUS-MINUS SIGN} 1.0 dB by 2048" in wave_claim.rendered
-    assert geometric.rendered.startswith("30.0 dB by 16 frames") and "0.8 of the full well" in geometric.claim
+    assert f"with {enough} frames; measured factors 51.0 \N{PLUS-MINUS SIGN} 1.0 dB with 2048" in wave_claim.rendered
+    assert geometric.rendered.startswith("30.0 dB with 16 frames") and "0.8 of the full well" in geometric.claim
 
 
 def test_each_exposure_is_a_panel_with_all_factors() -> None:
