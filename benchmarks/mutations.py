@@ -27,6 +27,8 @@ _TWINS = (
 _OTHER = dict(_TWINS) | {second: first for first, second in _TWINS}
 _UNTOUCHED = (ast.JoinedStr, ast.Raise, ast.Import, ast.ImportFrom, ast.arg)
 """Messages, imports and annotations: tests of bad input and of the architecture read these."""
+_SYMMETRIC = "min", "max", "minimum", "maximum", "hypot", "array_equal", "vdot"
+"""Functions that the order of their arguments means nothing to."""
 Place = tuple[str, ast.AST, Callable[[ast.AST], None], list[ast.AST]]
 
 
@@ -148,8 +150,7 @@ def _built_in(*names: ast.AST) -> bool:
 
 
 def _symmetric(call: ast.Call) -> bool:
-    """Whether the order of a call's arguments means nothing."""
-    return ast.unparse(call.func).rpartition(".")[2] in ("min", "max", "minimum", "maximum", "hypot", "array_equal")
+    return ast.unparse(call.func).rpartition(".")[2] in _SYMMETRIC
 
 
 def _with(node: ast.AST, **fields: object) -> ast.AST:

@@ -66,6 +66,14 @@ def test_energy_and_coefficients_are_those_of_all_frames(patterns: str, centre: 
     assert np.allclose(model.prepared.image(gain * lack.struck).ravel(), explained, atol=1e-8)
 
 
+def test_what_factors_explain_is_no_lack() -> None:
+    """A term of the factors' own shadow lies in their range. (Planted: an energy of 1 at least.)"""
+    rng, family = np.random.default_rng(3), parse_patterns("dots:3", 6, 0)
+    factors, lit = (rng.random((14, 6)), rng.random((11, 6))), (family.left.astype(float), family.right.astype(float))
+    lack = Lack(Model(prepare(*factors, *lit), factors, lit), (factors,), rng.random((6, 6)))
+    assert np.square(lack.struck).sum() > 1 and lack.energy == pytest.approx(0, abs=1e-9)
+
+
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:8"])
 def test_misfit_is_foretold_and_the_mask_named(patterns: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes without print within pixels, to 5 %: it is foretold from an image that is itself off, by 0.02 rms at

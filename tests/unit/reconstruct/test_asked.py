@@ -1,0 +1,51 @@
+"""What may be asked of an image, up to the ends of every range, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from mitsim.core.errors import ArgumentError
+from mitsim.reconstruct.asked import METHODS, check_asked, check_joint
+
+TAKEN = [
+    *(("auto", method, None, 0) for method in METHODS),
+    *((lam, "tikhonov", None, 0) for lam in (0.0, 1e-300, 5)),
+    *(("auto", "tikhonov", focus, 0) for focus in ("auto", "map", 1e-3, 400)),
+    *(("auto", method, 400.0, 0) for method in METHODS),
+    *(("auto", "tikhonov", None, margin) for margin in (1, 2)),
+]
+REFUSED = [
+    *((("auto", method, None, 0), "method", "use tikhonov, markov or tv") for method in ("gram", "")),
+    *(((lam, "tv", None, 0), "lam", "at least 0, or auto") for lam in (-1e-300, math.inf, math.nan, "none")),
+    *((("auto", "tv", focus, 0), "focus", "above 0 mm") for focus in (0.0, -1.0, math.inf, math.nan, "near")),
+    *((("auto", method, "map", 0), "method", "tikhonov alone") for method in ("markov", "tv")),
+    *((("auto", "tikhonov", None, margin), "margin", "at least 0") for margin in (-1, 1.0, True, False)),
+    *((("auto", "tikhonov", focus, 1), "margin", "leave out focus") for focus in ("auto", "map", 400.0)),
+    *((("auto", method, None, 1), "margin", "tikhonov at the calibrated depth alone") for method in ("markov", "tv")),
+]
+
+
+@pytest.mark.parametrize("asked", TAKEN)
+def test_what_an_image_may_be_asked_by_is_taken(asked: tuple[float | str, str, float | str | None, int]) -> None:
+    check_asked(*asked)
+
+
+@pytest.mark.parametrize(("asked", "name", "said"), REFUSED)
+def test_what_no_image_is_made_by_is_refused(
+    asked: tuple[float | str, str, float | str | None, int], name: str, said: str
+) -> None:
+    """By the name of the argument, and by what it may be. (Planted: 0 taken for a depth, a bool for a number.)"""
+    with pytest.raises(ArgumentError, match=said) as refusal:
+        check_asked(*asked)
+    assert refusal.value.argument == name
+
+
+def test_behind_filters_lambda_is_above_zero() -> None:
+    """(Planted: 0 taken, and infinity.)"""
+    for lam in ("auto", 1e-300, 7):
+        check_joint(lam)
+    for lam in (0.0, -1.0, math.inf, math.nan, "none"):
+        with pytest.raises(ArgumentError, match="a finite number above 0, or auto"):
+            check_joint(lam)
