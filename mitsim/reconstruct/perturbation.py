@@ -148,7 +148,7 @@ class Changed:
     added_common: Gains = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Noise:
     """Noise that is independent in every number, as variances.
 
