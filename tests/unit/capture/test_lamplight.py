@@ -30,15 +30,13 @@ from mitsim.capture.request import Request
 from mitsim.capture.run import _of_unknown_light
 from mitsim.capture.simulation import Simulation
 from mitsim.core.colours import MOSAIC, RUN
-from mitsim.core.errors import MitsimError
-from mitsim.rig.lamplight import SPECTRA_NM, Lamplight, Response, line_units
+from mitsim.rig.lamplight import SPECTRA_NM, Lamplight, Response
 from mitsim.rig.patterns import Lighting
-from mitsim.rig.projector import Lines, Spectrum
+from mitsim.rig.projector import Spectrum
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.lamps import LampTracer, Together
 from tests.conftest import write_small_scene
-from tests.invented import sensor
 from tests.system.conftest import CAMERA
 from tests.unit.capture.test_lamps import ALBEDO, POSITION, seen
 
@@ -262,54 +260,6 @@ def test_light_beyond_a_curve_is_known_to_be_missing(light: Mapping[Any, dict[st
         ends = min(CURVE), max(CURVE)
         inside, whole = counted(*case, *ends), counted(*case)
         assert light[case]["unknown"] == pytest.approx((whole - inside) / whole, abs=0.01)
-
-
-def test_a_number_is_the_efficiency_at_every_wavelength() -> None:
-    response = Response.of(sensor(quantum_efficiency=0.5))
-    assert response.range_nm == SPECTRA_NM and response.beyond_nm == 0
-    assert response.counts == pytest.approx(0.5 * np.linspace(*SPECTRA_NM, len(response.counts)), rel=1e-14)
-    assert line_units(sensor(quantum_efficiency=0.5), Lines((600.0, 400.0), (0.5, 0.5))) == (1 / 300, 1 / 200)
-
-
-def test_lines_behind_filters_share_a_count_as_their_power() -> None:
-    """Together they make as many electrons of a pixel in the mean. (Planted: each line all of it.)"""
-    ends = {"R": 0.0, "G": 0.2, "B": 0.4}
-    curves = {name: {"wavelengths_nm": [390.0, 610.0], "efficiency": [0.4, last]} for name, last in ends.items()}
-    change = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": curves, "binning": 1}
-    behind, lines = sensor(**change), Lines((600.0, 400.0), (0.75, 0.25))
-    units, mean = line_units(behind, lines), np.mean(behind.planes(lines.wavelengths_nm), axis=0)
-    assert units[0] / units[1] == pytest.approx(3)
-    assert sum(mean * units * np.array(lines.wavelengths_nm)) == pytest.approx(1)
-    blind = {name: {"wavelengths_nm": [390.0, 395.0, 610.0], "efficiency": [0.4, 0, 0]} for name in "RGB"}
-    with pytest.raises(MitsimError, match="is blind to all lines of the projector"):
-        line_units(sensor(**{**change, "mosaic_curves": blind}), Lines((600.0, 500.0), (0.75, 0.25)))
-
-
-def test_bands_are_even_and_so_are_their_parts() -> None:
-    response = Response(np.ones(2), (400.0, 800.0))
-    assert response.bands(4) == ((400, 500), (500, 600), (600, 700), (700, 800))
-    assert response.bands(2, 1, 2) == ((500, 600), (700, 800))
-
-
-def test_a_curve_that_goes_on_beyond_spectra_says_how_far() -> None:
-    """Efficiency 0.5 at 830 nm, falling to 0 at 1030 nm: integral of eta lambda over eta lambda there."""
-    curve = {"wavelengths_nm": [400.0, 830.0, 1030.0], "efficiency": [0.5, 0.5, 0.0]}
-    response = Response.of(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))
-    at = np.linspace(830, 1030, 20001)
-    exact = np.trapezoid(0.5 * (1030 - at) / 200 * at, at) / (0.5 * 830)
-    assert response.range_nm == (400.0, 830.0) and response.beyond_nm == pytest.approx(exact, rel=1e-6)
-
-
-def test_a_camera_that_sees_no_spectrum_is_refused() -> None:
-    curve = {"wavelengths_nm": [900.0, 1700.0], "efficiency": [0.5, 0.5]}
-    blind = sensor(quantum_efficiency=None, quantum_efficiency_curve=curve)
-    with pytest.raises(
-        MitsimError, match="of 900 to 1700 nm, and lamps' spectra are of 360 to 830 nm; switch lamps off"
-    ):
-        Response.of(blind)
-    half = {"wavelengths_nm": [400.0, 500.0, 700.0], "efficiency": [0.5, 0.0, 0.0]}
-    with pytest.raises(MitsimError, match="is blind at 600 nm, a line of the projector"):
-        line_units(sensor(quantum_efficiency=None, quantum_efficiency_curve=half), Lines((600.0,), (1.0,)))
 
 
 def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callable[..., Path], variant: str) -> None:

@@ -55,6 +55,33 @@ def test_equals_the_dense_solution_with_the_inverse_covariance(patterns: str, la
     assert found.residual == pytest.approx(residual, rel=1e-6)
 
 
+@pytest.mark.parametrize("left", ["five rows of pixels", "rank five"])
+@pytest.mark.parametrize("lam", [0.0, 0.3])
+def test_what_frames_do_not_tell_is_the_likeliest(left: str, lam: float) -> None:
+    """Of fewer data than unknowns C A^T (A C A^T + lambda)^+ y, the image of the least X^T C^-1 X at lambda 0.
+    (Planted: all right vectors; values that are zero but for rounding kept.)"""
+    rng = np.random.default_rng(1)
+    few, right = rng.random((5, ROWS)), rng.random((11, COLUMNS))
+    factor = few if left == "five rows of pixels" else rng.random((13, 5)) @ few
+    lit = [parse_patterns("uniform", size, 0).left.astype(float) for size in (ROWS, COLUMNS)]
+    whole, known = np.kron(factor, right), np.kron(covariance(ROWS), covariance(COLUMNS))
+    data = whole @ rng.random(ROWS * COLUMNS)
+    data += 0.1 * rng.standard_normal(data.shape)
+    inverse = np.linalg.pinv(whole @ known @ whole.T + lam * np.eye(len(whole)), rcond=1e-12)
+    expected = known @ whole.T @ inverse @ data
+    prepared = prepare(factor, right, *lit).correlated()
+    found = solved(prepared, data.reshape(1, *factor.shape[:1], 11), (1, 1), lam)
+    assert found.image.ravel() == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+
+
+def test_a_rank_stays_what_it_is() -> None:
+    """Rounding of a camera of 64 pixels and rank 20 makes values of 1e-14 of the largest. (Planted: kept; cut at
+    eps / n; ones in their place.)"""
+    rng, lit = np.random.default_rng(0), np.ones((64, 1))
+    side = prepare(*(rng.random((128, 20)) @ rng.random((20, 64)) for _ in range(2)), lit, lit).correlated().left
+    assert (side.singular == 0).sum() == 44 and side.singular[19] > 1e-4 * side.singular[0]
+
+
 def test_coefficients_see_light_as_the_frames_have_it() -> None:
     """W = response_L^T X response_R for any image X, and the image of W / sigma is X. (Planted: the basis for its
     dual.)"""
