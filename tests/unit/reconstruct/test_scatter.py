@@ -67,3 +67,10 @@ def test_shares_of_sources_add_up_in_squares() -> None:
         scatter.deviation(first + second, ERROR) ** 2
     )
     assert share > scatter.deviation(first, ERROR)
+
+
+def test_factors_of_a_dark_scene_scatter_nothing() -> None:
+    """(Planted: sums that begin at 1.)"""
+    scatter = Scatter(LinearImage(LEFT, RIGHT, parse_patterns("dots:2", N, seed=3), LAM), 0 * SCENE)
+    for kind in ("left", "right", "left_light", "right_light"):
+        assert scatter.deviation(Noise(**{kind: 1.0}), ERROR) == 0, kind
