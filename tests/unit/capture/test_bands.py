@@ -1,7 +1,7 @@
 """Mono, bands or lines: the fewest runs that keep half of the accuracy, what is left of it, and what is said."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +13,8 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Request
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
+from mitsim.rig.patterns import Lighting
 from mitsim.rig.projector import Lines
 from tests.unit.capture.invented_evidence import plan
 
@@ -141,3 +143,134 @@ def test_a_plan_says_of_which_tag_mono_knows_no_colours(small_scene: Callable[..
     grey, red = (SceneFacts.of(open_bench(scene, albedo=a)).spectrum for a in ("0.5", "400:0.2, 700:0.5"))
     assert (grey.error_if_off, red.error_if_off) == (0.0, None)
     assert "1 of the scene's tags may have colours, the first small.xml:" in red.reason
+
+
+@dataclass
+class OfLines:
+    """What a look asks of a bench: lines, and what the one alone is."""
+
+    lines: Lines | None = None
+    own: Lines = LASERS
+    alone: Lines | None = None
+    variant: str = "llvm_ad_mono"
+
+    @property
+    def projector(self) -> Any:
+        return SimpleNamespace(lines=self.own, effective_wavelength_nm=self.own.wavelengths_nm[0])
+
+    def in_variant(self, name: str) -> "OfLines":
+        return replace(self, variant=name)
+
+
+def light(line: Lines) -> Any:
+    """(1, 2, 1) of a single line: even in one pixel, and rising with the wavelength in the other."""
+    import numpy as np
+
+    (nm,), (share,) = line.wavelengths_nm, line.shares
+    return share * np.array([[[1.0], [(nm / 500) ** 3]]])
+
+
+@pytest.mark.parametrize(
+    ("lines", "traced"),
+    [(LASERS, [3, 2]), (Lines((450.0, 500.0, 550.0, 600.0, 650.0), (0.1, 0.3, 0.2, 0.3, 0.1)), [4, 1, 3])],
+)
+def test_a_look_finds_what_bands_leave_of_all_lines(
+    lines: Lines, traced: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each against the sum of its own lines, the worst of several; mono before any other variant, and no more lines at
+    once than paths carry. (Planted: bands against all lines; the last band's error for all.)"""
+    import numpy as np
+
+    asked: list[Any] = []
+
+    def deposits(self: Any, of: OfLines) -> list[Lines | None]:
+        asked.append((of.variant, len(of.lines.shares) if of.lines else 0))
+        return [*of.lines.single] if of.lines else [None]
+
+    def electrons(self: Any, of: OfLines, found: Lines | None) -> Any:
+        assert of.alone == found
+        return np.array([[[1.0], [3.0]]]) if found is None else light(found)
+
+    monkeypatch.setattr(bands._Look, "__init__", lambda self, whole: setattr(self, "_bench", whole))
+    monkeypatch.setattr(bands._Look, "_deposits", deposits)
+    monkeypatch.setattr(bands._Look, "_electrons", electrons)
+    monkeypatch.setattr(bands, "line_alone", lambda of, line: replace(of, alone=line))
+    look: Any = bands._Look
+    found = look(OfLines(own=lines)).errors(["lines", "bands:1", "bands:2", "mono"])
+    assert asked == [("llvm_ad_mono", 0), *(("llvm_ad_spectral", count) for count in traced)]
+
+    def left(of: list[Lines], frames: Any) -> float:
+        whole = sum(light(line) for line in of)
+        return bands._relative(frames, whole)
+
+    def leaves(band: Lines) -> float:
+        return left([*band.single], light(Lines((band.mean_nm,), (sum(band.shares),))))
+
+    first, second = lines.bands(2)
+    assert list(found) == ["lines", "bands:1", "bands:2", "mono"] and found["lines"] == 0
+    assert found["mono"] == left([*lines.single], np.array([[[1.0], [3.0]]])) > 0.1
+    assert found["bands:1"] == leaves(*lines.bands(1))
+    assert found["bands:2"] == max(leaves(first), leaves(second)) > 0
+
+
+def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the first to the last, pixels that they light alike in one class; electrons are photons times efficiency.
+    (Planted: shots from the second on; irradiance alone.)"""
+    import numpy as np
+
+    rng, labels = np.random.default_rng(0), np.array([0, 1, 2, 3, 1])
+    weights = np.array(rng.integers(0, 2, (9, 4)), dtype=float)
+    weights[:, 3] = weights[:, 1]
+    family = SimpleNamespace(lighting=Lighting(labels, weights))
+    asked: dict[str, Any] = {}
+
+    def simulation(of: Any, settings: Any) -> Any:
+        def trace(seed: int, first: int, rays: int) -> Any:
+            asked.update(traced=(seed, first, rays), settings=settings)
+            return SimpleNamespace(by_line=lambda count: ["light"] * count)
+
+        def expected(filed: Any, rows: Any, lighting: Any, seed: int, leaking: bool) -> Any:
+            asked.update(rows=list(rows), lighting=lighting, leaking=leaking)
+            return [SimpleNamespace(irradiance=np.full((2, 2), float(number))) for number in range(2)]
+
+        def file(found: Any, of_labels: Any, rays: int) -> Any:
+            asked.update(filed=(found, rays), labels=of_labels)
+            return "filed"
+
+        return SimpleNamespace(direct=SimpleNamespace(trace=trace), file_direct=file, expected=expected)
+
+    monkeypatch.setattr(bands, "Simulation", simulation)
+    of: Any = SimpleNamespace(
+        family=lambda patterns, seed: family,
+        geometry=SimpleNamespace(diffracts=True, scene_distance=400.0),
+        lines=None,
+        projector=SimpleNamespace(effective_wavelength_nm=500.0),
+        sensor=SimpleNamespace(efficiency=lambda nm: nm / 1000),
+    )
+    look = bands._Look(of, Request.of(patterns="dots:3", seed=3))
+    assert np.array_equal(look._lighting.weights[:, look._lighting.labels], weights[[0, 2, 5, 8]][:, labels])
+    assert look._lighting.weights.shape[1] == len({tuple(each) for each in weights[[0, 2, 5, 8]].T})
+    assert look._settings.effects == {"diffraction"} and look._settings.depth == 400
+    assert look._deposits(of) == ["light"]
+    of.lines = LASERS
+    assert look._deposits(of) == ["light"] * 3
+    assert asked["traced"] == (integer(3, "colour"), 0, bands._RAYS) and asked["settings"] == look._settings
+    found = look._electrons(of, "light")  # type: ignore[arg-type]
+    assert found.shape == (2, 2, 2) and (found[1] == 250).all() and not found[0].any()
+    assert asked["filed"] == ("light", bands._RAYS) and asked["labels"] is look._lighting.labels
+    assert asked["rows"] == list(range(look._lighting.weights.shape[1])) and not asked["leaking"]
+    for diffracts, effects in ((False, {}), (True, {"diffraction": False})):
+        of.geometry.diffracts = diffracts
+        assert not bands._Look(of, Request.of(effects=effects))._settings.effects
+    few = SimpleNamespace(lighting=family.lighting.shots([1, 4]))
+    of.family = lambda patterns, seed: few
+    assert len(bands._Look(of, Request.of())._lighting.weights) == 2
+
+
+def test_a_choice_falls_back_on_the_variant_that_was_set(chosen: Callable[..., bands.Coloured]) -> None:
+    """Mono after a look at lines sets its own variant again; without a look the bench is the one that it was."""
+    of = bench()
+    found = chosen(of, errors={"mono": 0.0, "bands:1": 0.0, "bands:2": 0.0, "lines": 0.0})
+    assert found.bench is not of and found.bench.words == ("llvm_ad_mono",)  # type: ignore[attr-defined]
+    grey = bench(coloured=False)
+    assert chosen(grey).bench is grey

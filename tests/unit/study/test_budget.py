@@ -174,21 +174,21 @@ def test_a_drift_costs_what_it_adds_to_the_error_that_is_there() -> None:
     def told(drift: Drift) -> Expected:
         if not drift.kinds:
             return Expected(SCENE + 2 * STEADY, 0.1)
-        if drift.kinds == ("lamp",):
-            raise MitsimError("no lamps")
+        if drift.kinds == ("exposure",):
+            raise MitsimError("no time")
         return Expected(images[drift.kinds[0]] + STEADY, 0.1)
 
     measured = 0.05
     stand: Any = SimpleNamespace(
         told=told,
         lit=SimpleNamespace(truth=SCENE),
-        recipe=SimpleNamespace(drift=Drift(mask_rows_um=0.4, power=0.1, lamp=0.2)),
+        recipe=SimpleNamespace(drift=Drift(mask_rows_um=0.4, exposure=0.2, power=0.1)),
         before_db=-10 * math.log10(measured),
         scatter=lambda drift, error: 1e-6 * (error == STEADY).all(),
     )
     scatter: Any = SimpleNamespace(common=lambda drawn, error: drawn.datum * float(np.abs(error).sum()))
     rows, refused = budget._drifts(stand, budget._Budget({}, scatter, Noise(datum=noise), STEADY), measured)
-    assert refused == ["lamp: no lamps"]
+    assert refused == ["exposure: no time"]
     assert [row.name for row in rows] == ["mask down the rows, 0.4 um", "projector's power, 10 %"]
     row, none = rows
     assert none.lost_db == 0 and none.error_db == pytest.approx(10 * math.log10(1 + 1e-3 / measured))
@@ -199,3 +199,40 @@ def test_a_drift_costs_what_it_adds_to_the_error_that_is_there() -> None:
     chance = math.hypot(noise * 0.2, 1e-3) / measured
     assert row.lost_db == pytest.approx(lost)
     assert row.error_db == pytest.approx(math.hypot(lost - apart, 10 * math.log10(1 + chance / (1 + added / measured))))
+
+
+def test_rows_are_all_parts_then_what_is_left_then_drifts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an image that 0.06 is told of and 0.05 measured; the chance of the whole is a mean over its pixels. (Planted:
+    the sum over them; where it comes from in the place of the source.)"""
+    parts = {("capture", "shot noise"): budget._Part(0.04, 1e-3), ("scene", "depth"): budget._Part(0.02)}
+    asked: list[Any] = []
+    scatter: Any = SimpleNamespace(deviation=lambda noise, error: asked.append((noise, error)) or 0.16)
+    whole = budget._Budget(parts, scatter, Noise(datum=1.0), STEADY)
+    drift = LossRow("drift", "power", "10 %", 1.0, 0.1)
+    monkeypatch.setattr(budget, "_budget", lambda *given: asked.append(given) or whole)
+    monkeypatch.setattr(budget, "_drifts", lambda *given: asked.append(given) or ([drift], ["lamp: no"]))
+    stand: Any = SimpleNamespace(before_db=-10 * math.log10(0.05))
+    rows, refused = budget.losses(stand, "session", "exact")  # type: ignore[arg-type]
+    shot, depth, left, last = rows
+    assert refused == ["lamp: no"] and last is drift
+    measured = pytest.approx(0.05)
+    assert asked == [(stand, "session", "exact"), (whole.drawn, STEADY), (stand, whole, measured)]
+    assert (shot.lost_db, shot.error_db) == pytest.approx(budget.gained(0.04, 0.05, 0.06, 1e-3))
+    assert (depth.lost_db, depth.error_db) == pytest.approx(budget.gained(0.02, 0.05, 0.06))
+    assert [(row.of, row.source, row.amount, row.deviation) for row in (shot, depth)] == [
+        ("capture", "shot noise", "", 1e-3),
+        ("scene", "depth", "", 0.0),
+    ]
+    assert (shot.squared_error, depth.squared_error) == (0.04, 0.02)
+    assert (left.squared_error, left.deviation) == pytest.approx((-0.01, 0.01))
+    assert (drift.squared_error, drift.deviation) == (0, 0)
+
+
+def test_chance_is_in_how_sure_a_part_is() -> None:
+    """A deviation as large as a part that is a quarter, 3.01 - 1.25 dB; with what is not explained as squares add."""
+    alone = budget.gained(1.0, 4.0, 4.0, 1.0)
+    assert alone == pytest.approx((1.2494, 3.0103 - 1.2494), abs=1e-4)
+    assert budget.gained(1.0, 4.0, 2.0, 1.0)[1] == pytest.approx(2**0.5 * alone[1])
+    more = budget.gained(1.0, 4.0, 8.0, 1.0)
+    assert more[1] == pytest.approx(math.hypot(1.2494 - 0.5799, 0.5799), abs=1e-4)
+    assert budget.gained(4.0, 4.0, 4.0)[0] == pytest.approx(90)
