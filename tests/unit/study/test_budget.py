@@ -137,15 +137,17 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
         ("capture", RENDERING): Noise(light=3e-4),
         ("session", RENDERING): Noise(left_light=4e-4),
     }
-    monkeypatch.setattr(budget, "_noises", lambda *_: noises)
-    monkeypatch.setattr(budget, "_seen", lambda *_: {"": SCENE + STEADY}.items())
+    asked: list[Any] = []
+    monkeypatch.setattr(budget, "_noises", lambda *given: asked.append(given) or noises)
+    monkeypatch.setattr(budget, "_seen", lambda *given: asked.append(given) or {"": SCENE + STEADY}.items())
     monkeypatch.setattr(budget, "_of_scene", lambda scatter, seen, sampled: {("scene", "light"): (seen, sampled)})
     left, right = RNG.standard_normal((6, N)) + 0.3, RNG.standard_normal((7, N)) + 0.3
     fixed = {"response": RNG.standard_normal((N, N)), "offsets": RNG.standard_normal((N, N))}
     linear = LinearImage(left, right, parse_patterns("dots:2", N), 0.1)
     stand: Any = SimpleNamespace(lit=SimpleNamespace(truth=SCENE), linear=linear, fixed=fixed)
     clear: Any = SimpleNamespace(left=2 * left, right=3 * right)
-    found = budget._budget(stand, None, clear)  # type: ignore[arg-type]
+    found = budget._budget(stand, "session", clear)  # type: ignore[arg-type]
+    assert asked == [(stand, "session"), (stand, clear)]
     steps = [STEADY, STEADY + fixed["response"], STEADY + fixed["response"] + fixed["offsets"]]
     assert found.steady == pytest.approx(steps[2])
     assert amounts(found.drawn) == pytest.approx(amounts(Noise(datum=1e-4, left=2e-4)))
