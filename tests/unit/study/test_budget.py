@@ -43,11 +43,10 @@ def test_noise_is_told_by_source_and_by_factor() -> None:
     factors[0][0] = 0.0
     variance = np.zeros((3, 5))
     variance[0] = 6.0
-    none = {"shot noise": np.zeros((1, 1))}
     session: Any = SimpleNamespace(
         session=SimpleNamespace(signs=stripe_signs(N)),
         uniform_rate=np.ones((3, 5)),
-        response_variances=lambda side: ({"shot noise": variance}, none),
+        response_variances=lambda side: ({"shot noise": variance}, {"shot noise": variance / 2}),
         light=SimpleNamespace(flux=np.ones(N * N), flux_error=np.full(N * N, 0.1)),
     )
     sampled = SimpleNamespace(flux_error=3.0, apparent=SimpleNamespace(error_of=lambda error: 2 * error, error=0.5))
@@ -58,13 +57,26 @@ def test_noise_is_told_by_source_and_by_factor() -> None:
     found = dict(budget._noises(stand, session))
     common = factors[1].sum(axis=1)
     told = found.pop((SESSION, "shot noise"))
-    assert told.left == pytest.approx(6 / 3 / (common @ common) / N) and told.right == 0
+    # Of noise of its own a mean over N responses; what these share is in the first of N columns.
+    assert told.left == pytest.approx(6 / 3 / (common @ common) * (1 / N + 0.5 / N)) and told.right == 0
     rendering = budget.session_rendering(np.ones(1), np.full(1, 0.1), factors)
     assert amounts(found.pop((SESSION, RENDERING))) == pytest.approx(amounts(rendering))
     assert found == {("capture", "read noise"): Noise(), ("capture", RENDERING): Noise(light=36.25)}, "no speckle"
     stand.noises = {name: Noise(datum=1.0) for name in empty}
     found = budget._noises(stand, session)
     assert {name for of, name in found if of == "capture"} == {AMBIENT, SPECKLE, "read noise", RENDERING}
+
+
+def test_sampled_light_of_a_board_multiplies_columns() -> None:
+    """By the mean square of its relative errors where it is lit, and the squares of the other side's weights. (Planted:
+    dark pixels; the mean of the weights' squares.)"""
+    left, right = 1 + RNG.random((3, N)), 1 + RNG.random((5, N))
+    found = budget.session_rendering(np.array([0.5, 0.0, 2.0]), np.array([0.05, 9.0, 0.4]), (left, right))
+    for factor, told in ((right, found.left_light), (left, found.right_light)):
+        common = factor.sum(axis=1)
+        weights = [float(column @ common) / float(common @ common) for column in factor.T]
+        assert sum(weights) == pytest.approx(1)
+        assert told == pytest.approx(0.025 * sum(weight**2 for weight in weights))
 
 
 def test_what_is_not_explained_is_a_loss_of_its_own() -> None:
