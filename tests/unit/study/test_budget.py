@@ -249,4 +249,6 @@ def test_chance_is_in_how_sure_a_part_is() -> None:
     assert budget.gained(1.0, 4.0, 2.0, 1.0)[1] == pytest.approx(2**0.5 * alone[1])
     more = budget.gained(1.0, 4.0, 8.0, 1.0)
     assert more[1] == pytest.approx(math.hypot(1.2494 - 0.5799, 0.5799), abs=1e-4)
+    # A quarter too much is told: it may all be this part's, of which half of the error is left.
+    assert budget.gained(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
     assert budget.gained(4.0, 4.0, 4.0)[0] == pytest.approx(90)
