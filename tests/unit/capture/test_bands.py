@@ -12,6 +12,7 @@ from mitsim.capture import bands
 from mitsim.capture.bench import Bench
 from mitsim.capture.plan import Plan
 from mitsim.capture.request import Request
+from mitsim.core.colours import RUN
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
@@ -56,7 +57,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bands.Coloured]:
         monkeypatch.setattr(bands._Look, "errors", found)
         monkeypatch.setattr(bands, "plan_request", planned)
         monkeypatch.setattr(bands, "plan_lines", planned)
-        monkeypatch.setattr(bands.ColourBench, "of", lambda whole, kind: whole)
+        monkeypatch.setattr(bands.ColourBench, "of", lambda whole, kind: {RUN: whole}[kind])
         return bands.choose_colour(of, Request.of(accuracy=accuracy))
 
     return choose
@@ -93,6 +94,9 @@ def test_seconds_grow_by_what_lines_do_not_share(chosen: Callable[..., bands.Col
     looked = found.predicted["plan"] - STAGES["plan"]
     seconds = [each.seconds - looked for each in found.colour.candidates]
     assert seconds == pytest.approx([15, 15, 1 + 1.2 * 5 + 2 * 9, 1 + 1.4 * 5 + 3 * 9])
+    # The same of a plan of three runs. (Planted: more of them for fewer.)
+    of_three = bands._seconds({"plan": 1.0, "transport": 7.0, "optics": 27.0}, 3, 1)
+    assert of_three == pytest.approx(1 + 5 + 9)
     later = found.taking(start=7.0)
     assert later.colour is not None and later.colour.taken.seconds == pytest.approx(later.predicted_seconds)
 

@@ -66,6 +66,17 @@ def camera(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
+def test_files_outside_a_scenes_folder_are_refused_unless_allowed(tmp_path: Path) -> None:
+    """(Planted: allowed if nothing is said.)"""
+    path = tmp_path / "in" / "own.xml"
+    path.parent.mkdir()
+    path.write_text("<scene version='3.0.0'><include filename='../more.xml'/></scene>")
+    (tmp_path / "more.xml").write_text(SMALL)
+    assert opening.check_scene(path, {}, True) == path
+    with pytest.raises(MitsimError, match=r"more\.xml"):
+        opening.check_scene(path, {})
+
+
 def test_devices_are_camera_and_projector(tmp_path: Path) -> None:
     """By name, by file, and the shipped ones. (Planted: one for the other.)"""
     usual = opening.check_devices(None, None)
