@@ -93,7 +93,12 @@ def test_a_bench_is_what_its_files_say(loader: Loader, scene: Path) -> None:
     """Parameters as a scene spells them; no file outside unless allowed; a scene to render needs no projector."""
     bench = opening.open_bench(scene, "llvm_ad_mono", albedo=0.25, mask=True)
     assert bench.variant == "llvm_ad_mono" and dict(bench.defines) == {"albedo": "0.25", "mask": "true"}
-    assert bench.rig.camera_file == str(opening.check_devices(None, None)[0]) and not loader.worn
+    assert bench.rig.camera is bench.loaded.camera.geometry and "IMX249" in bench.sensor.name
+    assert (
+        "MP-CL1" in bench.projector.name
+        and bench.rig.camera_file == str(opening.check_devices(None, None)[0])
+        and not loader.worn
+    )
     opening.open_bench(scene, "llvm_ad_rgb", allow_outside_files=True, for_render=True)
     assert loader.asked == [
         ("llvm_ad_mono", scene, dict(bench.defines), {"needs_projector": True, "outside": False}),
