@@ -87,9 +87,9 @@ def test_each_colour_of_filters_counts_in_its_own_pixels() -> None:
 
 def test_a_curve_that_has_fallen_to_nothing_goes_on_as_nothing() -> None:
     """And one that is next to nothing as next to nothing. (Planted: a division by none; small ones taken for none.)"""
-    ends = {0.0: 0.0, 1e-4: (1030**2 - 830**2) / 2 / 830}
+    ends = {(0.0, 0.0): 0.0, (0.0, 0.5): 0.0, (1e-4, 1e-4): (1030**2 - 830**2) / 2 / 830}
     for last, beyond in ends.items():
-        curve = {"wavelengths_nm": [400.0, 830.0, 1030.0], "efficiency": [0.5, last, last]}
+        curve = {"wavelengths_nm": [400.0, 830.0, 1030.0], "efficiency": [0.5, *last]}
         found = Response.of(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))
         assert found.beyond_nm == pytest.approx(beyond)
 
