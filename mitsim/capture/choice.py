@@ -44,14 +44,15 @@ from mitsim.capture.prices import (
     filing_seconds,
     optics_seconds,
     priced,
+    tells_all,
     traced_for,
     truth_seconds,
 )
 from mitsim.core.arrays import FloatArray
 
 _MARGIN = 0.95
-"""Part of the accuracy that is planned for: shots whose error is seen differ from all shots by a few percent, and so do
-the frames that the pilot looks at."""
+"""Part of the accuracy that is planned for: frames that the pilot looks at differ from all by a few percent, and so do
+shots whose error is seen, where it is not that of all."""
 _MOST_ENTRIES = 2.0**25
 """Entries of one group's filed light beyond which settings are not chosen: 12 GB in all (`mitsim.capture.cost`)."""
 _LUCKY = -1.0
@@ -388,9 +389,13 @@ class _Table:
 
     @cached_property
     def target(self) -> FloatArray:
-        """(m,) Monte Carlo error at which sampling may stop."""
-        left = np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
-        return np.where(left > 0, np.sqrt(np.maximum(left, 0)), _MARGIN * self.accuracy)
+        """(m,) Monte Carlo error at which sampling may stop.
+
+        Where looks see the error of all shots, it needs no margin; what the pilot saw of a few frames does.
+        """
+        forming, left = self.evidence.forming, np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
+        margin = _MARGIN if tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
+        return np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * self.accuracy)
 
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:

@@ -196,10 +196,10 @@ def test_every_verb_passes_the_permission_on(
     (tmp_path / "scene").mkdir()
     scene = str(prepared(tmp_path / "scene", picture("../out.png")))
     arguments = {
-        "plan": ["plan", scene],
+        "plan": ["plan", scene, "--patterns", "uniform"],
         "capture": ["capture", scene, "-o", "new", "--patterns", "uniform"],
         "calibrate": ["calibrate", scene, "-o", "new"],
-        "study": ["study", "accuracy", scene, "-o", "new"],
+        "study": ["study", "accuracy", scene, "-o", "new", "--patterns", "uniform"],
         "render": ["render", scene, "-o", "new.exr"],
     }[verb]
     with pytest.raises(MitsimError, match="--allow-outside-files"):

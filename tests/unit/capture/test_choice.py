@@ -204,6 +204,19 @@ def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
             assert 0.3 * loud.target < loud.noise < loud.target
 
 
+def test_what_looks_see_of_all_shots_needs_no_margin() -> None:
+    """Of 64 classes they see all, of 65 some: then the noise has as much margin as what the pilot saw of few frames.
+
+    (Planted: a margin for both in both; none for either.)
+    """
+    for classes, seen in ((64, True), (65, False)):
+        evidence = replace(EVIDENCE, forming=replace(EVIDENCE.forming, shots=100, classes=classes))
+        found = cheapest(1e-3, evidence, {})
+        left = found.systematic.bound
+        whole = math.hypot(left / 0.95, found.target) if seen else math.hypot(left, found.target) / 0.95
+        assert found.fits and whole == pytest.approx(1e-3)
+
+
 def test_samples_take_the_least_work_for_the_target() -> None:
     """Variances v / N add up to the target's over 1.1, as sampling stops by a bound that lies so far above the error.
 
