@@ -26,7 +26,7 @@ from mitsim.core.seeds import integer
 from mitsim.optics.frames import ExpectedFrames, bound_of
 from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.transport.histogram import Deposits
-from mitsim.transport.ledger import Ledger, LitSums
+from mitsim.transport.ledger import Ledger, LitSums, fetched
 
 if TYPE_CHECKING:
     from mitsim.core.job import Job
@@ -566,8 +566,8 @@ class _Group:
                 self.done[name] = done + count
                 self.paths += count * stage.tracer.lanes
             if ledgers:
-                held = enumerate([(ledger, ledger.fetched(), samples) for ledger in ledgers])
-                filing.give([partial(self._file_ledger, name, stage, each, line) for line, each in held])
+                held = [(*each, samples) for each in zip(ledgers, fetched(ledgers), strict=True)]
+                filing.give([partial(self._file_ledger, name, stage, each, line) for line, each in enumerate(held)])
 
     def _spread(self, name: str, growth: float) -> None:
         """Make the light of a stage the mean over so many times the samples, of which no others are filed yet."""

@@ -8,7 +8,11 @@ the ledger draws one of them: the same in the mean.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from itertools import pairwise
+from operator import or_
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from mitsim.core.arrays import Labels
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.transport.histogram import Bundle, Sightings
 
@@ -30,8 +34,50 @@ _MOST_BITS = 52
 A place would hold 4096 such paths."""
 
 
-LitSums = tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint64]]
-"""Increasing numbers of the sums that are not zero, and these: of corner, a tenth of its ledger's memory."""
+@dataclass(frozen=True, eq=False)
+class Lit:
+    """Sums that hold light in any of some ledgers of one kind, and how they lie in a matrix, which is found once.
+
+    Attributes
+    ----------
+    numbers
+        of the sums, increasing.
+    rows, size, lamps
+        of the matrix: rows of the projector's light, places, and rows of lamps after them.
+    """
+
+    numbers: npt.NDArray[np.uint32]
+    rows: int
+    size: int
+    lamps: int
+
+    @property
+    def inside(self) -> int:
+        """How many of the sums, the first, have a place: what lay outside has the last one."""
+        return int(np.searchsorted(self.numbers, np.uint32(self.size * self.rows)))
+
+    @cached_property
+    def layout(self) -> sparse.csr_array:
+        """(rows + lamps, size) which of the sums lies where."""
+        # All places fit 32 bits, in which matrices take half the time.
+        numbers = self.numbers[: self.inside]
+        places = (numbers // np.uint32(self.rows)).astype(np.int32)
+        row = numbers.astype(np.int32) - places * np.int32(self.rows)
+        starts = np.append(0, np.cumsum(np.bincount(places, minlength=self.size))).astype(np.int32)
+        which = np.arange(len(numbers), dtype=np.int32)
+        found = sparse.csc_array((which, row, starts), shape=(self.rows + self.lamps, self.size)).tocsr()
+        for shared in (found.indices, found.indptr):
+            shared.flags.writeable = False
+        return found
+
+    def matrix(self, light: FloatArray) -> sparse.csr_array:
+        """(rows + lamps, size) the ``light`` of the sums, where they have a place."""
+        layout = self.layout
+        return sparse.csr_array((light[layout.data], layout.indices, layout.indptr), shape=layout.shape)
+
+
+LitSums = tuple[Lit, npt.NDArray[np.uint64]]
+"""Which sums of a ledger hold light, and these: of corner, a tenth of its ledger's memory."""
 
 
 class Ledger:
@@ -126,11 +172,8 @@ class Ledger:
 
     def fetched(self) -> LitSums:
         """The sums so far, on the host; the ledger is empty then."""
-        lit = dr.compress(self.sums != 0)
-        units = dr.gather(mi.UInt64, self.sums, lit)
-        dr.eval(lit, units)
-        self.sums = dr.zeros(mi.UInt64, len(self.sums))
-        return np.array(lit), np.array(units)
+        (counted,) = fetched((self,))
+        return counted
 
     def filed(self, counted: LitSums | None = None, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
         """(rows + lamps, places) light per sample, the last rows empty; all that was received, and what lay outside
@@ -149,16 +192,24 @@ class Ledger:
             where light is NaN, infinite, or four million times ``one``.
         """
         lit, units = self.fetched() if counted is None else counted
-        if len(lit) and lit[-1] == self._rows * self._width:
+        if len(lit.numbers) and lit.numbers[-1] == self._rows * self._width and units[-1]:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        light = units * (self._unit / samples)
-        # What lay outside has the last place. All places fit 32 bits, in which matrices take half the time.
-        inside = int(np.searchsorted(lit, np.uint32(self._bundle.size * self._rows)))
-        places = (lit[:inside] // np.uint32(self._rows)).astype(np.int32)
-        row = lit[:inside].astype(np.int32) - places * np.int32(self._rows)
-        starts = np.append(0, np.cumsum(np.bincount(places, minlength=self._bundle.size))).astype(np.int32)
-        shape = self._rows + self._bundle.lamps, self._bundle.size
-        filed = sparse.csc_array((light[:inside], row, starts), shape=shape).tocsr()
-        return filed, float(light.sum()), float(light[inside:].sum())
+        light = units.astype(np.float64) * (self._unit / samples)
+        return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
+
+
+def fetched(ledgers: Sequence[Ledger]) -> list[LitSums]:
+    """The sums of ``ledgers`` of one kind, one for each line, on the host; they are empty then.
+
+    Which sums hold light is told of all together, as it is nearly the same of each.
+    """
+    first = ledgers[0]
+    lit = dr.compress(reduce(or_, (ledger.sums != 0 for ledger in ledgers)))
+    units = [dr.gather(mi.UInt64, ledger.sums, lit) for ledger in ledgers]
+    dr.eval(lit, units)
+    for ledger in ledgers:
+        ledger.sums = dr.zeros(mi.UInt64, len(ledger.sums))
+    found = Lit(np.array(lit), first._rows, first._bundle.size, first._bundle.lamps)
+    return [(found, np.array(each)) for each in units]
