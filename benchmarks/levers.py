@@ -37,6 +37,7 @@ from mitsim.capture.simulation import Simulation, Stage
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.histogram import INDIRECT
+from mitsim.transport.ledger import fetched
 from mitsim.transport.repeats import block_moments, chosen_repeats
 
 ROOT = Path(__file__).parents[1]
@@ -89,8 +90,9 @@ def traced(stage: Stage, labels: np.ndarray, seed: int, samples: int, device: bo
     """Light of one group, per sample."""
     ledgers = stage.ledgers(labels, 1) if device else ()
     light = stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
-    for ledger in ledgers if stage.file_ledger else ():
-        light = light + stage.file_ledger(ledger, ledger.fetched(), samples)
+    if stage.file_ledger and ledgers:
+        for ledger, counted in zip(ledgers, fetched(ledgers), strict=True):
+            light = light + stage.file_ledger(ledger, counted, samples)
     dr.sync_thread()
     return light
 

@@ -42,7 +42,7 @@ def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
     """The ``parallax`` that a ``calibration`` states; MitsimError where it states none."""
     if parallax is None:
         raise MitsimError(
-            f"focus: calibration {calibration} does not state its parallax, as none did before; calibrate again, or "
+            f"calibration {calibration}: does not state its parallax, which focus and margin need; calibrate again, or "
             "add it to the manifest"
         )
     return parallax

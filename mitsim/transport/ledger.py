@@ -170,11 +170,6 @@ class Ledger:
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
-    def fetched(self) -> LitSums:
-        """The sums so far, on the host; the ledger is empty then."""
-        (counted,) = fetched((self,))
-        return counted
-
     def filed(self, counted: LitSums | None = None, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
         """(rows + lamps, places) light per sample, the last rows empty; all that was received, and what lay outside
         [W m^-2].
@@ -182,7 +177,7 @@ class Ledger:
         Parameters
         ----------
         counted
-            sums that were fetched; None: those that are there.
+            sums that were :func:`fetched`; None: those that are there, which are fetched.
         samples
             that they are of.
 
@@ -191,7 +186,7 @@ class Ledger:
         MitsimError
             where light is NaN, infinite, or four million times ``one``.
         """
-        lit, units = self.fetched() if counted is None else counted
+        lit, units = counted or fetched((self,))[0]
         if len(lit.numbers) and lit.numbers[-1] == self._rows * self._width and units[-1]:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.capture import choice, planning
 from mitsim.capture import light as module
-from mitsim.capture import planning
 from mitsim.capture.bench import Bench
+from mitsim.capture.choice import Choice
+from mitsim.capture.cost import frames_cost
 from mitsim.capture.decision import SceneFacts
 from mitsim.capture.effects import EFFECTS
-from mitsim.capture.evidence import GROUPS, Settings
+from mitsim.capture.evidence import GROUPS, Evidence, Settings
 from mitsim.capture.light import Light, Sampling, trace_light
 from mitsim.capture.opening import open_bench
 from mitsim.capture.plan import Plan
@@ -173,6 +175,27 @@ def test_lines_are_looked_at_from_the_noisiest_until_one_is_not_good_enough(
     assert list(seen) == looked
     assert all(seen[line][0] is lines[line] and seen[line][1] == bounds[line] for line in looked)
     assert len(module._looks(lines, Lighting.uniform(1), False, math.inf)) == 4
+
+
+def test_a_plan_of_several_lines_is_priced_for_all(
+    bench: Bench, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames are those of each line, light is held for all; what one line's frames take to form comes once.
+
+    (Planted: lines that the pilot forgets; disk, or light, of one.)
+    """
+    seen: list[int] = []
+
+    def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> Choice:
+        seen.append(evidence.forming.lines)
+        return choice.cheapest(accuracy, evidence, switches)
+
+    monkeypatch.setattr(planning, "cheapest", cheapest)
+    plan = planning.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
+    assert seen == [3]
+    one, three = (frames_cost(bench, plan.settings, family, lines=count) for count in (1, 3))
+    assert three.disk_bytes == 3 * one.disk_bytes
+    assert one.memory_bytes < three.memory_bytes < 2 * one.memory_bytes
 
 
 def test_purposes_share_no_random_numbers(bench: Bench, plan: Plan, family: Lighting) -> None:

@@ -2,12 +2,19 @@
 
 import numpy as np
 import pytest
+from scipy import sparse
 
+from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.frames import ClassFrames, Filed, _probes, bound_of, monte_carlo_bound, monte_carlo_error
+from mitsim.optics.shadow import Directions
 from tests.unit.optics.small_camera import (
     BESIDE,
+    CAMERA,
+    CELLS,
     LABELS,
     PIXELS,
+    WINDOW,
+    Z,
     ambient_groups,
     expected_frames,
     random_groups,
@@ -97,3 +104,18 @@ def test_the_bound_of_a_monte_carlo_error_holds(freedom: int, least: float) -> N
     held = float((made <= bounds**2).mean())
     assert least < held < 0.99
     assert bound_of(np.zeros(8), 1.0) == bound_of(np.ones(8), 0.0) == 0.0
+
+
+@pytest.mark.parametrize("shots", [2, 4], ids=["formed by shot", "mixed of classes"])
+def test_layers_add_up_whatever_order_a_products_entries_have(shots: int) -> None:
+    """Frames of light in two layers are those of each layer's light (planted: entries as products leave them)."""
+    edges, depths = np.linspace(*WINDOW, CELLS + 1), (Z, 30.0)
+    both = FrameOptics(CAMERA, Directions.cells(edges), Directions.cells(edges), depths, 1)
+    single = [FrameOptics(CAMERA, Directions.cells(edges), Directions.cells(edges), (depth,), 1) for depth in depths]
+    layers = [random_groups(3, seed) for seed in (1, 2)]
+    stacked = [sparse.csr_array(sparse.hstack(pair)) for pair in zip(*layers, strict=True)]
+    weights = np.random.default_rng(3).random((shots, 4))
+    found = expected_frames(both, stacked, LABELS, weights, 0)
+    parts = [expected_frames(optics, groups, LABELS, weights, 0) for optics, groups in zip(single, layers, strict=True)]
+    for frame, *of_layers in zip(found, *parts, strict=True):
+        np.testing.assert_allclose(frame.irradiance, sum(part.irradiance for part in of_layers), rtol=1e-12)
