@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.capture import choice, planning
+from mitsim.capture import choice, cost, planning
 from mitsim.capture import light as module
 from mitsim.capture.bench import Bench
 from mitsim.capture.choice import Choice
-from mitsim.capture.cost import frames_cost
 from mitsim.capture.decision import SceneFacts
 from mitsim.capture.effects import EFFECTS
 from mitsim.capture.evidence import GROUPS, Evidence, Settings
@@ -193,7 +192,8 @@ def test_a_plan_of_several_lines_is_priced_for_all(
     monkeypatch.setattr(planning, "cheapest", cheapest)
     plan = planning.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
     assert seen == [3]
-    one, three = (frames_cost(bench, plan.settings, family, lines=count) for count in (1, 3))
+    monkeypatch.setattr(cost, "workers", lambda: 1)  # files one line at a time
+    one, three = (cost.frames_cost(bench, plan.settings, family, lines=count) for count in (1, 3))
     assert three.disk_bytes == 3 * one.disk_bytes
     assert one.memory_bytes < three.memory_bytes < 2 * one.memory_bytes
 
