@@ -91,6 +91,7 @@ class Apparatus:
             model.focus_mm or self.geometry.scene_distance,
             model.blur_pixels,
             self.lines,
+            bool(self.loaded.parting),
         )
 
     @property

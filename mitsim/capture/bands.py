@@ -109,7 +109,7 @@ def choose_colour(bench: Bench, request: Request) -> Coloured:
         plan = plan_lines(ColourBench.of(own, RUN), left)
     plan = plan.taking(plan=plan.predicted["plan"] + looked)
     candidates = tuple(
-        ColourCandidate(name, error, _seconds(plan.predicted, runs[chosen], runs[name]))
+        ColourCandidate(name, error, _seconds(plan.predicted, runs[chosen], runs[name], bool(bench.loaded.parting)))
         for name, error in errors.items()
     )
     return Coloured(_told(plan, ColourChoice(chosen, candidates), request), own)
@@ -128,7 +128,7 @@ def _in_greys(bench: Bench) -> bool:
     return not bench.loaded.coloured and bench.sensor.quantum_efficiency_curve is None
 
 
-def _seconds(predicted: Mapping[str, float], runs: int, others: int) -> float:
+def _seconds(predicted: Mapping[str, float], runs: int, others: int, parted: bool) -> float:
     """Seconds of so many other runs, from those of some.
 
     Parameters
@@ -137,11 +137,13 @@ def _seconds(predicted: Mapping[str, float], runs: int, others: int) -> float:
         seconds by stage.
     runs, others
         that they are of, and that are asked for.
+    parted
+        whether they share no paths.
     """
     shared = sum(predicted.get(stage, 0.0) for stage in _ONCE)
     traced = sum(predicted.get(stage, 0.0) for stage in _TRACED)
     own = sum(predicted.values()) - shared - traced
-    return shared + traced_for(others) / traced_for(runs) * traced + others / runs * own
+    return shared + traced_for(others, parted) / traced_for(runs, parted) * traced + others / runs * own
 
 
 def _told(plan: Plan, choice: ColourChoice, request: Request) -> Plan:

@@ -438,5 +438,5 @@ class Bench(Apparatus):
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )
         bare = replace(self.loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False)
-        alone = replace(bare, unfit=Unfit(), shapes=(), coloured=())
+        alone = replace(bare, unfit=Unfit(), shapes=(), coloured=(), parting=())
         return replace(self, loaded=alone)

@@ -400,7 +400,7 @@ class _Table:
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:
         """(m,) work of one sample in every group, by kind of light."""
-        lines = traced_for(self.evidence.forming.lines)
+        lines = traced_for(self.evidence.forming.lines, self.evidence.forming.parted)
         return {
             name: lines * GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.numbers)
             for name, effort in efforts(self.evidence, self.effects).items()

@@ -279,7 +279,9 @@ class Forming:
     drawing
         seconds of drawing a shadow on as few, without diffraction and with it, for each layer.
     lines
-        that share traced paths, each with frames of its own.
+        each with frames of its own.
+    parted
+        whether glass sends each line its own way, so that they share no paths.
     """
 
     pixels: float
@@ -295,6 +297,7 @@ class Forming:
     phases: float = 16.0
     drawing: tuple[float, float] = (0.0, 0.0)
     lines: int = 1
+    parted: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from mitsim.scene.window import lit_side
 
 if TYPE_CHECKING:
     from mitsim.rig.profile import MaskProfile
+    from mitsim.rig.projector import ProjectorModel
     from mitsim.scene.load import LoadedScene
 
 _PITCH_TOLERANCE = 1e-3
@@ -132,6 +133,7 @@ def open_bench(
                 f"{stated * 1e3:g} um; use the camera of that scene, or change {name}, or binning"
             )
     _wear(loaded, mask, sensor_path)
+    _tune(loaded, light)
     rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
     return Bench(loaded, rig, variant, defines)
 
@@ -143,6 +145,7 @@ def reopened(bench: Bench, variant: str) -> Bench:
     camera = Path(bench.rig.camera_file)
     loaded = _loaded(variant, bench.loaded.path, bench.defines, outside=True)
     _wear(loaded, load_mask(camera), camera)
+    _tune(loaded, bench.projector)
     return replace(bench, loaded=loaded, variant=variant)
 
 
@@ -150,6 +153,14 @@ def _wear(loaded: LoadedScene, mask: MaskProfile | None, camera: Path) -> None:
     """Put a ``mask`` of the file of a ``camera``, where it has one, before the sensor of a ``loaded`` scene."""
     if mask is not None:
         loaded.camera.wear(mask.worn(loaded.camera.geometry, camera.parent))
+
+
+def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:
+    """Give glass of a ``loaded`` scene the one wavelength of a ``projector`` that is not told apart by line."""
+    if loaded.parting:
+        from mitsim.transport.glass import tune
+
+        tune(loaded.scene, projector.effective_wavelength_nm)
 
 
 def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:

@@ -364,7 +364,7 @@ def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dic
         as for :func:`forming_seconds`.
     """
     return {
-        name: traced_for(evidence.forming.lines)
+        name: traced_for(evidence.forming.lines, evidence.forming.parted)
         * GROUPS
         * math.ceil(getattr(settings, f"{name}_samples"))
         * effort.paths
@@ -374,9 +374,10 @@ def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dic
     }
 
 
-def traced_for(lines: int) -> float:
-    """Times what one line takes that tracing and filing take for so many ``lines`` on the same paths."""
-    return 1 + _FILED * (lines - 1)
+def traced_for(lines: int, parted: bool = False) -> float:
+    """Times what one line takes that tracing and filing take for so many ``lines`` on the same paths, or on paths of
+    their own where glass has ``parted`` them."""
+    return lines if parted else 1 + _FILED * (lines - 1)
 
 
 def predicted_rays(pixels: int, samples: float, rate: float) -> float:
@@ -456,7 +457,7 @@ def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float
     direct = evidence.spread if settings.anchors > 1 else evidence.direct
     rate = direct.noise.rate
     return (
-        traced_for(evidence.forming.lines)
+        traced_for(evidence.forming.lines, evidence.forming.parted)
         * paces.ray
         * predicted_rays(evidence.direct.paths, settings.direct_samples, rate)
     )

@@ -122,6 +122,9 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
 
     if loaded.unfit.reference is not None:
         raise loaded.unfit.reference
+    if loaded.parting and mi.is_spectral:
+        rule = f"{mi.variant()} carries several wavelengths on a path, which this glass parts; use a mono variant"
+        raise loaded.parting[0].refusal("type", "'mitsim_glass'", rule)
     check_samples(REFERENCE, spp)
     job = job or Job()
     passes = max(FEWEST_PASSES, math.ceil(spp / _SAMPLES_A_PASS))

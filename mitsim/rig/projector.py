@@ -81,6 +81,16 @@ class Lines:
         return tuple(Lines((wavelength,), (share,)) for wavelength, share in pairs)
 
     @property
+    def apart(self) -> tuple[Lines, ...]:
+        """Each of them at its own place among all: a path carries the one, and the others are that wavelength without
+        power."""
+        size = len(self.shares)
+        return tuple(
+            Lines((wavelength,) * size, tuple(share if at == place else 0.0 for at in range(size)))
+            for place, (wavelength, share) in enumerate(zip(self.wavelengths_nm, self.shares, strict=True))
+        )
+
+    @property
     def mean_nm(self) -> float:
         """The one wavelength that carries as many photons per watt [nm], to a picometre."""
         if not self.several:

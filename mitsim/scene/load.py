@@ -31,7 +31,7 @@ class LoadedScene:
     whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
     estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
     several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
-    differ by wavelength, none of a scene in greys.
+    differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way.
     """
 
     path: Path
@@ -47,6 +47,7 @@ class LoadedScene:
     shapes: tuple[Tag, ...]
     small_lamps: tuple[tuple[mi.Emitter, Tag], ...]
     coloured: tuple[Tag, ...]
+    parting: tuple[Tag, ...] = ()
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -107,7 +108,7 @@ def load_scene(
     shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
     lit = tuple(zip(small, checked.small_lamps, strict=True))
-    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit, checked.coloured
+    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit, checked.coloured, checked.parting
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.rig.camera import CameraGeometry
+from mitsim.rig.projector import Lines
 from mitsim.transport.histogram import check_finite
 from mitsim.transport.landing import landing
 from mitsim.transport.paths import LANES_PER_LAUNCH
@@ -81,8 +82,8 @@ class FluxTracer:
             when the scene sends NaN or infinite light to the camera.
         """
         blocks, at_once = groups * len(pixels), max(1, self.lanes_per_launch // samples)
-        lines = self._rays.projector.lines
-        total = np.empty((len(lines.shares) if lines and lines.several else 1, blocks))
+        lines, apart = self._rays.projector.lines, self._rays.projector.apart
+        total = np.zeros((len(lines.shares) if lines and lines.several else 1, blocks))
         numbers, starts = mi.UInt32(pixels), mi.UInt32(first)
         # Opaque numbers keep the compiled kernel the same for all of them.
         each, count = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, len(pixels))
@@ -94,20 +95,23 @@ class FluxTracer:
             group = block // count
             number = block - group * count
             sample = dr.gather(mi.UInt32, starts, number) + (lane - place * each)
-            light = self._light(seed, group, dr.gather(mi.UInt32, numbers, number), sample)
-            if len(total) > 1:
-                dr.eval(light)  # together: apart, each line would trace it
-            for own, value in zip(total, told_apart(light, len(total)), strict=True):
-                own[start:stop] = np.array(dr.block_sum(mi.Float64(value), samples))
+            for projector in apart:
+                light = self._light(seed, group, dr.gather(mi.UInt32, numbers, number), sample, projector.lines)
+                if len(total) > 1:
+                    dr.eval(light)  # together: apart, each line would trace it
+                for own, value in zip(total, told_apart(light, len(total)), strict=True):
+                    own[start:stop] += np.array(dr.block_sum(mi.Float64(value), samples))
         check_finite(total)
         return total.reshape(len(total), groups, -1)
 
-    def _light(self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.UnpolarizedSpectrum:
+    def _light(
+        self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32, lines: Lines | None
+    ) -> mi.UnpolarizedSpectrum:
         """Mean irradiance that one ray of each ``pixel`` brings to the sensor."""
         pixels = dr.opaque(mi.UInt32, self._pixels)
         shared, rng = streams(seed, pixel + group * pixels, sample)
         jitter = stratified(sample, shared)
-        wavelengths, spectral = sampled_wavelengths(self._receiver.camera, rng, self._rays.projector.lines)
+        wavelengths, spectral = sampled_wavelengths(self._receiver.camera, rng, lines)
         ray = self._rays.sample(pixel, jitter, rng, wavelengths)
         point = stratified(shuffled(sample, shared), shared)
         turn = stratified(shuffled(sample, shared), shared) if self._glossy else None

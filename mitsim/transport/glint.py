@@ -72,8 +72,16 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
         raise MitsimError(f"max_depth of glints is {max_depth}; give at least 1")
     if not has_mirrors(scene):
         return _joined([], 0.0)
-    tracer = GlintRays(scene, camera, projector, max_depth)
-    n, geometry = projector.n, camera.geometry
+    parts, unresolved = [], 0.0
+    for each in projector.apart:
+        beams, lost = _of(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
+        parts += beams
+        unresolved += lost
+    return _joined(parts, unresolved)
+
+
+def _of(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], float]:
+    """Beams of the pixels of a window of ``n`` a side, and what was left unresolved."""
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
     line = np.arange(0, n * _UNIT + 1, step)
     row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
@@ -90,7 +98,7 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
         beams, lost = _refine(tracer, chain, low_row[chosen], low_column[chosen], step, n, geometry)
         parts += beams
         unresolved += lost
-    return _joined(parts, unresolved)
+    return parts, unresolved
 
 
 @dataclass(frozen=True, eq=False)

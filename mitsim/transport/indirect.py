@@ -101,8 +101,11 @@ class IndirectTracer(FollowingTracer):
         seed, first, samples
             as for :meth:`trace`.
         """
-        lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
-        launched = [self._walk(seed, *launch).file(ledgers) for launch in lanes]
+        launched = [
+            tracer._walk(seed, *launch).file(ledgers)
+            for tracer in self.apart
+            for launch in launches(self.lanes, first, samples, self.lanes_per_launch)
+        ]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
     def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:

@@ -11,6 +11,7 @@ A spectrum that is 1 everywhere is 1 W m^-2 (sr^-1) over the 470 nm from 360 to 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -65,6 +66,19 @@ class LampTracer(FromCameraTracer):
         """
         super().__init__(like.scene, like.camera, like.projector, like.grid, like.paths, like.geometry, like.points)
         self.counted = counted
+        self._alone: mi.UInt32 | None = None
+
+    @property
+    def apart(self) -> Sequence[LampTracer]:
+        """Itself, or where glass parts wavelengths, the same for each band alone."""
+        if not self.projector.parted:
+            return [self]
+        return [self._of(band) for band, (first, last) in enumerate(self.counted.bands) if last > first]
+
+    def _of(self, band: int) -> LampTracer:
+        again = copy(self)
+        again._alone = dr.opaque(mi.UInt32, band)
+        return again
 
     def wavelengths(
         self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32
@@ -92,6 +106,11 @@ class LampTracer(FromCameraTracer):
             count = low + (high - low) * (position - mi.Float(below))
             wavelengths.append(wavelength)
             weights.append(MOST_LINES * count * width / (SPECTRA_NM[1] - SPECTRA_NM[0]))
+        if self._alone is not None:
+            chosen = [self._alone == band for band in range(len(weights))]
+            weights = [dr.select(here, weight, 0) for here, weight in zip(chosen, weights, strict=True)]
+            own = [dr.select(here, wavelength, 0) for here, wavelength in zip(chosen, wavelengths, strict=True)]
+            wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
     def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:

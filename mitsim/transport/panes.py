@@ -20,6 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsim.transport.glass import is_glass
+
 if TYPE_CHECKING:
     from mitsim.transport.passage import Passage
 
@@ -42,8 +44,12 @@ def flat_panes(scene: mi.Scene) -> list[mi.ShapePtr]:
     return [
         mi.ShapePtr(shape)
         for shape in scene.shapes()
-        if shape.bsdf() is not None and shape.bsdf().class_name() == "SmoothDielectric" and _is_flat(shape)
+        if shape.bsdf() is not None and _is_glass(shape.bsdf()) and _is_flat(shape)
     ]
+
+
+def _is_glass(material: mi.BSDF) -> bool:
+    return material.class_name() == "SmoothDielectric" or is_glass(material)
 
 
 def _is_flat(shape: mi.Shape) -> bool:

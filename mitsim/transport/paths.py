@@ -17,6 +17,8 @@ from mitsim.transport.passage import Passage
 if TYPE_CHECKING:
     from typing import Self
 
+    from mitsim.transport.projector import ProjectorOptics
+
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 """Kinds of light by their names in a walk."""
 LANES_PER_LAUNCH = 2**22
@@ -103,11 +105,23 @@ class Tracer(ABC):
     """
 
     lanes_per_launch: ClassVar[int] = LANES_PER_LAUNCH
+    projector: ProjectorOptics
 
     @property
     @abstractmethod
     def lanes(self) -> int:
         """Paths, or connections, of one sample."""
+
+    @property
+    def apart(self) -> Sequence[Self]:
+        """Itself, or where glass parts light of several wavelengths, the same for each of them alone."""
+        projectors = self.projector.apart
+        return [self] if len(projectors) == 1 else [self._lit_by(projector) for projector in projectors]
+
+    def _lit_by(self, projector: ProjectorOptics) -> Self:
+        again = copy(self)
+        again.projector = projector
+        return again
 
     @abstractmethod
     def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
@@ -128,20 +142,24 @@ class Tracer(ABC):
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        lanes = launches(self.lanes, first, samples, self.lanes_per_launch)
-        launched = [self._launch(_seeds([seed], _ALL, sample)[0], sample, lane) for sample, lane in lanes]
+        launched = [
+            tracer._launch(_seeds([seed], _ALL, sample)[0], sample, lane)
+            for tracer in self.apart
+            for sample, lane in launches(self.lanes, first, samples, self.lanes_per_launch)
+        ]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
         """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
-        each, found = self.lanes * samples, list[Deposits]()
+        each, found, tracers = self.lanes * samples, list[Deposits](), self.apart
         together = min(self.lanes_per_launch // each, _TOGETHER)
         if together < 2:
             return [self.trace(seed, 0, samples) for seed in seeds]
         for start in range(0, len(seeds), together):
             few = seeds[start : start + together]
             ((sample, lane),) = launches(self.lanes, 0, samples * len(few), self.lanes_per_launch)
-            parts = self._launch(*_seeds(few, samples, sample), lane)
+            launched = [tracer._launch(*_seeds(few, samples, sample), lane) for tracer in tracers]
+            parts = [deposits for of_one in launched for deposits in of_one]
             for look in range(len(few)):
                 found.append(Deposits.joined([part.of_lanes(look * each, (look + 1) * each) for part in parts]))
         return found

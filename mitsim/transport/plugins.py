@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsim.transport import aperture, grating, lensless
+from mitsim.transport import aperture, glass, grating, lensless
 
 
 def register() -> None:
@@ -15,4 +15,5 @@ def register() -> None:
     """
     lensless.register()
     grating.register()
+    glass.register()
     aperture.register()

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.rig.projector import Lines
 from mitsim.transport.coordinates import Numbers, turn_and_origin
 from mitsim.transport.host import channels, per_lane
@@ -44,7 +45,7 @@ class ProjectorOptics:
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
     standard deviation of a projector pixel's spot, in projector pixels. ``lines`` are those that spectral variants
-    trace its light at; None: wavelengths drawn from all.
+    trace its light at; None: wavelengths drawn from all. ``parted`` tells that glass sends each wavelength its own way.
     """
 
     emitter: mi.Emitter
@@ -56,6 +57,22 @@ class ProjectorOptics:
     focus: float = 400.0
     blur: float = 0.0
     lines: Lines | None = None
+    parted: bool = False
+
+    @property
+    def apart(self) -> tuple[ProjectorOptics, ...]:
+        """Itself, or where its lines part, one for each line, of which a path carries that alone.
+
+        MitsimError where wavelengths that part would be drawn.
+        """
+        if not (self.parted and mi.is_spectral):
+            return (self,)
+        if self.lines is None:
+            raise MitsimError(
+                f"variant {mi.variant()}: its paths carry drawn wavelengths, which glass of the scene sends different "
+                "ways; trace the projector's lines (colour lines), or choose a mono variant"
+            )
+        return tuple(replace(self, lines=line) for line in self.lines.apart) if self.lines.several else (self,)
 
     @property
     def by_line(self) -> bool:

@@ -40,6 +40,7 @@ _MORE = """
     <bsdf type="principled" id="paint"><rgb name="base_color" value="0.5"/><float name="roughness" value="0.3"/></bsdf>
     <bsdf type="mitsim_grating" id="grating"><float name="pitch" value="1600"/>
         <string name="efficiencies" value="0.3, 0.15"/></bsdf>
+    <bsdf type="mitsim_glass" id="flint"><float name="index" value="1.62"/><float name="abbe" value="36"/></bsdf>
     <bsdf type="plastic" id="coated"><ref name="diffuse_reflectance" id="squares"/></bsdf>
     <bsdf type="bumpmap" id="bumps"><texture type="bitmap"><string name="filename" value="projector.png"/>
         <boolean name="raw" value="true"/></texture><ref id="paper"/></bsdf>
@@ -47,6 +48,8 @@ _MORE = """
         <ref id="two"/></shape>
     <shape type="cylinder"><point name="p0" value="0, 0, 300"/><point name="p1" value="9, 0, 300"/>
         <float name="radius" value="3"/><ref id="glass"/></shape>
+    <shape type="sphere"><point name="center" x="-5" y="5" z="300"/><float name="radius" value="2"/>
+        <ref id="flint"/></shape>
     <shape type="disk"><transform name="to_world"><lookat origin="0, 0, 350" target="0, 0, 0" up="0, 1, 0"/>
         </transform><ref id="grating"/></shape>
     <shape type="cube"><transform name="to_world"><rotate x="1" y="1" angle="30"/><scale value="7"/>

@@ -31,6 +31,8 @@ CASES: dict[str, list[dict[str, Any]]] = {
         {"efficiencies": "0"},
     ],
 }
+SINGLE = {"mitsim_glass": [{}, {"glass": "n-sf11"}, {"index": 1.0, "abbe": 30.0}, {"sellmeier": "8, 0.04"}]}
+"""Those that send light into single directions, which no grid of them meets."""
 LIST = [pytest.param(name, settings, id=f"{name}-{i}") for name in CASES for i, settings in enumerate(CASES[name])]
 INCIDENT = [(0, 0), (15, 80), (30, 0), (45, 45), (60, 180), (75, 250), (85, 0), (89, 100), (89.9, 0), (89.9, 90)]
 
@@ -90,7 +92,7 @@ def test_no_bsdf_is_left_out() -> None:
     for path in Path(mitsim.transport.__file__).parent.glob("*.py"):
         if 'register_once("bsdf"' in path.read_text(encoding="utf-8"):
             found.add(importlib.import_module(f"mitsim.transport.{path.stem}").PLUGIN)
-    assert found == set(CASES)
+    assert found == {*CASES, *SINGLE}
 
 
 @pytest.mark.parametrize(("name", "settings"), LIST)
@@ -104,6 +106,38 @@ def test_light_takes_the_same_way_back(name: str, settings: dict[str, Any]) -> N
     """f is equal to float32 precision: the division by a cosine down to 0.01 leaves a few units in the last place."""
     bsdf = load(name, settings)
     assert worst_asymmetry(lambda wi, wo: radiance_factor(bsdf, wi, wo)) < 1e-6
+
+
+@pytest.mark.parametrize("settings", SINGLE["mitsim_glass"])
+def test_single_directions_share_all_light_and_are_the_same_way_back(settings: dict[str, Any]) -> None:
+    """Reflected and transmitted parts sum to 1; light that is refracted and turned back has the same part let through,
+    returns where it came from, and what radiance gains on one way it loses on the other."""
+    import drjit as dr
+    import mitsuba as mi
+
+    bsdf, theta = load("mitsim_glass", settings), np.concatenate([np.linspace(0, 85, 90), np.linspace(95, 180, 90)])
+    si = dr.zeros(mi.SurfaceInteraction3f, theta.size)
+    si.wi = mi.Vector3f(directions(np.radians(theta), np.full(theta.size, 0.7)))
+
+    def parts(kind: mi.BSDFFlags, wi: mi.Vector3f, mode: mi.TransportMode) -> tuple[np.ndarray, np.ndarray]:
+        context = mi.BSDFContext(mode)
+        context.type_mask = int(kind)
+        si.wi = wi
+        sample, weight = bsdf.sample(context, si, mi.Float(0.5), mi.Point2f(0.5))
+        return np.array(weight, dtype=np.float64).ravel() * np.ones(theta.size), np.array(sample.wo, dtype=np.float64)
+
+    wi, light, importance = mi.Vector3f(si.wi), mi.TransportMode.Radiance, mi.TransportMode.Importance
+    reflected, _ = parts(mi.BSDFFlags.DeltaReflection, wi, importance)
+    through, way = parts(mi.BSDFFlags.DeltaTransmission, wi, importance)
+    np.testing.assert_allclose(reflected + through, 1, atol=1e-6)
+    passing = through > 1e-3
+    assert passing.sum() > 100
+    back, place = parts(mi.BSDFFlags.DeltaTransmission, mi.Vector3f(way.astype(np.float32)), importance)
+    np.testing.assert_allclose(back[passing], through[passing], atol=2e-5)
+    np.testing.assert_allclose(place[:, passing], np.array(wi)[:, passing], atol=1e-5)
+    gained, _ = parts(mi.BSDFFlags.DeltaTransmission, wi, light)
+    lost, _ = parts(mi.BSDFFlags.DeltaTransmission, mi.Vector3f(way.astype(np.float32)), light)
+    np.testing.assert_allclose((gained * lost)[passing], (through * back)[passing], rtol=1e-4)
 
 
 WEIGHTS = ("sheen", "sheen_tint", "spec_tint", "flatness", "clearcoat", "clearcoat_gloss", "diff_trans")

@@ -183,6 +183,7 @@ class FineLight:
             correlated=(geometry.drawn(waves=False), geometry.drawn(geometry.diffracts)),
             phases=float(cells_per_pixel(geometry) ** 2),
             drawing=(drawing_seconds(geometry, None), drawing_seconds(geometry, waves)),
+            parted=bool(self.bench.loaded.parting),
         )
 
     def raster(self) -> tuple[Drawn, Drawn]:

@@ -32,8 +32,10 @@ _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")
 _LARGEST_MATERIAL = 256
 """Objects of one BSDF: all of them are compiled into every kernel; shipped materials have up to 4."""
-_COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_grating", "regular")
+_COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_glass", "mitsim_grating", "regular")
 """Plugins whose light or reflectance is one by wavelength, lies in a mesh that may hold colours, or turns with it."""
+_PARTING = "mitsim_glass"
+"""The material that bends each wavelength by an index of its own."""
 _METALS = ("conductor", "roughconductor")
 """Materials that are copper where nothing else is said."""
 _Type = mi.Properties.Type
@@ -46,7 +48,7 @@ class CheckedScene:
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
     the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
     ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
-    into; ``coloured`` those of what may differ by wavelength.
+    into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way.
     """
 
     outline: Outline
@@ -58,6 +60,7 @@ class CheckedScene:
     shapes: tuple[Tag, ...]
     small_lamps: tuple[Tag, ...]
     coloured: tuple[Tag, ...]
+    parting: tuple[Tag, ...]
 
 
 def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
@@ -94,7 +97,7 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
     listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
     facts = tuple(files.used), tree.limits, unfit
     shown, small = listed
-    return CheckedScene(outline, config, state, *facts, shown, small, tuple(tree.coloured))
+    return CheckedScene(outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting))
 
 
 @contextmanager
@@ -122,6 +125,7 @@ class _Tree:
     limits: dict[str, Range] = field(default_factory=lambda: dict(limits.LIMITS))
     texels: int = 0
     coloured: list[Tag] = field(default_factory=list)
+    parting: list[Tag] = field(default_factory=list)
 
     def check(self) -> None:
         """MitsimError for the first object that a scene cannot have."""
@@ -130,6 +134,8 @@ class _Tree:
             check_plugin(tag, plugin)
             if plugin in _COLOURED or (plugin in _METALS and not _is_plain(node)):
                 self.coloured.append(tag)
+            if plugin == _PARTING:
+                self.parting.append(tag)
             for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
                 self._check_property(node, name)
             if plugin in _READERS:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""
-_MIRRORS = ("conductor", "dielectric", "plastic", "thindielectric")
+_MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
 SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path runs into."""

@@ -13,9 +13,9 @@ from mitsim.scene.guard.outline import Tag
 
 _TEXTURES = "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconstant regular srgb uniform"
 PLUGINS = {
-    "bsdf": "blendbsdf bumpmap conductor dielectric diffuse hair mask mitsim_grating normalmap null plastic "
-    "polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic thindielectric "
-    "twosided circular",
+    "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask mitsim_glass mitsim_grating normalmap "
+    "null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic "
+    "thindielectric twosided",
     "emitter": "area constant directional envmap mitsim_projector point projector spot",
     "film": "hdrfilm specfilm",
     "integrator": "direct path ptracer volpath volpathmis",

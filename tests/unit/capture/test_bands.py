@@ -27,7 +27,7 @@ def bench(coloured: bool = True, lines: Lines = LASERS, curve: object = None) ->
     """Plain numbers that are called a bench, whose other variants and bands say so."""
     found = SimpleNamespace(
         variant="llvm_ad_mono", projector=SimpleNamespace(lines=lines), words=("mono",),
-        loaded=SimpleNamespace(coloured=("a tag",) if coloured else ()),
+        loaded=SimpleNamespace(coloured=("a tag",) if coloured else (), parting=()),
         sensor=SimpleNamespace(quantum_efficiency_curve=curve),
     )  # fmt: skip
     found.in_variant = lambda name: SimpleNamespace(
@@ -95,8 +95,11 @@ def test_seconds_grow_by_what_lines_do_not_share(chosen: Callable[..., bands.Col
     seconds = [each.seconds - looked for each in found.colour.candidates]
     assert seconds == pytest.approx([15, 15, 1 + 1.2 * 5 + 2 * 9, 1 + 1.4 * 5 + 3 * 9])
     # The same of a plan of three runs. (Planted: more of them for fewer.)
-    of_three = bands._seconds({"plan": 1.0, "transport": 7.0, "optics": 27.0}, 3, 1)
+    of_three = bands._seconds({"plan": 1.0, "transport": 7.0, "optics": 27.0}, 3, 1, False)
     assert of_three == pytest.approx(1 + 5 + 9)
+    # Where glass parts the lines they share nothing but the plan. (Planted: shared paths.)
+    parted = bands._seconds({"plan": 1.0, "transport": 6.0, "optics": 27.0}, 3, 1, True)
+    assert parted == pytest.approx(1 + 2 + 9)
     later = found.taking(start=7.0)
     assert later.colour is not None and later.colour.taken.seconds == pytest.approx(later.predicted_seconds)
 

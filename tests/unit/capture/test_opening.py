@@ -34,7 +34,7 @@ class Loader:
     def loaded(self, variant: str, path: Path, defines: Any, **options: bool) -> Any:
         self.asked.append((variant, path, dict(defines), options))
         geometry = SimpleNamespace(pitches=self.pitches)
-        return SimpleNamespace(camera=SimpleNamespace(geometry=geometry, wear=self.worn.append), path=path)
+        return SimpleNamespace(camera=SimpleNamespace(geometry=geometry, wear=self.worn.append), path=path, parting=())
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         geometry=geometry,
         spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
         loaded=SimpleNamespace(
-            pixels=SimpleNamespace(keystone=2.5), unfit=Unfit(), shapes=(), small_lamps=(), coloured=()
+            pixels=SimpleNamespace(keystone=2.5), unfit=Unfit(), shapes=(), small_lamps=(), coloured=(), parting=()
         ),
         lines=None,
         sensor=SimpleNamespace(quantum_efficiency_curve=None),

@@ -1,0 +1,197 @@
+"""Light of several lines through dispersive glass, each line beside a capture's of plain glass of its own index.
+
+A child process traces them, for this one has another variant. Lines that part are traced alone, by the random numbers
+that a projector of one line has: places and light agree to float32's rounding, in all ways that light is followed.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.colour import ColourBench, line_alone
+from mitsim.capture.lamplight import lit_by_lamps
+from mitsim.capture.opening import open_bench
+from mitsim.core.colours import RUN
+from mitsim.core.errors import MitsimError
+from mitsim.transport.cells import aligned_grid
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.flux import FluxTracer
+from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.glint import trace_glint
+from mitsim.transport.histogram import Deposits
+from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.lamps import Counted, LampTracer
+from mitsim.transport.neighbours import NeighbourTracer
+from tests.conftest import write_small_scene
+
+N, SAMPLES = 8, 16
+LINES, SHARES = (450.0, 530.0, 640.0), (0.5, 0.3, 0.2)
+INDEX, ABBE = 1.7, 25.0
+"""Of a dense flint."""
+GLASS = '<bsdf type="mitsim_glass"><float name="index" value="1.7"/><float name="abbe" value="25"/></bsdf>'
+PLAIN = '<bsdf type="dielectric"><float name="int_ior" value="{:.9f}"/><float name="ext_ior" value="1"/></bsdf>'
+SLAB = """<shape type="cube"><transform name="to_world"><scale x="90" y="90" z="12"/>
+    <rotate y="1" angle="25"/><translate z="220"/></transform>{glass}</shape>"""
+BALL = """<shape type="sphere"><point name="center" x="-8" y="2" z="340"/>
+    <float name="radius" value="14"/>{glass}</shape>"""
+MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="40"/>
+    <rotate y="1" angle="180"/><translate x="30" z="330"/></transform>
+    <bsdf type="conductor"><string name="material" value="none"/></bsdf></shape>"""
+LAMP = """<shape type="rectangle"><transform name="to_world"><scale x="15" y="15"/><translate z="320" x="-40"/>
+    </transform><emitter type="area"><spectrum name="radiance" value="0.5"/></emitter></shape>"""
+SCENES = {"slab": SLAB, "ball": BALL, "glint": MIRROR + SLAB, "lamp": SLAB + LAMP}
+QUICK = ("slab", "glint")
+ROUNDING = 2e-6
+"""Of sums of a few thousand paths in float32."""
+
+
+def index(nm: float) -> float:
+    """Cauchy's two terms through n_d and the Abbe number, by the lines d, F and C."""
+    slope = (INDEX - 1) / ABBE / (0.48613**-2 - 0.65627**-2)
+    return INDEX + slope * ((nm / 1000) ** -2 - 0.58756**-2)
+
+
+def seen(light: Deposits) -> list[float]:
+    """How much light, from where and how far, and of which pixels."""
+    places = (np.ones(len(light.value)), light.row, light.column, light.inverse_depth * 400, light.pixel / N**2)
+    return [float(np.sum(light.value * place)) for place in places]
+
+
+def followed(bench: Bench) -> dict[str, Deposits]:
+    """Light of a bench by the way that it is followed."""
+    loaded, optics = bench.loaded, bench.projector_optics
+    aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
+    parts = loaded.scene, loaded.camera, optics
+    tracers = {
+        "direct": DirectTracer(*parts, 2),
+        "indirect": IndirectTracer(*parts, True, True),
+        "shared": NeighbourTracer(*parts, True, True),
+        "from camera": FromCameraTracer(*parts, aim, Paths(True, True, ())),
+    }
+    if not tracers["indirect"].receiver.passage.open:
+        tracers["looks"] = tracers["indirect"]
+    else:
+        del tracers["shared"]
+    return {
+        name: tracer.trace_looks([3, 5], SAMPLES)[1] if name == "looks" else tracer.trace(3, 0, SAMPLES)
+        for name, tracer in tracers.items()
+    }
+
+
+def flux(bench: Bench) -> list[list[float]]:
+    """(lines, 2) mean irradiance of the sensor, by truth's tracer: all pixels, and the first half of them."""
+    loaded = bench.loaded
+    tracer = FluxTracer(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry)
+    pixels = np.arange(N**2)
+    sums = tracer.sums(7, 1, pixels, np.zeros(N**2, dtype=np.int64), 64)[:, 0]
+    return [[float(line.sum()), float(line[: N**2 // 2].sum())] for line in sums]
+
+
+def glint(bench: Bench) -> list[float]:
+    """Of beams that reach the sensor: power, and by place."""
+    beams = trace_glint(bench.loaded.scene, bench.loaded.camera, bench.projector_optics)
+    light = beams.flux * beams.throughput.mean(axis=(1, 2))
+    return [float(light.sum()), *(light @ beams.sensor.mean(axis=(1, 2))).tolist()]
+
+
+def lamps(bench: Bench) -> list[list[float]]:
+    """What a camera counts of lamps' light in a narrow band about each line."""
+    lit = lit_by_lamps(bench, {}, 1)
+    assert lit.lamplight is not None
+    aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
+    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, aim
+    like = FromCameraTracer(*parts, Paths(True, True, bench.loaded.lamps))
+    bands = [(nm - 0.01, nm + 0.01) for nm in LINES] + [(830.0, 830.0)]
+    found = LampTracer(like, Counted(lit.lamplight.responses[0], bands, (1.0,))).trace(3, 0, SAMPLES)
+    return [seen(found.where(found.pixel == N**2 + band)) for band in range(len(LINES))]
+
+
+def both(name: str, opened: Callable[[str, str], Bench]) -> dict[str, Any]:
+    """Light of a scene by the way that it is followed: of several lines in dispersive glass, and of each in plain
+    glass."""
+    whole = ColourBench.of(opened(name, GLASS), RUN).whole
+    assert whole.lines is not None
+    pairs = zip(LINES, whole.lines.single, strict=True)
+    alone = [line_alone(opened(name, PLAIN.format(index(nm))), line) for nm, line in pairs]
+    if name == "lamp":
+        return {"lamps": [lamps(whole), [lamps(bench)[line] for line, bench in enumerate(alone)]]}
+    if name == "glint":
+        each = np.array([glint(bench) for bench in alone])
+        return {"glint": [[glint(whole)], [each.sum(axis=0).tolist()]], "line by line": [each.tolist()] * 2}
+    together, apart = followed(whole), [followed(bench) for bench in alone]
+    found = {
+        way: [[seen(line) for line in light.by_line(3)], [seen(one[way]) for one in apart]]
+        for way, light in together.items()
+    }
+    return {**found, "flux": [flux(whole), [flux(bench)[0] for bench in alone]]}
+
+
+def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
+    """Light of some scenes; its process has a spectral variant for good."""
+    place = Path(folder)
+    (place / "lines.toml").write_text(
+        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {list(LINES)}\n'
+        f"radiant_shares = {list(SHARES)}\n"
+    )
+
+    def opened(name: str, glass: str) -> Bench:
+        path = write_small_scene(place, name, n=N, extra=SCENES[name].format(glass=glass))
+        return open_bench(path, "llvm_ad_spectral", None, place / "lines.toml")
+
+    found = {name: both(name, opened) for name in names}
+    try:
+        followed(opened("slab", GLASS))
+    except MitsimError as error:
+        found["drawn wavelengths"] = {"refusal": str(error)}
+    return found
+
+
+@pytest.fixture(scope="module")
+def light(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
+    """Light of a scene, traced with that of all others that are as quick."""
+    program = (
+        "import json, sys; from tests.physics.test_dispersion import traced; "
+        "print(json.dumps(traced(sys.argv[1], sys.argv[2:]), default=float))"
+    )
+
+    @cache
+    def trace(*names: str) -> dict[str, Any]:
+        command = [sys.executable, "-c", program, str(tmp_path_factory.mktemp("dispersion")), *names]
+        root = Path(__file__).parents[2]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
+        assert done.returncode == 0, done.stderr
+        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+        return found
+
+    return lambda name: trace(*(each for each in SCENES if (each in QUICK) == (name in QUICK)))
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SCENES]
+)
+def test_each_line_is_bent_by_its_own_index(light: Callable[[str], dict[str, Any]], name: str) -> None:
+    """Light, places and pixels of each line are those of a line alone in plain glass of that index.
+
+    By some way the lines differ, beside their power, by more than a hundred times the tolerance.
+    """
+    apart = []
+    for way, (whole, alone) in light(name)[name].items():
+        ours, theirs = np.array(whole), np.array(alone)
+        np.testing.assert_allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING * np.abs(theirs).max(), err_msg=way)
+        apart.append(np.ptp(theirs / theirs[..., :1], axis=-2).max())
+    assert max(apart) > 100 * ROUNDING
+
+
+def test_drawn_wavelengths_are_refused(light: Callable[[str], dict[str, Any]]) -> None:
+    refusal = light(QUICK[0])["drawn wavelengths"]["refusal"]
+    assert refusal.startswith("variant llvm_ad_spectral: ") and "colour lines" in refusal
