@@ -28,9 +28,10 @@ from mitsim.transport.direct import DirectTracer
 from mitsim.transport.flux import FluxTracer
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.glint import trace_glint
-from mitsim.transport.histogram import Deposits
+from mitsim.transport.histogram import Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.lamps import Counted, LampTracer
+from mitsim.transport.ledger import Ledger
 from mitsim.transport.neighbours import NeighbourTracer
 from tests.conftest import write_small_scene
 
@@ -88,6 +89,17 @@ def followed(bench: Bench) -> dict[str, Deposits]:
     }
 
 
+def filed(bench: Bench) -> list[list[float]]:
+    """(lines, classes) indirect light that is filed on the device."""
+    lines, parts = bench.lines, (bench.loaded.scene, bench.loaded.camera, bench.projector_optics)
+    assert lines is not None
+    tracer, labels = IndirectTracer(*parts, True, True), np.arange(N**2) % 5
+    bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
+    ledgers = [Ledger(bundle, labels, tracer.board) for _ in lines.shares]
+    tracer.trace_into(ledgers, 3, 0, SAMPLES)
+    return [np.asarray(ledger.filed()[0].sum(axis=1)).ravel().tolist() for ledger in ledgers]
+
+
 def flux(bench: Bench) -> list[list[float]]:
     """(lines, 2) mean irradiance of the sensor, by truth's tracer: all pixels, and the first half of them."""
     loaded = bench.loaded
@@ -133,7 +145,9 @@ def both(name: str, opened: Callable[[str, str], Bench]) -> dict[str, Any]:
         way: [[seen(line) for line in light.by_line(3)], [seen(one[way]) for one in apart]]
         for way, light in together.items()
     }
-    return {**found, "flux": [flux(whole), [flux(bench)[0] for bench in alone]]}
+    for way, sums in {"filed": filed, "flux": flux}.items():
+        found[way] = [sums(whole), [sums(bench)[0] for bench in alone]]
+    return found
 
 
 def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
@@ -188,7 +202,7 @@ def test_each_line_is_bent_by_its_own_index(light: Callable[[str], dict[str, Any
     for way, (whole, alone) in light(name)[name].items():
         ours, theirs = np.array(whole), np.array(alone)
         np.testing.assert_allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING * np.abs(theirs).max(), err_msg=way)
-        apart.append(np.ptp(theirs / theirs[..., :1], axis=-2).max())
+        apart.append(np.ptp(theirs / np.abs(theirs).sum(axis=-1, keepdims=True), axis=-2).max())
     assert max(apart) > 100 * ROUNDING
 
 
