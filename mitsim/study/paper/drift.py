@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.capture.drift import projecting
+from mitsim.capture.run import trace_request
 from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factors import Factors
@@ -100,7 +101,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     session = _session(studio, point, recipe, drift) if kind.startswith("session") else None
     moved = None
     if kind.startswith("projector"):
-        moved = studio.once("moved projector", 6, (setup, drift), lambda: _moved(lit, drift, setup.accuracy))
+        moved = studio.once("moved projector", 6, (setup, drift), lambda: _moved(lit, drift))
     found = known.outcome(drift, session, moved)
     row = point.row(
         before_db=found.before_db,
@@ -126,8 +127,10 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
     )
 
 
-def _moved(lit: LitScene, drift: Drift, accuracy: float) -> LitScene:
-    return LitScene(projecting(lit.bench, drift).light(accuracy=accuracy))
+def _moved(lit: LitScene, drift: Drift) -> LitScene:
+    """The scene in light of a projector that moved, as coarse as its light before: another plan's errors would be in
+    one image alone, and would pass for the drift's."""
+    return LitScene(trace_request(projecting(lit.bench, drift), lit.light.plan))
 
 
 def _losses(table: Table) -> Mapping[str, tuple[Mean, Mean]]:

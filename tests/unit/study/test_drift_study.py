@@ -22,6 +22,7 @@ from mitsim.study import find_experiment
 from mitsim.study.drift import SESSION, DriftStand, Outcome
 from mitsim.study.experiment import Results, Scope, Setup
 from mitsim.study.exposures import RENDERED, LitScene
+from mitsim.study.paper.drift import _moved
 from mitsim.study.studio import Studio
 from mitsim.study.table import Table
 
@@ -168,6 +169,9 @@ def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
     left = moved.truth[:-1] - 0.75 * truth[:-1] - 0.25 * truth[1:]
     assert np.linalg.norm(left) < 0.2 * np.linalg.norm(moved.truth - truth)
     assert projecting(stand.lit.bench, Drift(mask_rows_um=1.0)) is stand.lit.bench
+    # By the plan of the light before: another's errors pass for the drift's. (Planted: a plan of its own.)
+    own = _moved(stand.lit, drift).light
+    assert own.plan is stand.lit.light.plan and own.bench.loaded.pixels == bench.loaded.pixels
 
 
 def test_what_is_predicted_of_a_worse_image() -> None:
