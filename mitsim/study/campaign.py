@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from mitsim.capture.opening import check_scene
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
@@ -123,6 +124,8 @@ def run_experiment(
             return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, together))
     campaign, job, where = _Campaign.of(study, scope, output), job or Job(), where or Where()
     own, started = where.shard.part(campaign.points), time.perf_counter()
+    for setup in dict.fromkeys(point.setup for point in own):
+        check_scene(setup.scene, dict(setup.parameters), setup.outside)  # before there is a folder
     with campaign.folder(output) as (folder, store):
         todo = [point for point in own if not store.has(point)]
         for done, (point, found) in enumerate(where.measure(study, todo) if todo else (), start=1):

@@ -153,7 +153,7 @@ def test_a_killed_worker_loses_its_point_only(
 
 def test_a_point_that_kills_again_ends_the_study_and_keeps_the_rest(run: Run, tmp_path: Path) -> None:
     (tmp_path / "fatal d1").write_text("always")
-    with pytest.raises(MitsimError, match=r"2 processes ended at one point \(place = d, number = 1\).*exit code -9"):
+    with pytest.raises(MitsimError, match=r"2 processes ended at one point \(mask = d, number = 1\).*exit code -9"):
         run(jobs=1)
     assert begun(tmp_path) == sorted([*(point for point in ALL if point[0] != "d"), "d1", "d1"])
     (tmp_path / "fatal d1").unlink()

@@ -14,11 +14,11 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 
 def points(scope: Scope) -> Sequence[Point]:
     numbers = scope.chosen((1, 2, 3), (1, 2))
-    return [Point.of(scope.setup.changed(place=place), number=number) for place in "abcd" for number in numbers]
+    return [Point.of(scope.setup.changed(mask=place), number=number) for place in "abcd" for number in numbers]
 
 
 def measure(_: object, point: Point) -> Found:
-    place, number = dict(point.setup.parameters)["place"], int(point["number"])
+    place, number = dict(point.setup.parameters)["mask"], int(point["number"])
     folder = Path(os.environ.get("TOY_FOLDER", "/nowhere"))
     (folder / "begun").open("a").write(f"{place}{number}\n")
     if (fatal := folder / f"fatal {place}{number}").exists():
