@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("draft_figures")
 
 TOY = "tests.unit.study.toy_study"
 ROOT = Path(__file__).parents[3]
-SCOPE = Scope(Setup("nowhere"), (None,))
+SCOPE = Scope(Setup("photograph"), (None,))
 ALL = {f"{place}{number}" for place in "abcd" for number in (1, 2, 3)}
 Run = Callable[..., CampaignResult]
 Whole = tuple[CampaignResult, Path]
