@@ -60,7 +60,7 @@ class FiledLight:
         return FiledLight(*(_sum(getattr(self, field.name), getattr(other, field.name)) for field in fields(self)))
 
     def __truediv__(self, count: float) -> FiledLight:
-        return FiledLight(*(getattr(self, field.name) / count for field in fields(self)))
+        return FiledLight(*(_divided(getattr(self, field.name), count) for field in fields(self)))
 
     @property
     def totals(self) -> FloatArray:
@@ -73,6 +73,13 @@ def _sum(one: Any, other: Any) -> Any:
     if not isinstance(one, sparse.csr_array) or (one.nnz and other.nnz):
         return one + other
     return one if one.nnz else other
+
+
+def _divided(light: Any, count: float) -> Any:
+    """A number or a matrix over ``count``; SciPy would copy where a matrix has its light, which lines may share."""
+    if not isinstance(light, sparse.csr_array):
+        return light / count
+    return sparse.csr_array((light.data * (1 / count), light.indices, light.indptr), shape=light.shape)
 
 
 class Tray:

@@ -393,6 +393,8 @@ def trace_lines(
         )
         growth = most**rate
         rounds *= min(max(beyond * growth, least), _LARGEST_GROWTH)
+        # What the next round replaces is not held beside it: new memory is dear.
+        del lines, looks, lights, light
 
 
 @single_threaded_blas()
