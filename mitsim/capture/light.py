@@ -42,6 +42,10 @@ _LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 4 / 3
 """Least that they grow by: a tenth, and where all come in even numbers (2^k, 3 * 2^k) as far as the next of them."""
 _BEYOND = 1.05
 """Growth beyond what the error asks for, so that another round is rare; even numbers are rounded up as it is."""
+_TOLD, _DOUBLED = 1.2, 1.5
+"""Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: eight
+groups of many paths have 1.05 to 1.17. The next round is then for the error, or double where that is small already: by
+the bound, one heavy path among cookie_bag's first 49 samples asked for 270, and 158 do."""
 _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 """Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
 what direct light brings), direct light's with their 0.8th power or faster."""
@@ -383,7 +387,7 @@ def trace_lines(
             lights[line] = replace(light, reached=seen <= target)
             if seen > target:
                 # Capped before the power as well: a target that was set very low would overflow it.
-                most = max(most, min(seen / target, _LARGEST_GROWTH))
+                most = max(most, min(_excess(seen, more * light.sampling_error, target), _LARGEST_GROWTH))
             near = min(near, (target / seen) ** 2 if seen > 0 else 1.0)
         progress("transport", near)
         if last or all(light.reached for light in lights.values()):
@@ -473,6 +477,11 @@ def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, fl
         found = Looked(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
         light = replace(light, looked=found)
     return light, bound
+
+
+def _excess(seen: float, error: float, target: float) -> float:
+    """By how much the next round is to lower what is ``seen`` of an ``error`` to come to the ``target``, as a ratio."""
+    return min(seen / target, max(_TOLD * error / target, _DOUBLED))
 
 
 def first_round(simulation: Simulation) -> float:

@@ -118,6 +118,35 @@ def test_shots_that_are_looked_at(
     assert trace_light(bench, plan, family, 3).reached and asked == [looked_at] * 2
 
 
+@pytest.mark.parametrize(
+    ("error", "bound", "excess"), [(1.9, 2.0, 2.0), (1.9, 6.0, 1.2 * 1.9), (0.9, 6.0, 1.5), (0.9, 1.1, 1.1)]
+)
+def test_the_next_round_is_for_the_error_where_few_paths_make_the_bound(
+    bench: Bench,
+    plan: Plan,
+    family: Lighting,
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    bound: float,
+    excess: float,
+) -> None:
+    """Where many tell it, for the bound; never more than that. (Planted: for the bound always, for the error always,
+    no least step.)"""
+    target, looks = plan.sampling_target, []
+
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
+        looks.append(frames)
+        return (0.0, 0.0) if len(looks) > 1 else (error * target, bound * target)
+
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    monkeypatch.setattr(module, "tells_all", lambda *_: True)
+    wanted = []
+    monkeypatch.setattr(module, "samples_of", lambda _, rounds: wanted.append(rounds) or {"direct": 1})
+    assert trace_light(bench, plan, family, 3).reached
+    growth = max(excess**module._DIRECT_RATE, module._LEAST_EVEN_GROWTH)
+    assert wanted == [1.0, pytest.approx(growth)]
+
+
 def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Lighting) -> None:
     """Frames of looked-at light state the errors of frames that nobody looked at before; of other light, shots with
     other classes, or other signs they do not. (Planted: the look's products, times two, and a look for any light.)"""
