@@ -188,7 +188,8 @@ class Look:
         if stage == "cells":
             self.fine = FineLight(bench, base, sample, self.accuracy, seed)
         elif stage == "effects":
-            self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
+            looked = bench, self._everything, sample, seed, self.fine.judging, self.accuracy
+            self.switched = SwitchedEffects(*looked)
         elif stage == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
             self.followed = FollowedLight(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)

@@ -4,6 +4,7 @@ The scene calls for everything at once: a sensor of 24 mm near a ball and a corn
 against frames of many more samples; the pilot sees a few, so a factor of 1.5 either way is its promise here.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from mitsim.capture import effects, pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
-from mitsim.capture.evidence import Evidence, Settings
+from mitsim.capture.evidence import Changes, Evidence, Part, Settings
 from mitsim.capture.opening import open_bench
 from mitsim.capture.pilot import direct, followed, looks
 from mitsim.capture.pilot.switched import SwitchedEffects
@@ -269,6 +270,25 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     formed = [made.expected([light], sample.rows, sample.lighting, 0) for light in filed]
     expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
+
+
+def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
+    """By looks of their own, whose light and noise are as large as told before. (Planted: samples of the first looks
+    for either, the first looks' seeds, no closer looks at all.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = looks.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    first, close = (SwitchedEffects(bench, everything, sample, 5, (450.0, 330.0), told) for told in (1.0, 1e-7))
+    seen = [Changes.between(found.changes, found.light**2) for found in (first, close)]
+    open_ = [bound**2 - value**2 for value, bound in (each.estimate([Part("indirect cells", 1)]) for each in seen)]
+    assert open_[1] < open_[0] / 4
+    one, two = (each.estimate([Part("indirect layers", 1)]).value for each in seen)
+    assert two == pytest.approx(one, rel=0.3)
+    noises = [found.effort("indirect").noise for found in (first, close)]
+    assert [noise.samples for noise in noises] == [sample.followed, 16 * sample.followed]
+    assert 0.5 < noises[1].error * math.sqrt(16) / noises[0].error < 2
+    one, two = (found._closer[0][0].value[:50] for found in (first, close))
+    assert not np.array_equal(one, two)
 
 
 def test_the_pilot_is_reproducible(bench: Bench) -> None:
