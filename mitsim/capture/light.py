@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
+from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, whole
 from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
@@ -395,8 +395,11 @@ def trace_lines(
         rate, least, beyond = (
             (_FOLLOWED_RATE, _LEAST_GROWTH, _BEYOND) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH, 1.0)
         )
-        growth = most**rate
+        growth, done = most**rate, lines[0].samples
         rounds *= min(max(beyond * growth, least), _LARGEST_GROWTH)
+        # Where less than a sample is needed, there is one.
+        while samples_of(simulation, rounds) == done:
+            rounds *= least
 
 
 @single_threaded_blas()
@@ -451,7 +454,8 @@ def _looks(lines: Sequence[Light], lighting: Lighting, followed: bool, enough: f
 
 def _mostly_followed(simulation: Simulation) -> bool:
     """Whether most paths that a plan predicts are of light over several surfaces."""
-    paths = {name: stage.predicted * stage.tracer.lanes for name, stage in simulation.tracers().items()}
+    samples = samples_of(simulation, 1.0)
+    paths = {name: samples[name] * stage.tracer.lanes for name, stage in simulation.tracers().items()}
     return sum(count for name, count in paths.items() if name not in EVEN) > sum(paths.values()) / 2
 
 
@@ -492,11 +496,7 @@ def first_round(simulation: Simulation) -> float:
 def samples_of(simulation: Simulation, rounds: float) -> dict[str, int]:
     """Samples of a group, by the name of what is traced: so many times those that the plan of a ``simulation``
     predicted, in ``rounds``."""
-    wanted = {}
-    for name, stage in simulation.tracers().items():
-        samples = max(rounds * stage.predicted, 1.0)
-        wanted[name] = math.ceil(even(samples) if name in EVEN else samples)
-    return wanted
+    return {name: int(whole(name, rounds * stage.predicted)) for name, stage in simulation.tracers().items()}
 
 
 def _some(lighting: Lighting, count: int) -> Lighting:

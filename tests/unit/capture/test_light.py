@@ -140,11 +140,36 @@ def test_the_next_round_is_for_the_error_where_few_paths_make_the_bound(
 
     monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
     monkeypatch.setattr(module, "tells_all", lambda *_: True)
-    wanted = []
-    monkeypatch.setattr(module, "samples_of", lambda _, rounds: wanted.append(rounds) or {"direct": 1})
-    assert trace_light(bench, plan, family, 3).reached
+    monkeypatch.setattr(module, "samples_of", lambda _, rounds: {"direct": math.ceil(100 * rounds)})
+    found = trace_light(bench, plan, family, 3)
     growth = max(excess**module._DIRECT_RATE, module._LEAST_EVEN_GROWTH)
-    assert wanted == [1.0, pytest.approx(growth)]
+    assert found.reached and found.samples == {"direct": math.ceil(100 * growth)}
+
+
+def test_light_that_needs_less_than_a_sample_takes_one_until_it_needs_more(
+    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a round that nothing grows in is none. (Planted: one sample for what needs less, so that it takes two in the
+    next round; rounds in which nothing grows.)"""
+    target, looks = plan.sampling_target, list[ExpectedFrames]()
+
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
+        looks.append(frames)
+        return (1.1 * target, 1.2 * target) if len(looks) < 3 else (0.0, 0.0)
+
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    settings = replace(plan.settings, effects=frozenset(FAR), direct_samples=0.1, indirect_samples=3.0)
+    settings = replace(settings, followed_anchors=2, followed_samples=0.5, followed_from_camera_samples=0.02)
+    wanted, kept = [], module._trace
+    monkeypatch.setattr(module, "_trace", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
+    assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
+    assert [each["direct"] for each in wanted] == [1, 1, 1]
+    assert [each["indirect at anchors"] for each in wanted] == [1, 1, 1]
+    looks.clear()
+    wanted.clear()
+    settings = replace(settings, effects=frozenset())
+    assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
+    assert [each["direct"] for each in wanted] == [1, 2, 3]
 
 
 def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Lighting) -> None:

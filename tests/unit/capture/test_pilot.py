@@ -15,7 +15,7 @@ import pytest
 from mitsim.capture import effects, pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
-from mitsim.capture.evidence import Changes, Evidence, Part, Settings
+from mitsim.capture.evidence import LOOKS, Changes, Evidence, Part, Settings
 from mitsim.capture.opening import open_bench
 from mitsim.capture.pilot import direct, followed, looks
 from mitsim.capture.pilot.switched import SwitchedEffects
@@ -100,7 +100,8 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(followed.FOLLOWED_LADDER)
     assert 0 < evidence.forming.seconds < 1
     assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.from_camera.paths
-    assert evidence.followed.paths == evidence.indirect.paths + evidence.from_camera.paths
+    assert evidence.followed.paths == evidence.indirect.paths
+    assert evidence.followed_from_camera.paths == evidence.from_camera.paths
     assert evidence.forming.terms == len(bench.spectrum.weights)
 
 
@@ -188,7 +189,7 @@ def test_light_to_many_anchors_is_traced_in_parts(
 ) -> None:
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
-    monkeypatch.setattr(followed, "_AT_ONCE", 2 * 9 * evidence.followed.paths)
+    monkeypatch.setattr(followed, "_AT_ONCE", 2 * 9 * (evidence.followed.paths + evidence.from_camera.paths))
     again = measured(bench, seed=3).ladders["followed_anchors"]
     for count, error in evidence.ladders["followed_anchors"].items():
         assert again[count] == pytest.approx(error, rel=1e-6)
@@ -270,6 +271,22 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     formed = [made.expected([light], sample.rows, sample.lighting, 0) for light in filed]
     expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
+
+
+def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
+    """At anchors, as a tracer alone would make it; their squares add up. (Planted: one side's for the other's, all
+    light's for one of them.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = looks.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    found = followed.FollowedLight(bench, everything, sample, 0.0, 5)
+    indirect, camera = found.efforts(1.0)
+    alone, nothing = followed.FollowedLight(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
+    vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
+    assert indirect.noise.error == pytest.approx(looks.noise(alone._beyond_mean()), rel=1e-9)
+    both = looks.noise(found._beyond_mean())
+    assert math.hypot(indirect.noise.error, camera.noise.error) == pytest.approx(both, rel=0.3)
+    assert (indirect.paths, camera.paths) == tuple(tracer.lanes for tracer in found._simulation().at_anchors)
 
 
 def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
