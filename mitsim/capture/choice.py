@@ -21,7 +21,6 @@ import numpy.typing as npt
 from mitsim.capture.effects import EFFECTS, names
 from mitsim.capture.evidence import (
     COUNTED,
-    EVEN,
     GROUPS,
     SURE,
     Effort,
@@ -30,7 +29,7 @@ from mitsim.capture.evidence import (
     Number,
     Part,
     Settings,
-    even,
+    whole,
 )
 from mitsim.capture.prices import (
     ANCHORS_OF,
@@ -61,8 +60,6 @@ _AS_GOOD = 1.1
 """Where nothing fits, settings whose error is larger than the least by this count as good as it."""
 _COARSE_CELLS = (1, 2, 4, 8)
 """As for fine light."""
-_FEWEST_SAMPLES = 1.0
-"""Samples of each kind of light in a group: it sees every pixel."""
 _BOUND_OVER_ERROR = 1.1
 """Sampling stops by the 95 % bound on its error, which lies so far above its estimate where eight groups of many paths
 tell it (1.05 to 1.17 in photograph, gift card, corner, cookie bag, metal blade, compact disc)."""
@@ -308,7 +305,7 @@ class _Table:
             raster=self.raster_cells > 0,
             raster_cells=self.raster_cells,
         )
-        samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.samples.items()}
+        samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.needed.items()}
         return replace(settings, **samples)
 
     def choice(self, index: int) -> Choice:
@@ -408,16 +405,22 @@ class _Table:
 
     @cached_property
     def samples(self) -> dict[str, FloatArray]:
-        """(m,) samples of a group by kind of light: the least work for a sum of variances."""
+        """(m,) samples of a group by kind of light, as they are traced."""
+        return {name: np.asarray(whole(name, count)) for name, count in self.needed.items()}
+
+    @cached_property
+    def needed(self) -> dict[str, FloatArray]:
+        """(m,) samples of a group by kind of light, or the part of one: the least work for a sum of variances."""
         parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._prices.items()}
-        whole = sum(parts.values()) + np.zeros(len(self.rows))
+        every = sum(parts.values()) + np.zeros(len(self.rows))
         single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
         for name, part in parts.items():
             # Light without noise takes no share; a share of one keeps the division defined.
-            share = np.sqrt(np.divide(part, whole, out=np.ones(len(whole)), where=part > 0))
-            needed = np.maximum(self._by_row(name, partial(_needed, target=single * share)), _FEWEST_SAMPLES)
-            found[name] = np.asarray(even(needed) if name in EVEN else np.ceil(needed))
+            share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
+            needed = self._by_row(name, partial(_needed, target=single * share))
+            # What needs no whole sample does not take two when all others grow.
+            found[name] = np.where(needed < 1, needed, whole(name, needed))
         return found
 
     @cached_property
@@ -441,7 +444,7 @@ class _Table:
     def _entries(self) -> FloatArray:
         """(m,) of one group's filed light."""
         evidence, samples = self.evidence, {**self.samples}
-        for name in ("indirect", "followed", "occluded"):
+        for name in ("indirect", "followed", "followed_from_camera", "occluded"):
             samples.setdefault(name, np.ones(len(self.rows)))
         found = entries(evidence.direct.paths, evidence.forming.classes, self.numbers, samples)
         return np.asarray(found) + np.zeros(len(self.rows))

@@ -118,7 +118,9 @@ def light_bytes(bench: Bench, classes: int, settings: Settings, lines: int = 1) 
 
 def _paths(pixels: int, settings: Settings) -> float:
     """Paths of one group's largest stage, about."""
-    anchored = settings.anchors**2 * settings.anchored_samples * (settings.anchors > 1)
-    followed = settings.followed_anchors**2 * settings.followed_samples * (settings.followed_anchors > 1)
-    occluded = len(settings.with_own_anchors) / pixels * settings.occluded_anchors**2 * settings.occluded_samples
-    return pixels * max(settings.direct_samples, anchored, followed, occluded, settings.indirect_samples)
+    anchored = settings.anchors**2 * max(settings.anchored_samples, 1.0) * (settings.anchors > 1)
+    most = max(settings.followed_samples, settings.followed_from_camera_samples, 1.0)
+    followed = settings.followed_anchors**2 * most * (settings.followed_anchors > 1)
+    part = len(settings.with_own_anchors) / pixels
+    occluded = part * settings.occluded_anchors**2 * max(settings.occluded_samples, 1.0)
+    return pixels * max(settings.direct_samples, 1.0, anchored, followed, occluded, settings.indirect_samples)

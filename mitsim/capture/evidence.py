@@ -78,10 +78,10 @@ class Settings:
         names of those that are simulated (:mod:`mitsim.capture.effects`).
     direct_samples, anchored_samples, indirect_samples, from_camera_samples
         samples that each group is predicted to need: a projector pixel of direct light, of its differences between
-        anchors, and of indirect light; a cell of what is followed from the camera.
-    followed_anchors, followed_samples
+        anchors, and of indirect light; a cell of what is followed from the camera. Below 1, one is traced.
+    followed_anchors, followed_samples, followed_from_camera_samples
         points a side of the sensor that light over several surfaces, or in mirrors, is followed to, and samples that
-        each group is predicted to need of what they see beyond their mean.
+        each group is predicted to need of what they see beyond their mean, from the projector's side and the camera's.
     followed_width
         projector pixels a side of a cell of that, in one layer; 1: as ``coarse_cells`` and ``coarse_layers`` say.
     coarse_cells, coarse_layers
@@ -118,6 +118,7 @@ class Settings:
     from_camera_samples: float = 1.0
     followed_anchors: int = 1
     followed_samples: float = 1.0
+    followed_from_camera_samples: float = 1.0
     followed_width: int = 1
     coarse_cells: int = 1
     coarse_layers: bool = False
@@ -167,6 +168,12 @@ def even(samples: Number) -> Number:
     power = np.exp2(np.floor(np.log2(np.maximum(samples, 1.0))))
     found = np.where(samples <= power, power, np.where((samples <= 1.5 * power) & (power > 1), 1.5 * power, 2 * power))
     return found if isinstance(samples, np.ndarray) else float(found)
+
+
+def whole(name: str, samples: Number) -> Number:
+    """Samples of the light ``name`` that are traced where so many ``samples`` are needed: one at least, and whole."""
+    least = np.maximum(samples, 1.0)
+    return even(least) if name in EVEN else np.ceil(least)
 
 
 @dataclass(frozen=True)
@@ -345,8 +352,8 @@ class Evidence:
         as in :class:`Settings`.
     sharp_light, occluded_light
         what that light takes (paths of the latter: to one anchor).
-    followed
-        what is followed takes at several anchors beyond its mean (paths: to one of them).
+    followed, followed_from_camera
+        what is followed takes at several anchors beyond its mean, from either side (paths: to one of them).
     raster
         what a shadow on a raster leaves of the frames, without diffraction and with it (:class:`Drawn`).
     """
@@ -370,6 +377,7 @@ class Evidence:
     sharp: SharpPixels | None = None
     sharp_light: Effort = field(default_factory=lambda: Effort.none())
     followed: Effort = field(default_factory=lambda: Effort.none())
+    followed_from_camera: Effort = field(default_factory=lambda: Effort.none())
     occluded: tuple[int, ...] = ()
     occluded_light: Effort = field(default_factory=lambda: Effort.none())
     raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, even
+from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, whole
 from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
@@ -42,6 +42,10 @@ _LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 4 / 3
 """Least that they grow by: a tenth, and where all come in even numbers (2^k, 3 * 2^k) as far as the next of them."""
 _BEYOND = 1.05
 """Growth beyond what the error asks for, so that another round is rare; even numbers are rounded up as it is."""
+_TOLD, _DOUBLED = 1.2, 1.5
+"""Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: eight
+groups of many paths have 1.05 to 1.17. The next round is then for the error, or double where that is small already: by
+the bound, one heavy path among cookie_bag's first 49 samples asked for 270, and 158 do."""
 _FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
 """Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
 what direct light brings), direct light's with their 0.8th power or faster."""
@@ -383,7 +387,7 @@ def trace_lines(
             lights[line] = replace(light, reached=seen <= target)
             if seen > target:
                 # Capped before the power as well: a target that was set very low would overflow it.
-                most = max(most, min(seen / target, _LARGEST_GROWTH))
+                most = max(most, min(_excess(seen, more * light.sampling_error, target), _LARGEST_GROWTH))
             near = min(near, (target / seen) ** 2 if seen > 0 else 1.0)
         progress("transport", near)
         if last or all(light.reached for light in lights.values()):
@@ -391,8 +395,11 @@ def trace_lines(
         rate, least, beyond = (
             (_FOLLOWED_RATE, _LEAST_GROWTH, _BEYOND) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH, 1.0)
         )
-        growth = most**rate
+        growth, done = most**rate, lines[0].samples
         rounds *= min(max(beyond * growth, least), _LARGEST_GROWTH)
+        # Where less than a sample is needed, there is one.
+        while samples_of(simulation, rounds) == done:
+            rounds *= least
         # What the next round replaces is not held beside it: new memory is dear.
         del lines, looks, lights, light
 
@@ -449,7 +456,8 @@ def _looks(lines: Sequence[Light], lighting: Lighting, followed: bool, enough: f
 
 def _mostly_followed(simulation: Simulation) -> bool:
     """Whether most paths that a plan predicts are of light over several surfaces."""
-    paths = {name: stage.predicted * stage.tracer.lanes for name, stage in simulation.tracers().items()}
+    samples = samples_of(simulation, 1.0)
+    paths = {name: samples[name] * stage.tracer.lanes for name, stage in simulation.tracers().items()}
     return sum(count for name, count in paths.items() if name not in EVEN) > sum(paths.values()) / 2
 
 
@@ -477,6 +485,11 @@ def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, fl
     return light, bound
 
 
+def _excess(seen: float, error: float, target: float) -> float:
+    """By how much the next round is to lower what is ``seen`` of an ``error`` to come to the ``target``, as a ratio."""
+    return min(seen / target, max(_TOLD * error / target, _DOUBLED))
+
+
 def first_round(simulation: Simulation) -> float:
     """Times the samples that the plan of a ``simulation`` predicted with which sampling begins."""
     return _FIRST if _mostly_followed(simulation) else 1.0
@@ -485,11 +498,7 @@ def first_round(simulation: Simulation) -> float:
 def samples_of(simulation: Simulation, rounds: float) -> dict[str, int]:
     """Samples of a group, by the name of what is traced: so many times those that the plan of a ``simulation``
     predicted, in ``rounds``."""
-    wanted = {}
-    for name, stage in simulation.tracers().items():
-        samples = max(rounds * stage.predicted, 1.0)
-        wanted[name] = math.ceil(even(samples) if name in EVEN else samples)
-    return wanted
+    return {name: int(whole(name, rounds * stage.predicted)) for name, stage in simulation.tracers().items()}
 
 
 def _some(lighting: Lighting, count: int) -> Lighting:

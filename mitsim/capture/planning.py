@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import drjit as dr
 
@@ -37,6 +38,15 @@ _SELDOM = 3.0
 _LONG, _MORE = 5.0, 4
 """Seconds of a stage from which its pace is told by what so many times as many paths take longer: the cost of launches
 does not count as if it grew with the paths."""
+
+_FIELDS = MappingProxyType(
+    {
+        "sharp": "sharp_light",
+        "occluded": "occluded_light",
+        **dict(zip(AT_ANCHORS, ("followed", "followed_from_camera"), strict=True)),
+    }
+)
+"""What evidence calls the light of a stage, where it is not the stage's name."""
 
 
 @single_threaded_blas()
@@ -149,7 +159,6 @@ def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
 def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
     """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
     own, found = integer(seed, "pilot", "paces"), {}
-    at_anchors = [0.0, 0]
     for name, stage in simulation.tracers().items():
         samples = max(1, _REHEARSED // stage.tracer.lanes)
         _seconds(stage, own, labels, 1)  # compiles the kernel
@@ -160,13 +169,8 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
             # What disturbs either of the two may not halve the pace, nor hide that more paths take less for each.
             most = min(seconds, more / (_MORE * samples))
             seconds = min(max((more - once) / ((_MORE - 1) * samples), most / 2), most)
-        if name in AT_ANCHORS:
-            at_anchors = [at_anchors[0] + seconds, at_anchors[1] + stage.tracer.lanes]
-            continue
-        field = f"{name}_light" if name in ("sharp", "occluded") else name
+        field = _FIELDS.get(name, name)
         effort = getattr(evidence, field)
         # A path of shared light counts for several.
         found[field] = replace(effort, seconds=seconds / (effort.paths if name == "indirect" else stage.tracer.lanes))
-    if at_anchors[1]:
-        found["followed"] = replace(evidence.followed, seconds=at_anchors[0] / at_anchors[1])
     return replace(evidence, **found)

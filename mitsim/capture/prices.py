@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 
 from mitsim.capture.effects import names
-from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, Settings
+from mitsim.capture.evidence import GROUPS, Effort, Evidence, Forming, Number, Settings, whole
 from mitsim.core.arrays import FloatArray
 from mitsim.optics.frames import PROBES, formed_frames, mixes
 from mitsim.rig.plate import FEW
@@ -36,7 +36,14 @@ MIXING = "black-level"
 _SPLIT, _EDGES = 2.0, 2.0
 """Layers, at most, that share the light of one depth; and how many times the cells of a pixel its light lies in, at
 most, where it lies across an edge or at another depth than the cells are aligned at (measured: 1.6)."""
-ANCHORS_OF = MappingProxyType({"anchored": "anchors", "followed": "followed_anchors", "occluded": "occluded_anchors"})
+ANCHORS_OF = MappingProxyType(
+    {
+        "anchored": "anchors",
+        "followed": "followed_anchors",
+        "followed_from_camera": "followed_anchors",
+        "occluded": "occluded_anchors",
+    }
+)
 """What counts the anchors of each kind of light that has several."""
 _GEOMETRIC_ENTRIES = 0.03
 """An entry of a geometric shadow over one of a wave-optical one: a sum over features against samples of a field."""
@@ -69,6 +76,7 @@ class Paces:
     indirect: float
     from_camera: float
     followed: float
+    followed_from_camera: float
     occluded: float
     sharp: float
     frame: float
@@ -85,6 +93,7 @@ FIXED = Paces(
     indirect=1.2e-7,
     from_camera=2e-7,
     followed=1.3e-7,
+    followed_from_camera=1.3e-7,
     occluded=5e-7,
     sharp=3e-7,
     frame=2.2e-3,
@@ -180,6 +189,7 @@ def paces_of(evidence: Evidence) -> Paces:
         indirect=evidence.indirect.seconds or FIXED.indirect,
         from_camera=evidence.from_camera.seconds or FIXED.from_camera,
         followed=evidence.followed.seconds or FIXED.followed,
+        followed_from_camera=evidence.followed_from_camera.seconds or FIXED.followed_from_camera,
         occluded=evidence.occluded_light.seconds or FIXED.occluded,
         sharp=evidence.sharp_light.seconds or FIXED.sharp,
         frame=float(frame),
@@ -205,6 +215,7 @@ def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
         found["sharp"] = evidence.sharp_light
     if effects & names(lambda effect: effect.followed):
         found |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera, "followed": evidence.followed}
+        found["followed_from_camera"] = evidence.followed_from_camera
     return found
 
 
@@ -366,7 +377,7 @@ def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dic
     return {
         name: traced_for(evidence.forming.lines, evidence.forming.parted)
         * GROUPS
-        * math.ceil(getattr(settings, f"{name}_samples"))
+        * float(whole(name, getattr(settings, f"{name}_samples")))
         * effort.paths
         * getattr(paces, name)
         * float(connections(name, Numbers.of(settings)))
@@ -408,7 +419,7 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
     """
 
     def of(name: str) -> Number:
-        return cast(Number, getattr(samples, f"{name}_samples") if isinstance(samples, Settings) else samples[name])
+        return whole(name, getattr(samples, f"{name}_samples") if isinstance(samples, Settings) else samples[name])
 
     coarse, layers = np.square(numbers.coarse_cells), np.minimum(numbers.coarse_layers, _SPLIT)
     several, followed = (np.asarray(count) > 1 for count in (numbers.anchors, numbers.followed_anchors))
@@ -426,7 +437,8 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
         found = found + numbers.indirect * np.minimum(_SPLIT * of("indirect"), places)
     if np.any(followed):
         cells, seen_in = numbers.of_followed
-        seen = np.minimum(_SPLIT * of("followed"), classes * np.square(cells) * seen_in)
+        most = np.maximum(of("followed"), of("followed_from_camera"))
+        seen = np.minimum(_SPLIT * most, classes * np.square(cells) * seen_in)
         found = found + followed * _EDGES * np.square(numbers.followed_anchors) * seen
     return cast(Number, pixels * found)
 
@@ -459,5 +471,5 @@ def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float
     return (
         traced_for(evidence.forming.lines, evidence.forming.parted)
         * paces.ray
-        * predicted_rays(evidence.direct.paths, settings.direct_samples, rate)
+        * predicted_rays(evidence.direct.paths, float(whole("direct", settings.direct_samples)), rate)
     )

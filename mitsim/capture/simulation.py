@@ -212,12 +212,13 @@ class Simulation(Trays):
             samples = settings.from_camera_samples
             stages["from_camera"] = Stage(self.from_camera, samples, self.file_followed, "other")
         if settings.followed_anchors > 1:
-            samples, file, names = settings.followed_samples, self.file_at_anchors, AT_ANCHORS
+            file, names = self.file_at_anchors, AT_ANCHORS
             indirect, from_camera = self.at_anchors
             if indirect is not None:
-                stages[names[0]] = Stage(indirect, samples, file, names[0], self.anchors_ledgers, self.file_anchors)
+                ledger, samples = (self.anchors_ledgers, self.file_anchors), settings.followed_samples
+                stages[names[0]] = Stage(indirect, samples, file, names[0], *ledger)
             if from_camera is not None:
-                stages[names[1]] = Stage(from_camera, samples, file, names[1])
+                stages[names[1]] = Stage(from_camera, settings.followed_from_camera_samples, file, names[1])
         return stages
 
     def glint_frames(self, labels: Labels) -> ClassFrames | None:

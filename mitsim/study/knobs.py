@@ -54,6 +54,7 @@ def sampled(settings: Settings, samples: int) -> Settings:
         indirect_samples=each,
         from_camera_samples=each,
         followed_samples=each / 8,
+        followed_from_camera_samples=each / 8,
         occluded_samples=each / 8,
     )
 

@@ -188,7 +188,8 @@ class Look:
         if stage == "cells":
             self.fine = FineLight(bench, base, sample, self.accuracy, seed)
         elif stage == "effects":
-            self.switched = SwitchedEffects(bench, self._everything, sample, seed, self.fine.judging)
+            looked = bench, self._everything, sample, seed, self.fine.judging, self.accuracy
+            self.switched = SwitchedEffects(*looked)
         elif stage == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
             self.followed = FollowedLight(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)
@@ -229,6 +230,7 @@ class Look:
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         samples = self.samples["effects"].followed * LOOKS
         indirect, shared, repeats = switched.indirect_effort()
+        followed, from_camera = self.followed.efforts(light)
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
@@ -251,7 +253,8 @@ class Look:
             reach=self._base.reach,
             sharp=apart,
             sharp_light=switched.sharp_effort(),
-            followed=self.followed.effort(light),
+            followed=followed,
+            followed_from_camera=from_camera,
             occluded=self._base.occluded,
             occluded_light=self.occluded.effort(light) if self.occluded else Effort.none(),
             raster=self._raster,

@@ -78,13 +78,25 @@ class FollowedLight:
         # Where the judge was never judged, few anchors serve, and their light is held in any cells.
         return {**anchors, **self._widths} if len(found) > _FIRST_JUDGE + 1 else anchors
 
-    def effort(self, light: float) -> Effort:
-        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
+    def efforts(self, light: float) -> tuple[Effort, Effort]:
+        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``, of
+        indirect light from the projector's side, and of what is followed from the camera."""
+        tracers = self._simulation().at_anchors
         if not self.changes:
-            return Effort.none()
-        error, samples = noise(self._beyond_mean()), self.sample.followed
-        lanes = sum(tracer.lanes for tracer in self._tracers(self._simulation()))
-        return Effort(Noise(error / light if light else 0.0, samples, 0.5), lanes)
+            return Effort.none(), Effort.none()
+        every = self._beyond_mean()
+        if None in tracers:
+            seen = every, every
+        else:
+            simulation = self._simulation(followed_anchors=_FEW_ANCHORS)
+            from_camera = self._beyond(simulation, self._few_by_tracer[1])
+            seen = every - from_camera, from_camera
+        errors = (noise(each) / light if light else 0.0 for each in seen)
+        indirect, camera = (
+            Effort(Noise(error, self.sample.followed, 0.5), tracer.lanes) if tracer else Effort.none()
+            for error, tracer in zip(errors, tracers, strict=True)
+        )
+        return indirect, camera
 
     @property
     def _widths(self) -> dict[Part, FloatArray]:
@@ -99,17 +111,26 @@ class FollowedLight:
     def _beyond_mean(self, **cells: Any) -> FloatArray:
         """Frames of what a few anchors see beyond their mean, in such ``cells``."""
         simulation = self._simulation(followed_anchors=_FEW_ANCHORS, **cells)
+        return self._beyond(simulation, self._few, None if cells else self._frames(_FEW_ANCHORS))
+
+    def _beyond(self, simulation: Simulation, looks: list[Deposits], frames: FloatArray | None = None) -> FloatArray:
+        """Frames of light to a few anchors beyond its mean, in a ``simulation``; of all of it, where they are known."""
         weights = simulation.mean_weights(_FEW_ANCHORS)
-        mean = [look.averaged(weights) for look in self._few]
+        mean = [look.averaged(weights) for look in looks]
         trays = simulation.followed, simulation.followed_ambient
-        frames = self._formed(trays, self._few) if cells else self._frames(_FEW_ANCHORS)
+        frames = self._formed(trays, looks) if frames is None else frames
         return frames - self._formed((trays[0].of_mean, trays[1].of_mean), mean)
 
     @cached_property
     def _few(self) -> list[Deposits]:
         """Light to a few anchors, look by look."""
+        return self._joined(self._few_by_tracer)
+
+    @cached_property
+    def _few_by_tracer(self) -> list[list[Deposits]]:
+        """The same by tracer."""
         tracers, samples = self._tracers(self._simulation(followed_anchors=_FEW_ANCHORS)), self.sample.followed
-        return self._joined([tracer.trace_looks(self._seeds, samples) for tracer in tracers])
+        return [tracer.trace_looks(self._seeds, samples) for tracer in tracers]
 
     @staticmethod
     def _joined(traced: Iterable[list[Deposits]]) -> list[Deposits]:

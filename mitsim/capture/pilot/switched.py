@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 
 import numpy as np
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import DIRECT, EFFECTS, FOLLOWED, Effect
-from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
+from mitsim.capture.evidence import LOOKS, Changes, Effort, Noise, Part, Settings
 from mitsim.capture.pilot.looks import Known, Sample, coarsened, noise, norm
 from mitsim.capture.pilot.sharp import SHARP_RATE
 from mitsim.capture.prices import SHARED_COST
@@ -29,6 +29,10 @@ _TRACERS = ("indirect", "from_camera")
 _WORTH_REPEATING = 0.85
 """Variance times paths, over that of even ones, below which blocks are followed unevenly: short looks tell it so
 well."""
+_OPEN = 0.1
+"""Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
+budget's square. Where more is, the capture follows ten times as many paths as the closer looks, or more (corner at
+5e-4, first looks: 1e-3 open, and 110 processor seconds in place of 33)."""
 
 
 class SwitchedEffects:
@@ -44,12 +48,21 @@ class SwitchedEffects:
         root of the random streams.
     layers
         depths [mm] that judge one layer; none for a flat scene.
+    accuracy
+        what coarse cells change of indirect light is told to a small part of it, where that is cheap.
     """
 
     def __init__(
-        self, bench: Bench, everything: Settings, sample: Sample, seed: int, layers: tuple[float, ...] = ()
+        self,
+        bench: Bench,
+        everything: Settings,
+        sample: Sample,
+        seed: int,
+        layers: tuple[float, ...] = (),
+        accuracy: float = math.inf,
     ) -> None:
         self.bench, self.everything, self.sample, self.layers = bench, everything, sample, layers
+        self.accuracy = accuracy
         self.seeds = [integer(seed, "pilot", "effects", look) for look in range(LOOKS)]
         self.simulation = sample.simulation(bench, everything)
         self.direct = self._direct(self.simulation)
@@ -66,18 +79,45 @@ class SwitchedEffects:
         """Change of the frames by each effect that they have, and by coarse cells for indirect light."""
         shown = [name for name in EFFECTS if name in self.everything.effects and EFFECTS[name].in_frames]
         found = {Part(name): self.frames - self._without(EFFECTS[name]) for name in shown}
-        bounced = any(light.value.size for light in self._bounced)
-        return {**found, **coarsened("indirect", self._indirect, self.layers)} if bounced else found
+        return {**found, **self._coarse}
 
-    def _indirect(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
-        """Frames of indirect light in coarse cells and layers."""
+    @cached_property
+    def _coarse(self) -> dict[Part, FloatArray]:
+        """Change of the frames by coarse cells for indirect light; none where there is no such light."""
+        if not any(light.value.size for light in self._bounced):
+            return {}
+        return coarsened("indirect", partial(self._indirect, self._bounced, self._closer[1]), self.layers)
+
+    def _indirect(self, bounced: Sequence[Deposits], samples: int, cells: int, layers: tuple[float, ...]) -> FloatArray:
+        """Frames of ``bounced`` light in so many samples, in coarse cells and layers."""
         coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        return self._form(self.sample.simulation(self.bench, coarse), followed={"indirect": self._bounced})
+        simulation = self.sample.simulation(self.bench, coarse)
+        return self._form(simulation, followed={"indirect": bounced}, samples=samples)
 
     @cached_property
     def _bounced(self) -> list[Deposits]:
-        """Indirect light from the projector's side, look by look."""
-        return [light.where(light.kind == histogram.INDIRECT) for light in self.followed["indirect"]]
+        """Indirect light from the projector's side in closer looks, look by look."""
+        looks, _ = self._closer
+        return self._first_bounced if looks is self.followed["indirect"] else _indirect_of(looks)
+
+    @cached_property
+    def _first_bounced(self) -> list[Deposits]:
+        return _indirect_of(self.followed["indirect"])
+
+    @cached_property
+    def _closer(self) -> tuple[list[Deposits], int]:
+        """Looks at the projector's side's light, and their samples: more where noise hides what coarse cells change."""
+        looks, samples, tracer = self.followed["indirect"], self.sample.followed, self.simulation.indirect
+        if tracer is None or not any(light.value.size for light in self._first_bounced):
+            return looks, samples
+        seen = coarsened("indirect", partial(self._indirect, self._first_bounced, samples), ())
+        value, bound = Changes.between(seen, self.light**2).estimate(seen)
+        wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
+        more = min(wanted, self.sample.closer(tracer.lanes))
+        if more <= samples:
+            return looks, samples
+        # Seeds of their own: that the first looks are vague says nothing of these.
+        return tracer.trace_looks([integer(seed, "closer") for seed in self.seeds], more), more
 
     @property
     def received(self) -> float:
@@ -94,15 +134,15 @@ class SwitchedEffects:
     @property
     def lanes(self) -> dict[str, int]:
         """Paths in a sample of each tracer."""
-        return {name: lanes for name, (_, lanes) in self._noise.items()}
+        return {name: lanes for name, (_, _, lanes) in self._noise.items()}
 
     def effort(self, name: str) -> Effort:
         """Monte Carlo error of one estimate by the tracer ``name``, relative to all light, and its paths."""
         if name not in self._noise:
             return Effort.none()
-        error, lanes = self._noise[name]
+        error, samples, lanes = self._noise[name]
         relative = error / self.light if self.light else 0.0
-        return Effort(Noise(relative, self.sample.followed, 0.5), lanes)
+        return Effort(Noise(relative, samples, 0.5), lanes)
 
     def indirect_effort(self) -> tuple[Effort, bool, tuple[int, ...]]:
         """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how
@@ -132,7 +172,7 @@ class SwitchedEffects:
         plain, tracer = self.effort("indirect"), self._sharing.indirect
         if not plain.noise.error or not isinstance(tracer, NeighbourTracer) or not tracer.shares():
             return plain, False
-        samples = max(1, self.sample.followed // SHARED_COST)
+        samples = max(1, self._closer[1] // SHARED_COST)
         seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
         error = noise(self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples))
         error /= self.light
@@ -155,16 +195,16 @@ class SwitchedEffects:
         return Effort(Noise(relative, samples, SHARP_RATE), tracer.lanes)
 
     @cached_property
-    def _noise(self) -> dict[str, tuple[float, int]]:
-        """Error of a look by each tracer, and its paths in a sample."""
-        return {
-            name: (
-                noise(self._form(self.simulation, followed=self._by_kind({name: self.followed[name]}))),
-                stage.tracer.lanes,
-            )
-            for name, stage in self.simulation.tracers().items()
-            if name in _TRACERS
-        }
+    def _noise(self) -> dict[str, tuple[float, int, int]]:
+        """Error of a look by each tracer, the look's samples, and paths of one."""
+        found = {}
+        for name, stage in self.simulation.tracers().items():
+            if name in _TRACERS:
+                first = self.followed[name], self.sample.followed
+                looks, samples = self._closer if name == "indirect" else first
+                frames = self._form(self.simulation, followed=self._by_kind({name: looks}), samples=samples)
+                found[name] = noise(frames), samples, stage.tracer.lanes
+        return found
 
     def _without(self, effect: Effect) -> FloatArray:
         effects = self.everything.effects - {effect.name}
@@ -227,3 +267,8 @@ class SwitchedEffects:
             frames += sample.lamps(simulation.ambient, lamps, few, known)
         glint = simulation.glint_frames(sample.lighting.labels)
         return frames if glint is None else frames + np.tensordot(light[:, glint.classes], glint.irradiance, 1)
+
+
+def _indirect_of(looks: Sequence[Deposits]) -> list[Deposits]:
+    """Indirect light in ``looks``, look by look."""
+    return [light.where(light.kind == histogram.INDIRECT) for light in looks]

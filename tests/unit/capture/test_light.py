@@ -119,6 +119,60 @@ def test_shots_that_are_looked_at(
     assert trace_light(bench, plan, family, 3).reached and asked == [looked_at] * 2
 
 
+@pytest.mark.parametrize(
+    ("error", "bound", "excess"), [(1.9, 2.0, 2.0), (1.9, 6.0, 1.2 * 1.9), (0.9, 6.0, 1.5), (0.9, 1.1, 1.1)]
+)
+def test_the_next_round_is_for_the_error_where_few_paths_make_the_bound(
+    bench: Bench,
+    plan: Plan,
+    family: Lighting,
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    bound: float,
+    excess: float,
+) -> None:
+    """Where many tell it, for the bound; never more than that. (Planted: for the bound always, for the error always,
+    no least step.)"""
+    target, looks = plan.sampling_target, []
+
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
+        looks.append(frames)
+        return (0.0, 0.0) if len(looks) > 1 else (error * target, bound * target)
+
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    monkeypatch.setattr(module, "tells_all", lambda *_: True)
+    monkeypatch.setattr(module, "samples_of", lambda _, rounds: {"direct": math.ceil(100 * rounds)})
+    found = trace_light(bench, plan, family, 3)
+    growth = max(excess**module._DIRECT_RATE, module._LEAST_EVEN_GROWTH)
+    assert found.reached and found.samples == {"direct": math.ceil(100 * growth)}
+
+
+def test_light_that_needs_less_than_a_sample_takes_one_until_it_needs_more(
+    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a round that nothing grows in is none. (Planted: one sample for what needs less, so that it takes two in the
+    next round; rounds in which nothing grows.)"""
+    target, looks = plan.sampling_target, list[ExpectedFrames]()
+
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
+        looks.append(frames)
+        return (1.1 * target, 1.2 * target) if len(looks) < 3 else (0.0, 0.0)
+
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    settings = replace(plan.settings, effects=frozenset(FAR), direct_samples=0.1, indirect_samples=3.0)
+    settings = replace(settings, followed_anchors=2, followed_samples=0.5, followed_from_camera_samples=0.02)
+    wanted, kept = [], module._trace
+    monkeypatch.setattr(module, "_trace", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
+    assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
+    assert [each["direct"] for each in wanted] == [1, 1, 1]
+    assert [each["indirect at anchors"] for each in wanted] == [1, 1, 1]
+    looks.clear()
+    wanted.clear()
+    settings = replace(settings, effects=frozenset())
+    assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
+    assert [each["direct"] for each in wanted] == [1, 2, 3]
+
+
 def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Lighting) -> None:
     """Frames of looked-at light state the errors of frames that nobody looked at before; of other light, shots with
     other classes, or other signs they do not. (Planted: the look's products, times two, and a look for any light.)"""

@@ -4,6 +4,7 @@ The scene calls for everything at once: a sensor of 24 mm near a ball and a corn
 against frames of many more samples; the pilot sees a few, so a factor of 1.5 either way is its promise here.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from mitsim.capture import effects, pilot
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
-from mitsim.capture.evidence import Evidence, Settings
+from mitsim.capture.evidence import LOOKS, Changes, Evidence, Part, Settings
 from mitsim.capture.opening import open_bench
 from mitsim.capture.pilot import direct, followed, looks
 from mitsim.capture.pilot.switched import SwitchedEffects
@@ -99,7 +100,8 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(followed.FOLLOWED_LADDER)
     assert 0 < evidence.forming.seconds < 1
     assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.from_camera.paths
-    assert evidence.followed.paths == evidence.indirect.paths + evidence.from_camera.paths
+    assert evidence.followed.paths == evidence.indirect.paths
+    assert evidence.followed_from_camera.paths == evidence.from_camera.paths
     assert evidence.forming.terms == len(bench.spectrum.weights)
 
 
@@ -187,7 +189,7 @@ def test_light_to_many_anchors_is_traced_in_parts(
 ) -> None:
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
-    monkeypatch.setattr(followed, "_AT_ONCE", 2 * 9 * evidence.followed.paths)
+    monkeypatch.setattr(followed, "_AT_ONCE", 2 * 9 * (evidence.followed.paths + evidence.from_camera.paths))
     again = measured(bench, seed=3).ladders["followed_anchors"]
     for count, error in evidence.ladders["followed_anchors"].items():
         assert again[count] == pytest.approx(error, rel=1e-6)
@@ -269,6 +271,41 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     formed = [made.expected([light], sample.rows, sample.lighting, 0) for light in filed]
     expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
+
+
+def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
+    """At anchors, as a tracer alone would make it; their squares add up. (Planted: one side's for the other's, all
+    light's for one of them.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = looks.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    found = followed.FollowedLight(bench, everything, sample, 0.0, 5)
+    indirect, camera = found.efforts(1.0)
+    alone, nothing = followed.FollowedLight(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
+    vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
+    assert indirect.noise.error == pytest.approx(looks.noise(alone._beyond_mean()), rel=1e-9)
+    both = looks.noise(found._beyond_mean())
+    assert math.hypot(indirect.noise.error, camera.noise.error) == pytest.approx(both, rel=0.3)
+    assert (indirect.paths, camera.paths) == tuple(tracer.lanes for tracer in found._simulation().at_anchors)
+
+
+def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
+    """By looks of their own, whose light and noise are as large as told before. (Planted: samples of the first looks
+    for either, the first looks' seeds, no closer looks at all.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = looks.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    first, close = (SwitchedEffects(bench, everything, sample, 5, (450.0, 330.0), told) for told in (1.0, 1e-7))
+    seen = [Changes.between(found.changes, found.light**2) for found in (first, close)]
+    open_ = [bound**2 - value**2 for value, bound in (each.estimate([Part("indirect cells", 1)]) for each in seen)]
+    assert open_[1] < open_[0] / 4
+    one, two = (each.estimate([Part("indirect layers", 1)]).value for each in seen)
+    assert two == pytest.approx(one, rel=0.3)
+    noises = [found.effort("indirect").noise for found in (first, close)]
+    assert [noise.samples for noise in noises] == [sample.followed, 16 * sample.followed]
+    assert 0.5 < noises[1].error * math.sqrt(16) / noises[0].error < 2
+    one, two = (found._closer[0][0].value[:50] for found in (first, close))
+    assert not np.array_equal(one, two)
 
 
 def test_the_pilot_is_reproducible(bench: Bench) -> None:
