@@ -243,26 +243,26 @@ class _Lobes:
             times the sensor's width that is looked at.
         """
         squares, met, weights = 0.0, [], []
-        by_pixel, moments, sharp = np.zeros((3, self.rays.projector.n**2))
+        by_pixel, moments = np.zeros((2, self.rays.projector.n**2))
+        turned = dr.zeros(mi.Float, len(by_pixel))
         for sample, place in launches(len(pixels), first, samples):
             pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
-            mean, product, density, turns = self.meet(seed, sample, pixel, wider)
-            check_finite(mean)
-            check_finite(product)
-            number = np.array(pixel)
+            number, mean, product, density = self.meet(seed, sample, pixel, wider, turned)
             by_pixel += np.bincount(number, mean, minlength=len(by_pixel)) / samples
             moments += np.bincount(number, product, minlength=len(by_pixel)) / samples
-            sharp += np.bincount(number, turns, minlength=len(by_pixel)) / samples
             squares += float(np.square(mean).sum())
-            met.append((number[mean > 0], density[mean > 0]))
-            weights.append(mean[mean > 0])
+            met.append((number, density))
+            weights.append(mean)
+        sharp = np.array(turned, dtype=np.float64) / samples
         variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
         pixel_of, densities = (np.concatenate(parts) for parts in zip(*met, strict=True))
         widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
         return _Found(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
 
-    def meet(self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float) -> tuple[FloatArray, ...]:
-        """Estimates x of the mean irradiance, x I, density q of one of the points met, and sharp turns; (lanes,).
+    def meet(
+        self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
+    ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
+        """Pixels of the rays that meet the sensor, and for each x, x I, and density q of one of the points met.
 
         Parameters
         ----------
@@ -270,6 +270,13 @@ class _Lobes:
             of the rays.
         wider
             as for :meth:`look`.
+        turned
+            (n^2,) sharp turns of each pixel's rays, to which these add theirs.
+
+        Raises
+        ------
+        MitsimError
+            when the scene sends NaN or infinite light to the camera.
         """
         half = dr.opaque(mi.Float, wider * self.geometry.half_width)
         _, rng = streams(seed, pixel, sample)
@@ -281,8 +288,19 @@ class _Lobes:
         met, _ = self.receiver.passage.along(
             ray, flux, (none, rng), partial(self._at, half, dr.gather(mi.Float, self.least, pixel))
         )
-        dr.eval(met)
-        return tuple(np.array(values, dtype=np.float64) for values in vars(met).values())
+        # Whole numbers, whose sums in any order are the same.
+        dr.scatter_reduce(dr.ReduceOp.Add, turned, met.turns, pixel, met.turns > 0)
+        dr.eval(met, turned)
+        # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
+        lit = dr.compress(~(met.mean == 0))
+        number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
+        mean, product, density = (
+            np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)
+            for values in (met.mean, met.moment, met.density)
+        )
+        check_finite(mean)
+        check_finite(product)
+        return number, mean, product, density
 
     def _at(
         self,
