@@ -188,7 +188,7 @@ class Simulation(Trays):
     def _ledgers(self, bundle: Bundle, labels: Labels, lines: int) -> tuple[Ledger, ...]:
         if self.indirect is None or not Ledger.holds(bundle, labels, lines):
             return ()
-        return tuple(Ledger(bundle, labels, self.indirect.board) for _ in range(lines))
+        return Ledger.of_lines(lines, bundle, labels, self.indirect.board)
 
     def tracers(self) -> dict[str, Stage]:
         """What is traced: samples a group is predicted to need, and how the light is filed, by name."""

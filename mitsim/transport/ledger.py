@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import pairwise
@@ -80,6 +81,29 @@ LitSums = tuple[Lit, npt.NDArray[np.uint64]]
 """Which sums of a ledger hold light, and these: of corner, a tenth of its ledger's memory."""
 
 
+class _Held:
+    """Sums on the device of so many ``lines``, those of an entry side by side: a path brings light of every line to one
+    entry, and memory that is not at hand is fetched once for all of them."""
+
+    def __init__(self, entries: int, lines: int) -> None:
+        self._entries, self.lines = entries, lines
+        self.empty()
+
+    def empty(self) -> None:
+        """Hold no light."""
+        self.sums = dr.zeros(mi.UInt64, self._entries * self.lines)
+
+    def of_line(self, line: int, entries: mi.UInt32 | None = None) -> mi.UInt64:
+        """Sums of a ``line``, of some ``entries`` or of all."""
+        if entries is None and self.lines == 1:
+            return self.sums
+        if entries is None:
+            entries = dr.arange(mi.UInt32, self._entries)
+        if not len(entries):  # of which there are no multiples
+            return mi.UInt64()
+        return dr.gather(mi.UInt64, self.sums, entries * self.lines + line)
+
+
 class Ledger:
     """Sums of light by row and place.
 
@@ -95,8 +119,8 @@ class Ledger:
     Attributes
     ----------
     sums
-        (places * rows + 1,) on the device, in units. A place's rows lie side by side: neighbouring pixels, which are of
-        different rows, bring light to one place at a time.
+        (places * rows + 1,) on the device, in units, or of all lines that it was made with, side by side. A place's
+        rows lie side by side: neighbouring pixels, which are of different rows, bring light to one place at a time.
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
@@ -105,7 +129,29 @@ class Ledger:
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
         self._labels = mi.UInt32(labels.astype(np.uint32))
         # One place more for each row, of light from beyond all cells; and a last one that counts what is no light.
-        self.sums = dr.zeros(mi.UInt64, self._rows * self._width + 1)
+        self._line, self._held = 0, _Held(self._rows * self._width + 1, 1)
+
+    @classmethod
+    def of_lines(cls, lines: int, bundle: Bundle, labels: Labels, one: float) -> tuple[Ledger, ...]:
+        """One for each of so many ``lines``, which are :func:`fetched` together.
+
+        Parameters
+        ----------
+        lines
+            their number.
+        bundle, labels, one
+            as for one alone.
+        """
+        first = cls(bundle, labels, one)
+        first._held = _Held(first._rows * first._width + 1, lines)
+        ledgers = first, *(copy(first) for _ in range(1, lines))
+        for line, ledger in enumerate(ledgers):
+            ledger._line = line
+        return ledgers
+
+    @property
+    def sums(self) -> mi.UInt64:
+        return self._held.sums
 
     @staticmethod
     def holds(bundle: Bundle, labels: Labels, ledgers: int = 1) -> bool:
@@ -166,7 +212,8 @@ class Ledger:
         units = light * dr.opaque(mi.Float, 1 / self._unit)
         fits = (units >= 0) & (units < 2.0**_MOST_BITS)
         row = dr.gather(mi.UInt32, self._labels, pixel, active)
-        index = dr.select(fits, place * dr.opaque(mi.UInt32, self._rows) + row, self._rows * self._width)
+        entry = dr.select(fits, place * dr.opaque(mi.UInt32, self._rows) + row, self._rows * self._width)
+        index = entry * self._held.lines + self._line
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
@@ -201,10 +248,10 @@ def fetched(ledgers: Sequence[Ledger]) -> list[LitSums]:
     Which sums hold light is told of all together, as it is nearly the same of each.
     """
     first = ledgers[0]
-    lit = dr.compress(reduce(or_, (ledger.sums != 0 for ledger in ledgers)))
-    units = [dr.gather(mi.UInt64, ledger.sums, lit) for ledger in ledgers]
+    lit = dr.compress(reduce(or_, (ledger._held.of_line(ledger._line) != 0 for ledger in ledgers)))
+    units = [ledger._held.of_line(ledger._line, lit) for ledger in ledgers]
     dr.eval(lit, units)
     for ledger in ledgers:
-        ledger.sums = dr.zeros(mi.UInt64, len(ledger.sums))
+        ledger._held.empty()
     found = Lit(np.array(lit), first._rows, first._bundle.size, first._bundle.lamps)
     return [(found, np.array(each)) for each in units]

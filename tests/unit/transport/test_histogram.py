@@ -187,7 +187,8 @@ def test_small_light_beside_great_light_is_counted() -> None:
 def test_ledgers_of_several_lines_are_fetched_together() -> None:
     """Each holds what it would hold alone, where others have light and it has none too; then all are empty.
 
-    (Planted: light in the order of its numbers; what is lit by the first line.)
+    (Planted: light in the order of its numbers; what is lit by the first line; light of all lines filed as the first's,
+    or fetched as that; sums that are not emptied.)
     """
     import mitsuba as mi
 
@@ -198,7 +199,8 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
     pixel = np.minimum(found.pixel, PIXELS - 1).astype(np.uint32)
     seen = [mi.Float(each.astype(np.float32)) for each in (found.value, found.row, found.column, found.inverse_depth)]
     light = Sightings(seen[0], mi.UInt32(pixel), *seen[1:])
-    together, single = ([Ledger(alone, LABELS, one=1.0) for _ in range(3)] for _ in range(2))
+    together = Ledger.of_lines(3, alone, LABELS, one=1.0)
+    single = [Ledger(alone, LABELS, one=1.0) for _ in range(3)]
     lit = [mi.Bool(found.pixel % 2 == 0), mi.Bool(found.pixel % 3 == 0), mi.Bool(False)]
     for ledgers in (together, single):
         place = ledgers[0].place(light, mi.Float(0.5))
@@ -207,7 +209,8 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
     for ledger, own, counted in zip(together, single, fetched(together), strict=True):
         (matrix, *sums), (expected, *own_sums) = ledger.filed(counted, 4), own.filed(samples=4)
         assert np.array_equal(matrix.toarray(), expected.toarray()) and sums == own_sums
-        assert ledger.filed()[1] == 0.0 and not ledger.filed()[0].nnz
+    for ledger, counted in zip(together, fetched(together), strict=True):
+        assert ledger.filed(counted)[1] == 0.0 and not ledger.filed(counted)[0].nnz
     assert own_sums == [0.0, 0.0] and not expected.nnz, "the last line is dark"
     for ledger, value in zip(together, (1.0, np.nan, 1.0), strict=True):
         ledger.add(mi.Float(value), mi.UInt32(0), mi.UInt32(0), mi.Bool(True))
