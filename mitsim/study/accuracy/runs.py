@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from mitsim.capture.cost import frame_seconds
 from mitsim.capture.effects import present
-from mitsim.capture.evidence import Settings
+from mitsim.capture.evidence import Settings, whole
 from mitsim.capture.request import Request
 from mitsim.capture.run import capture
 from mitsim.core.arrays import FloatArray
@@ -109,8 +110,9 @@ class Runs:
         lit: dict[Settings, float] = {}
         for accuracy in sorted(accuracies, reverse=True):
             plan = self._stand.plan(accuracy)
-            groups.setdefault(plan.settings, []).append(accuracy)
-            lit[plan.settings] = plan.predicted_seconds
+            settings = _begun_with(plan.settings)
+            groups.setdefault(settings, []).append(accuracy)
+            lit[settings] = plan.predicted_seconds
         around = self._stand.look.seconds + sum(
             frame_seconds(self._stand.bench, len(self._stand.family.shots)).values()
         )
@@ -142,6 +144,14 @@ class Runs:
         rig = self._stand.bench.rig
         unit = electrons_from_irradiance(1.0, shots.exposure_s, rig.sensor, rig.projector.effective_wavelength_nm)
         return np.asarray(shots.electrons, dtype=np.float64) / unit
+
+
+def _begun_with(settings: Settings) -> Settings:
+    """The same ``settings`` with the samples that are taken: parts of one are as good as a whole one."""
+    end = "_samples"
+    named = (each.name for each in fields(settings) if each.name.endswith(end))
+    taken: dict[str, Any] = {name: float(whole(name.removesuffix(end), getattr(settings, name))) for name in named}
+    return replace(settings, **taken)
 
 
 def _listed(accuracies: Sequence[float]) -> str:

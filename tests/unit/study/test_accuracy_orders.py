@@ -32,7 +32,7 @@ def test_each_surface_keeps_the_albedo_of_the_light(shared_scene: Callable[..., 
     stand = Stand(bench, bench.family("dots:2"), 5, Job(), 1e-2)
     plan = stand.plan(1e-2)
     judge = Judge.trace(stand, plan, 0.0)
-    full = SimpleNamespace(settings=sampled(plan.settings, 128))
+    full = SimpleNamespace(settings=sampled(plan.settings, 1024))
     orders = Orders(stand, judge, SimpleNamespace(full=full, seconds=0.0))
     assert not orders.costs
     orders.measure(Budget(600.0), 1.0)
