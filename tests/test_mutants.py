@@ -98,6 +98,7 @@ def test_the_list_names_modules_and_tests_that_are_there() -> None:
         "capture",
         "rig",
         "study",
+        "transport",
     }
     assert sum(count for room in settings["rooms"].values() for count, _ in room.values()) >= 300
     for module, names in listed.items():
