@@ -174,9 +174,12 @@ def test_a_capture_in_colour_goes_on_where_it_stopped(
 def test_each_line_is_calibrated_for_itself(
     call: Callable[..., Any], shell: Callable[..., Any], coloured: Callable[[str], Path], tmp_path: Path, mask: str
 ) -> None:
-    """Factors of a line are those of a mono session whose projector shows it alone, noise apart."""
+    """Factors of a line are those of a mono session whose projector shows it alone, noise apart.
+
+    Light is traced to a tenth of the turned mask's residual of 0.03: the error of each session's light is in its own.
+    """
     whole = projector(tmp_path / "all.toml", LINES)
-    scene, common = coloured("sheet"), (*worn(tmp_path, mask), "--accuracy", ACCURACY, "--json", "-o")
+    scene, common = coloured("sheet"), (*worn(tmp_path, mask), "--accuracy", 3e-3, "--json", "-o")
     payload = shell("calibrate", scene, "--colour", "lines", "--projector", whole, *common, tmp_path / "cal").payload
     assert payload["kind"] == "colour-calibration"
     for channel, nm in zip(payload["channels"], LINES, strict=True):
