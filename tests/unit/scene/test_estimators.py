@@ -85,15 +85,16 @@ BALL = """<shape type="sphere"><float name="radius" value="5"/><point name="cent
 BULB = '<emitter type="point"><point name="position" x="0" y="200" z="0"/></emitter>'
 
 
-def test_light_that_mirrors_bring_is_told_as_lost(small_scene: Write) -> None:
+@pytest.mark.parametrize("glass", ["dielectric", "mitsim_glass"])
+def test_light_that_mirrors_bring_is_told_as_lost(small_scene: Write, glass: str) -> None:
     """The reference loses the pinhole's, the factored estimator that of small lamps; with file and line, exit 1."""
-    path = small_scene(extra=BALL.format("dielectric"))
+    path = small_scene(extra=BALL.format(glass))
     unfit = open_bench(path).loaded.unfit
     lines = path.read_text().splitlines()
     line = next(number for number, text in enumerate(lines, 1) if "sphere" in text)
     said = open_bench(path).render("reference", spp=4).warnings
     assert unfit.caustics is not None and said == (unfit.caustics,) and unfit.lamps is None
-    assert f"small.xml:{line} (dielectric)" in said[0] and "'projector'" in said[0] and f"{path}:" in said[0]
+    assert f"small.xml:{line} ({glass})" in said[0] and "'projector'" in said[0] and f"{path}:" in said[0]
     lit = small_scene("lit", extra=BALL.format("conductor") + BULB)
     lamps = open_bench(lit).loaded.unfit.lamps
     assert lamps is not None and "'point'" in lamps and "(conductor)" in lamps
