@@ -5,10 +5,13 @@
 The answer is light of two other seeds with every effect of the scene, one step finer in anchors, layers, cells and
 coarse cells than the plan at 3e-4. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the
 squared error of all frames a without the noise of the answer; its standard error is the jackknife's over shots.
-Captures are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version to
-be timed and judged beside this one. What FILE and the answers beside it hold already is not repeated, so the work can
-be cut short at any time; ``--answers`` makes those alone, which need no idle machine. ``--seeds N`` tells of how many
-captures with other seeds the error lies within the accuracy, and below the bound that the run states; it is not timed.
+Captures are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version,
+with its environment in ``.venv``, to be timed and judged beside this one. What FILE and the answers beside it hold
+already is not repeated, so the work can be cut short at any time; ``--answers`` makes those alone, which need no idle
+machine. ``--seeds N`` tells of how many captures with other seeds the error lies within the accuracy, and below the
+bound that the run states; it is not timed. ``--equal N`` compares seconds at equal measured errors: with each of N
+seeds the earlier version at 1e-3, and this one at 1e-3 and coarser accuracies, in turn, against the same answer. The
+coarsest accuracy whose root mean square error over the seeds is not above the earlier version's is its equal.
 """
 
 from __future__ import annotations
@@ -17,10 +20,12 @@ import argparse
 import json
 import math
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,8 +55,10 @@ FINEST, NOISE = 3e-4, 1e-3
 energy drops out."""
 SEEN = 3
 """How many times as closely the pilot of the answer looks, so that more pixels count as occluded, and more is tried."""
-_OLD_START = "import sys; from mitsim.cli import main; sys.exit(main())"
 SEED, ANSWERS = 0, (811, 812)
+PROMISED, COARSER = 1e-3, tuple(1e-3 * 2 ** (step / 4) for step in range(6))
+"""What the earlier version is asked for by ``--equal``, and what this one is: each has some 0.7 of the paths of the one
+before."""
 Frames = npt.NDArray[np.floating[Any]]
 
 
@@ -70,24 +77,16 @@ def answer(scene: str, noise: float) -> npt.NDArray[np.float32]:
     return np.array(halves)
 
 
-def captured(scene: str, accuracy: float, tree: Path | None) -> dict[str, Any]:
+def captured(scene: str, accuracy: float, tree: Path | None, seed: int = SEED) -> dict[str, Any]:
     """Seconds and manifest of a capture by the version in ``tree`` (this one without), and its frames."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        command = [
-            sys.executable,
-            *(["-c", _OLD_START] if tree else ["-m", "mitsim"]),
-            "capture",
-            scene,
-            "--patterns",
-            PATTERNS,
-            "--seed",
-            str(SEED),
-        ]
+        command = [str(tree / ".venv" / "bin" / "mitsim")] if tree else [sys.executable, "-m", "mitsim"]
+        command += ["capture", scene, "--patterns", PATTERNS, "--seed", str(seed)]
         command += ["--accuracy", str(accuracy), "-o", str(run), "--json"]
-        path = {"PYTHONPATH": str(tree)} if tree else {}
+        plain = {name: value for name, value in os.environ.items() if not tree or name != "PYTHONPATH"}
         started = time.perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **path}, cwd=folder)
+        done = subprocess.run(command, capture_output=True, text=True, env=plain, cwd=folder)
         seconds = time.perf_counter() - started
         if not (run / "manifest.json").exists():
             raise SystemExit(f"{scene} at {accuracy:g}: {done.stderr}")
@@ -97,29 +96,39 @@ def captured(scene: str, accuracy: float, tree: Path | None) -> dict[str, Any]:
     return {"seconds": seconds, "manifest": manifest, "frames": np.stack(frames), "exposure_s": exposure}
 
 
-def squared_error(frames: Frames, halves: Frames) -> tuple[float, float]:
-    """Squared relative error of ``frames`` and its standard error, by the jackknife over shots."""
+def shares(frames: Frames, halves: Frames) -> npt.NDArray[np.floating[Any]]:
+    """(2, shots): squared error of each of ``frames`` without the noise of the answer, and the answer's energy."""
     first, second = halves
     each = zip(frames.astype(np.float64), first, second, strict=True)
-    products, energies = np.array([[((a - r) * (a - s)).sum(), (r * s).sum(dtype=np.float64)] for a, r, s in each]).T
+    return np.array([[((a - r) * (a - s)).sum(), (r * s).sum(dtype=np.float64)] for a, r, s in each]).T
+
+
+def squared_error(products: Frames, energies: Frames) -> tuple[float, float]:
+    """Squared relative error from the ``shares`` of shots, and its standard error by the jackknife over them."""
     without = (products.sum() - products) / (energies.sum() - energies)
     count = len(products)
     spread = np.sqrt((count - 1) / count * np.square(without - without.mean()).sum())
     return float(products.sum() / energies.sum()), float(spread)
 
 
-def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None) -> dict[str, Any]:
+def bracketed(products: Frames, energies: Frames) -> dict[str, float]:
+    """Relative error from the ``shares`` of shots, and two standard errors about it."""
+    square, spread = squared_error(products, energies)
+    ends = {"error": square, "low": square - 2 * spread, "high": square + 2 * spread}
+    return {name: math.sqrt(max(value, 0)) for name, value in ends.items()}
+
+
+def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None, seed: int = SEED) -> dict[str, Any]:
     """One capture, held against the answer."""
-    run = captured(scene, accuracy, tree)
+    run = captured(scene, accuracy, tree, seed)
     bench = ms.open_bench(scene)
     unit = float(Exposer(bench.rig, run["exposure_s"], 0).electrons(_Unit()))
-    square, spread = squared_error(run["frames"] / unit, halves)
+    of_shots = shares(run["frames"] / unit, halves)
     manifest = run["manifest"]
     plan = manifest["plan"]
     return {
-        "error": float(np.sqrt(max(square, 0))),
-        "low": float(np.sqrt(max(square - 2 * spread, 0))),
-        "high": float(np.sqrt(max(square + 2 * spread, 0))),
+        **bracketed(*of_shots),
+        "shares": of_shots.tolist(),
         "seconds": run["seconds"],
         "predicted_seconds": plan["predicted_seconds"],
         **{name: manifest.get(name) for name in ("total_error", "total_error_bound", "mc_error", "warnings")},
@@ -136,7 +145,7 @@ def covered(scene: str, accuracy: float, seeds: int, halves: Frames) -> dict[str
         family = bench.family(PATTERNS, SEED)
         plan = make_plan(bench, family.lighting, accuracy, seed)
         expected = trace_light(bench, plan, family.lighting, seed, Sampling(by_pixel=False)).frames(family.lighting, 0)
-        square, _ = squared_error(np.array([frame.irradiance for frame in expected]), halves)
+        square, _ = squared_error(*shares(np.array([frame.irradiance for frame in expected]), halves))
         noise = Estimate(monte_carlo_error(expected), monte_carlo_bound(expected))
         rows.append((math.sqrt(max(square, 0)), *plan.total(noise)))
     errors, totals, bounds = np.array(rows).T
@@ -147,6 +156,63 @@ def covered(scene: str, accuracy: float, seeds: int, halves: Frames) -> dict[str
         "errors": errors.tolist(),
         "totals": totals.tolist(),
         "bounds": bounds.tolist(),
+    }
+
+
+def side_by_side(scene: str, seed: int, halves: Frames, old: Path, warm: bool) -> dict[str, Any]:
+    """One run of the earlier version and one of this at each coarser accuracy; ``warm``: after uncounted ones."""
+    for tree in (old, None) if warm else ():
+        captured(scene, PROMISED, tree, seed)
+    runs = {"old": judged(scene, PROMISED, halves, old, seed)}
+    return runs | {f"{accuracy:.3g}": judged(scene, accuracy, halves, None, seed) for accuracy in COARSER}
+
+
+def table(row: Mapping[str, Any]) -> str:
+    """A line for each run of ``compared``, for people."""
+    lines = [
+        f"  {name:<8} error {each['error']:.2e} [{each['low']:.1e}, {each['high']:.1e}]"
+        f" {each['seconds']:6.2f} s, light {each['light']:5.2f} s"
+        for name, each in row.items()
+        if isinstance(each, dict)
+    ]
+    if row["equal"]:
+        lines += [f"  equal: {row['equal']}, {row['ratio']:.2f} times faster, light {row['light_ratio']:.2f} times"]
+    return "\n".join(lines)
+
+
+def compared(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Errors and seconds of ``old`` and of each accuracy of this version, over the seeds, and which of these is equal.
+
+    Parameters
+    ----------
+    runs
+        of each name, runs with the same seeds, as ``judged`` gives them.
+
+    Returns
+    -------
+    dict
+        ``error``, ``low`` and ``high`` of all seeds' squares together, median ``seconds`` and ``light`` (transport and
+        optics) by name; ``equal``, the name of the coarsest whose error is not above that of ``old``, and the medians
+        over seeds of what ``old`` took over it, ``ratio`` and ``light_ratio``.
+    """
+    found: dict[str, Any] = {}
+    light = {
+        name: [run["stages"]["transport"] + run["stages"]["optics"] for run in each] for name, each in runs.items()
+    }
+    for name, each in runs.items():
+        of_shots = np.mean([run["shares"] for run in each], axis=0)
+        seconds = statistics.median(run["seconds"] for run in each)
+        found[name] = {**bracketed(*of_shots), "seconds": seconds, "light": statistics.median(light[name])}
+    fit = [name for name in runs if name != "old" and found[name]["error"] <= found["old"]["error"]]
+    if not fit:
+        return {**found, "equal": None}
+    equal = max(fit, key=float)
+    pairs = zip(runs["old"], runs[equal], strict=True)
+    return {
+        **found,
+        "equal": equal,
+        "ratio": statistics.median(old["seconds"] / new["seconds"] for old, new in pairs),
+        "light_ratio": statistics.median(old / new for old, new in zip(light["old"], light[equal], strict=True)),
     }
 
 
@@ -164,8 +230,11 @@ def main() -> None:
     parser.add_argument("--old", type=Path)
     parser.add_argument("--answers", action="store_true")
     parser.add_argument("--seeds", type=int, default=0)
+    parser.add_argument("--equal", type=int, default=0)
     parser.add_argument("--noise", type=float, default=NOISE)
     options = parser.parse_args()
+    if options.equal and not options.old:
+        parser.error("--equal needs --old, the checkout to compare with")
     found = json.loads(options.json.read_text()) if options.json.exists() else {}
     for scene in options.scene or SCENES:
         rows = found.setdefault(scene, {})
@@ -177,7 +246,16 @@ def main() -> None:
                 rows[key] = row = covered(scene, accuracy, options.seeds, np.load(kept))
                 print(f"{scene} {accuracy:g}: within {row['within_accuracy']}, {row['within_bound']} of {row['seeds']}")
                 options.json.write_text(json.dumps(found, indent=1))
-        for accuracy in () if options.answers or options.seeds else options.accuracy or ACCURACIES:
+        for seed in range(1, options.equal + 1):
+            runs = rows.setdefault("runs", {})
+            if str(seed) not in runs:
+                runs[str(seed)] = side_by_side(scene, seed, np.load(kept), options.old, warm=seed == 1)
+            each = list(runs.values())
+            rows["equal"] = row = compared({name: [run[name] for run in each] for name in each[0]})
+            options.json.write_text(json.dumps(found, indent=1))
+            print(f"{scene}, {len(each)} seeds\n{table(row)}", flush=True)
+        others = options.answers or options.seeds or options.equal
+        for accuracy in () if others else options.accuracy or ACCURACIES:
             for name, tree in (("new", None), ("old", options.old)):
                 key = f"{name} {accuracy:g}"
                 if key in rows or (name == "old" and tree is None):
