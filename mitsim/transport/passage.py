@@ -103,7 +103,7 @@ class Passage:
             another state of one.
         """
         if not self.open:
-            si = self.scene.ray_intersect(ray)
+            si = self.scene.ray_intersect(ray, mi.RayFlags.All, True)
             return visit(si, ray.d, light, si.is_valid(), state)
 
         def further(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
