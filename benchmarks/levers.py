@@ -92,7 +92,7 @@ def traced(stage: Stage, labels: np.ndarray, seed: int, samples: int, device: bo
     light = stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
     if stage.file_ledger and ledgers:
         for ledger, counted in zip(ledgers, fetched(ledgers), strict=True):
-            light = light + stage.file_ledger(ledger, counted, samples)
+            light = light + stage.file_ledger(ledger, counted, labels, samples)
     dr.sync_thread()
     return light
 

@@ -312,27 +312,33 @@ class Trays:
         smooth = self.smooth.file(deposits.where(indirect), labels, samples)
         return self._light(deposits, samples, fine=fine, smooth=smooth)
 
-    def file_smooth(self, ledger: Ledger, counted: LitSums, samples: int) -> FiledLight:
-        """Light in a ledger of :meth:`smooth_ledgers`, per sample.
+    def file_smooth(self, ledger: Ledger, counted: LitSums, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`indirect` in a ledger, per sample.
 
         Parameters
         ----------
         ledger, counted, samples
             as for :meth:`mitsim.transport.ledger.Ledger.filed`.
+        labels
+            by which the ledger files.
         """
+        del labels
         smooth, received, outside = ledger.filed(counted, samples)
         return replace(self._light(None, 1, smooth=smooth), received=received, outside=outside)
 
-    def file_anchors(self, ledger: Ledger, counted: LitSums, samples: int) -> FiledLight:
-        """Light in a ledger of :meth:`anchors_ledgers` beyond its mean, per sample.
+    def file_beyond(self, name: str, ledger: Ledger, counted: LitSums, labels: Labels, samples: int) -> FiledLight:
+        """Light of anchors in a ledger beyond its mean over the sensor, per sample.
 
         Parameters
         ----------
-        ledger, counted, samples
-            as for :meth:`mitsim.transport.ledger.Ledger.filed`.
+        name
+            of the tray whose cells the ledger has.
+        ledger, counted, labels, samples
+            as for :meth:`file_smooth`.
         """
+        del labels
         light, *_ = ledger.filed(counted, samples)
-        return self._light(None, 1, followed=self._less_mean(self.followed.bundle, light))
+        return self._light(None, 1, **{name: self._less_mean(getattr(self, name).bundle, light)})
 
     def file_sharp(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
         """Light of :attr:`apart`, per sample.
@@ -346,6 +352,48 @@ class Trays:
         mean = deposits.averaged(self.sharp_weights)
         outside = self.sharp.bundle.outside(mean) / samples
         return replace(light, received=float(mean.value.sum()) / samples, outside=outside)
+
+    def file_sharp_sums(self, ledger: Ledger, counted: LitSums, labels: Labels, samples: int) -> FiledLight:
+        """Light of :attr:`apart` in a ledger with a row for each of its pixels, per sample.
+
+        Parameters
+        ----------
+        ledger, counted, samples
+            as for :meth:`mitsim.transport.ledger.Ledger.filed`.
+        labels
+            (n^2,) class of each projector pixel.
+        """
+        by_pixel, received, outside = self._sharp_sums(ledger, counted, samples)
+        rows = np.append(labels[self._sharp_pixels], labels.max() + 1 + np.arange(self._lamp_rows))
+        shape = int(labels.max()) + 1 + self._lamp_rows, len(rows)
+        classes = sparse.csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=shape)
+        light = self._light(None, 1, sharp=sparse.csr_array(classes @ by_pixel))
+        return replace(light, received=float(received.sum()), outside=float(outside.sum()))
+
+    def sharp_flux(self, ledger: Ledger, counted: LitSums, samples: int) -> FloatArray:
+        """What :meth:`flux` tells of the same light.
+
+        Parameters
+        ----------
+        ledger, counted, samples
+            as for :meth:`mitsim.transport.ledger.Ledger.filed`.
+        """
+        flux = np.zeros(self.bench.n**2)
+        flux[self._sharp_pixels] = self._sharp_sums(ledger, counted, samples)[1]
+        return flux
+
+    @property
+    def _sharp_pixels(self) -> Labels:
+        return np.array(self.settings.sharp.pixels if self.settings.sharp else (), dtype=np.int64)
+
+    def _sharp_sums(
+        self, ledger: Ledger, counted: LitSums, samples: int
+    ) -> tuple[sparse.csr_array, FloatArray, FloatArray]:
+        """Light by pixel; of each pixel the mean over the sensor, in all and beyond all cells."""
+        light, weights, pixels = ledger.filed(counted, samples)[0], self.sharp_weights, len(self._sharp_pixels)
+        outside = np.einsum("pab,a,b->p", ledger.beyond(counted, samples), weights, weights)
+        inside = np.asarray(self.sharp.bundle.averaged(light, weights).sum(axis=1))[:pixels]
+        return light, inside + outside, outside
 
     def _light(self, deposits: Deposits | None, samples: int, **parts: sparse.csr_array) -> FiledLight:
         """Light in ``parts``; of ``deposits`` in so many ``samples`` it is told what is received, and what lost."""

@@ -596,7 +596,10 @@ class _Group:
     def _file_ledger(self, name: str, stage: Stage, held: tuple[Ledger, LitSums, int], line: int) -> None:
         """Add light of a stage and a line that its ledger ``held``, of so many samples."""
         assert stage.file_ledger is not None
-        self._add(name, stage.file_ledger(*held), line)
+        ledger, counted, samples = held
+        if name in self._flux[line]:
+            self._flux[line][name] += self.simulation.sharp_flux(ledger, counted, samples)
+        self._add(name, stage.file_ledger(ledger, counted, self.labels, samples), line)
 
     def _add(self, name: str, light: FiledLight, line: int) -> None:
         means = self._means[line]

@@ -7,9 +7,10 @@ samples the choice that the plan made.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -39,8 +40,8 @@ class Stage:
     """A tracer, the samples of it that the plan predicted, how its light is filed, and its random stream's name.
 
     ``file`` takes deposits, labels and the number of samples. ``ledgers`` makes, from labels and a number of lines,
-    what indirect light of each line is filed in on the device, where that has room, and ``file_ledger`` takes one,
-    its sums on the host and the number of samples; none for other light.
+    what light of each line is filed in on the device, where that has room and pays, and ``file_ledger`` takes one, its
+    sums on the host, labels and the number of samples; none for other light.
     """
 
     tracer: DirectTracer | IndirectTracer | FromCamera
@@ -48,7 +49,7 @@ class Stage:
     file: Callable[[Deposits, Labels, int], FiledLight]
     stream: str
     ledgers: Callable[[Labels, int], tuple[Ledger, ...]] = lambda labels, lines: ()
-    file_ledger: Callable[[Ledger, LitSums, int], FiledLight] | None = None
+    file_ledger: Callable[[Ledger, LitSums, Labels, int], FiledLight] | None = None
 
     def trace(self, seed: int, first: int, samples: int, ledgers: Sequence[Ledger] = ()) -> Deposits:
         """Light of some samples, but for what is filed in the ``ledgers``.
@@ -60,7 +61,7 @@ class Stage:
         ledgers
             of :attr:`ledgers`.
         """
-        if not ledgers or not isinstance(self.tracer, IndirectTracer):
+        if not ledgers or not isinstance(self.tracer, DirectTracer | IndirectTracer):
             return self.tracer.trace(seed, first, samples)
         return self.tracer.trace_into(ledgers, seed, first, samples)
 
@@ -179,34 +180,54 @@ class Simulation(Trays):
 
     def smooth_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
         """What indirect light of each of ``lines`` is filed in by class in ``labels`` (n^2,), where it has room."""
-        return self._ledgers(self.smooth.bundle, labels, lines)
+        return self._ledgers(self.indirect, self.smooth.bundle, labels, lines)
 
     def anchors_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
         """The same of indirect light at anchors, as :meth:`smooth_ledgers` takes ``labels`` and ``lines``."""
-        return self._ledgers(self.followed.bundle, labels, lines)
+        return self._ledgers(self.indirect, self.followed.bundle, labels, lines)
 
-    def _ledgers(self, bundle: Bundle, labels: Labels, lines: int) -> tuple[Ledger, ...]:
-        if self.indirect is None or not Ledger.holds(bundle, labels, lines):
+    def coarse_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+        """The same of direct light at anchors, where its paths are many for its cells."""
+        return self._ledgers(self.anchored, self.coarse.bundle, labels, lines, self.settings.anchored_samples)
+
+    def sharp_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+        """The same of :attr:`apart`, whose pixels have a row each."""
+        del labels
+        sharp, rows = self.settings.sharp, np.zeros(self.bench.n**2, dtype=np.int64)
+        if sharp is not None:
+            rows[list(sharp.pixels)] = np.arange(len(sharp.pixels))
+        return self._ledgers(self.apart, self.sharp.bundle, rows, lines, self.settings.sharp_samples)
+
+    @staticmethod
+    def _ledgers(
+        tracer: DirectTracer | IndirectTracer | None,
+        bundle: Bundle,
+        labels: Labels,
+        lines: int,
+        samples: float = math.inf,
+    ) -> tuple[Ledger, ...]:
+        """Ledgers of what a ``tracer`` finds in so many samples; none where it has none, or no room."""
+        if tracer is None or not Ledger.holds(bundle, labels, lines, samples * tracer.lanes):
             return ()
-        return Ledger.of_lines(lines, bundle, labels, self.indirect.board)
+        return Ledger.of_lines(lines, bundle, labels, tracer.board)
 
     def tracers(self) -> dict[str, Stage]:
         """What is traced: samples a group is predicted to need, and how the light is filed, by name."""
         settings = self.settings
         stages = {"direct": Stage(self.direct, settings.direct_samples, self.file_direct, "direct")}
         if self.anchored is not None:
-            stages["anchored"] = Stage(self.anchored, settings.anchored_samples, self.file_anchored, "anchored")
+            own = self.coarse_ledgers, partial(self.file_beyond, "coarse")
+            stages["anchored"] = Stage(self.anchored, settings.anchored_samples, self.file_anchored, "anchored", *own)
         if self.anchored_occluded is not None:
             stages["occluded"] = Stage(
                 self.anchored_occluded, settings.occluded_samples, self.file_occluded, "occluded"
             )
         if self.apart is not None:
-            stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp")
+            device = self.sharp_ledgers, self.file_sharp_sums
+            stages["sharp"] = Stage(self.apart, settings.sharp_samples, self.file_sharp, "sharp", *device)
         if self.indirect is not None:
-            ledger = self.smooth_ledgers, self.file_smooth
-            stages["indirect"] = Stage(
-                self.indirect, settings.indirect_samples, self.file_followed, "indirect", *ledger
-            )
+            samples, device = settings.indirect_samples, (self.smooth_ledgers, self.file_smooth)
+            stages["indirect"] = Stage(self.indirect, samples, self.file_followed, "indirect", *device)
         if self.from_camera is not None:
             # The stream keeps the name that it had in 0.3.0, so that the same seed gives the same frames.
             samples = settings.from_camera_samples
@@ -215,8 +236,8 @@ class Simulation(Trays):
             file, names = self.file_at_anchors, AT_ANCHORS
             indirect, from_camera = self.at_anchors
             if indirect is not None:
-                ledger, samples = (self.anchors_ledgers, self.file_anchors), settings.followed_samples
-                stages[names[0]] = Stage(indirect, samples, file, names[0], *ledger)
+                own = self.anchors_ledgers, partial(self.file_beyond, "followed")
+                stages[names[0]] = Stage(indirect, settings.followed_samples, file, names[0], *own)
             if from_camera is not None:
                 stages[names[1]] = Stage(from_camera, settings.followed_from_camera_samples, file, names[1])
         return stages

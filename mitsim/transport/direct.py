@@ -8,6 +8,9 @@ meets one is handed out, drawn in proportion to its light.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,7 +18,8 @@ import numpy.typing as npt
 
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import DIRECT, Deposits, Sightings
-from mitsim.transport.paths import Tracer
+from mitsim.transport.ledger import Ledger
+from mitsim.transport.paths import Tracer, launches
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, Reception, SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import shuffled, stratified, streams
@@ -56,10 +60,35 @@ class DirectTracer(Tracer):
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
         self.points = SensorPoints(self.receiver.geometry.half_width, anchors, spread)
 
+    @cached_property
+    def board(self) -> float:
+        """Irradiance [W m^-2] that light compares to."""
+        return self.receiver.of_board(self.rays)
+
     @property
     def lanes(self) -> int:
         """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
+
+    def trace_into(self, ledgers: Sequence[Ledger], seed: int, first: int, samples: int) -> Deposits:
+        """The same as :meth:`trace`, all light filed in ledgers; none is left for the host.
+
+        Parameters
+        ----------
+        ledgers
+            of light by pixel; of several lines, one for each.
+        seed, first, samples
+            as for :meth:`trace`.
+        """
+        for tracer in self.apart:
+            for sample, lane in launches(self.lanes, first, samples, self.lanes_per_launch):
+                seen, _, anchor = tracer._sightings(seed, sample, lane)
+                lights = seen.by_line(len(ledgers))
+                for place, share in ledgers[0].shares(seen, anchor):
+                    for ledger, light in zip(ledgers, lights, strict=True):
+                        ledger.add(light * share, seen.pixel, place, ~(light == 0))  # not a number is refused
+                dr.eval([ledger.sums for ledger in ledgers])
+        return Deposits.none()
 
     def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
         return [Deposits.fetched(*self._sightings(seed, sample, lane))]

@@ -14,7 +14,6 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
@@ -31,7 +30,7 @@ from mitsim.transport.paths import FollowingTracer, Walk, camera_part, is_delta,
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
 from mitsim.transport.repeats import Turns, by_pixel
-from mitsim.transport.sampling import generator, panchromatic, stratified, streams
+from mitsim.transport.sampling import stratified, streams
 
 
 class IndirectTracer(FollowingTracer):
@@ -83,13 +82,8 @@ class IndirectTracer(FollowingTracer):
 
     @cached_property
     def board(self) -> float:
-        """Irradiance [W m^-2] by a pixel's light from a white board at the rig's distance, to which light compares."""
-        pixel = dr.arange(mi.UInt32, self.projector.n**2)
-        wavelengths, spectral = sampled_wavelengths(
-            self.receiver.camera, generator(mi.UInt32(0), pixel), self.projector.lines
-        )
-        flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
-        return float(flux.mean(dtype=np.float64)) / (math.pi * self.receiver.geometry.scene_distance**2)
+        """Irradiance [W m^-2] that light compares to."""
+        return self.receiver.of_board(self.rays)
 
     def trace_into(self, ledgers: Sequence[Ledger], seed: int, first: int, samples: int) -> Deposits:
         """The same as :meth:`trace`, indirect light filed in ledgers as far as it can be: the rest, on the host.

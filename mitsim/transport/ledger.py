@@ -2,17 +2,17 @@
 
 Light is added up in whole numbers of a small unit, so that the sums do not hang on the order in which threads add, and
 nothing but the sums is ever fetched. Where :class:`mitsim.transport.histogram.Bundle` splits light between two layers,
-the ledger draws one of them: the same in the mean.
+the ledger does so too, or draws one of them: the same in the mean.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from itertools import pairwise
+from itertools import pairwise, product
 from operator import or_
 
 import drjit as dr
@@ -23,6 +23,7 @@ from scipy import sparse
 
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
+from mitsim.transport.cells import CellAxis
 from mitsim.transport.histogram import Bundle, Sightings
 
 MOST_PLACES = 2**26
@@ -30,6 +31,9 @@ MOST_PLACES = 2**26
 _UNIT_BITS = 30
 """Power of two of units in the light that is passed as one: rounding moves a path's by 5e-10 of it at most, either way,
 and a place holds 2^34 times as much."""
+_PAYS = 4
+"""Places for each part of a path below which a ledger pays: a place takes 0.03 us, to be fetched from the machine and
+looked through, and each part of a path on the host 0.1 us or more (balls of the highlight)."""
 _MOST_BITS = 52
 """Power of two of units that one path may bring, four million times the light that is passed as one: more is no light.
 A place would hold 4096 such paths."""
@@ -54,7 +58,7 @@ class Lit:
 
     @property
     def inside(self) -> int:
-        """How many of the sums, the first, have a place: what lay outside has the last one."""
+        """How many of the sums, the first, have a place: what lay outside has the last ones."""
         return int(np.searchsorted(self.numbers, np.uint32(self.size * self.rows)))
 
     @cached_property
@@ -110,7 +114,7 @@ class Ledger:
     Parameters
     ----------
     bundle
-        how light is filed; not between cells.
+        how light is filed.
     labels
         (n^2,) row of each projector pixel.
     one
@@ -125,10 +129,10 @@ class Ledger:
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
         self._bundle, self._rows = bundle, int(labels.max()) + 1
-        self._width = bundle.size + 1
+        self._width = self._places(bundle)
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
         self._labels = mi.UInt32(labels.astype(np.uint32))
-        # One place more for each row, of light from beyond all cells; and a last one that counts what is no light.
+        # A last one that counts what is no light.
         self._line, self._held = 0, _Held(self._rows * self._width + 1, 1)
 
     @classmethod
@@ -154,8 +158,13 @@ class Ledger:
         return self._held.sums
 
     @staticmethod
-    def holds(bundle: Bundle, labels: Labels, ledgers: int = 1) -> bool:
-        """Whether so many ledgers have room, and can file as a bundle does.
+    def _places(bundle: Bundle) -> int:
+        """Places of a row: those of a ``bundle``, and one for each anchor, of light from beyond all cells."""
+        return bundle.size + bundle.anchors**2
+
+    @staticmethod
+    def holds(bundle: Bundle, labels: Labels, ledgers: int = 1, paths: float = math.inf) -> bool:
+        """Whether so many ledgers have room, and take less time than the host.
 
         Parameters
         ----------
@@ -163,12 +172,15 @@ class Ledger:
             of each.
         ledgers
             their number.
+        paths
+            that they file.
         """
-        fits = ledgers * (int(labels.max()) + 1) * (bundle.size + 1) < MOST_PLACES
-        return fits and not bundle.between
+        entries = (int(labels.max()) + 1) * Ledger._places(bundle)
+        parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
+        return ledgers * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
-        """Where light is filed.
+        """Where light is filed, all of it in one place.
 
         Parameters
         ----------
@@ -179,21 +191,69 @@ class Ledger:
         anchor
             row and column of its anchor; the first without them.
         """
-        grid, nodes = self._bundle.grid, [1 / depth for depth in self._bundle.depths]
-        inside, cells = mi.Bool(True), []
-        for axis, tau in ((grid.rows, seen.row), (grid.columns, seen.column)):
-            start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, 1 / axis.size)
-            cell = dr.floor((tau - start) * size)
-            inside &= (cell >= 0) & (cell < dr.opaque(mi.Float, axis.count))
-            cells.append(mi.UInt32(dr.maximum(cell, 0)))
         layer = mi.UInt32(0)
-        for low, high in pairwise(nodes):
-            part = (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
+        for part in self._passed(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
+        cells = [self._cell(axis, tau) for axis, tau in self._axes(seen)]
+        return self._placed(seen, layer, cells, anchor)
+
+    def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
+        """Where light is filed, each place with its part of it, as :meth:`Bundle.file` splits it.
+
+        Parameters
+        ----------
+        seen, anchor
+            as for :meth:`place`.
+        """
+        passed = [dr.clip(part, 0, 1) for part in self._passed(seen)]
+        layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
+        rows, columns = (self._cells(axis, tau) for axis, tau in self._axes(seen))
+        for (layer, part), (row, row_part), (column, column_part) in product(layers, rows, columns):
+            yield self._placed(seen, layer, [row, column], anchor), part * row_part * column_part
+
+    def _axes(self, seen: Sightings) -> tuple[tuple[CellAxis, mi.Float], tuple[CellAxis, mi.Float]]:
+        return (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
+
+    def _passed(self, seen: Sightings) -> Iterator[mi.Float]:
+        """How far between each layer and the next nearer one light is; below 0 before it, and above 1 beyond."""
+        for low, high in pairwise(1 / depth for depth in self._bundle.depths):
+            yield (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
+
+    @staticmethod
+    def _position(axis: CellAxis, tau: mi.Float) -> mi.Float:
+        """Cells from the first one's edge."""
+        return (tau - dr.opaque(mi.Float, axis.start)) * dr.opaque(mi.Float, 1 / axis.size)
+
+    def _cell(self, axis: CellAxis, tau: mi.Float) -> mi.UInt32:
+        return mi.UInt32(dr.maximum(dr.floor(self._position(axis, tau)), 0))
+
+    def _cells(self, axis: CellAxis, tau: mi.Float) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Cells along an axis that share the light, each with its part."""
+        if not self._bundle.between or axis.count == 1:
+            return [(self._cell(axis, tau), mi.Float(1))]
+        position = dr.clip(self._position(axis, tau) - 0.5, 0, dr.opaque(mi.Float, axis.count - 1))
+        first = dr.minimum(mi.UInt32(position), dr.opaque(mi.UInt32, axis.count - 2))
+        beyond = position - mi.Float(first)
+        return [(first, 1 - beyond), (first + 1, beyond)]
+
+    def _placed(
+        self,
+        seen: Sightings,
+        layer: mi.UInt32,
+        cells: Sequence[mi.UInt32],
+        anchor: tuple[mi.UInt32, mi.UInt32] | None,
+    ) -> mi.UInt32:
+        """Where light of a ``layer`` and of ``cells`` along rows and columns is filed, or its anchor's place for what
+        lies beyond all cells."""
+        inside = mi.Bool(True)
+        for axis, tau in self._axes(seen):
+            position = self._position(axis, tau)
+            inside &= (position >= 0) & (position < dr.opaque(mi.Float, axis.count))
+        grid = self._bundle.grid
         rows, columns, anchors = (dr.opaque(mi.UInt32, count) for count in (*grid.shape, self._bundle.anchors))
         line, column = anchor or (mi.UInt32(0), mi.UInt32(0))
         place = ((layer * anchors + line) * rows + cells[0]) * (anchors * columns) + column * columns + cells[1]
-        return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size))
+        return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size) + line * anchors + column)
 
     def add(self, light: mi.Float, pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
         """File light.
@@ -240,6 +300,21 @@ class Ledger:
             )
         light = units.astype(np.float64) * (self._unit / samples)
         return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
+
+    def beyond(self, counted: LitSums, samples: int = 1) -> FloatArray:
+        """(rows, anchors, anchors) light from beyond all cells per sample [W m^-2].
+
+        Parameters
+        ----------
+        counted, samples
+            as for :meth:`filed`.
+        """
+        (lit, units), anchors = counted, self._bundle.anchors
+        # Its last one counts what is no light.
+        found = np.zeros(self._rows * anchors**2 + 1)
+        found[lit.numbers[lit.inside :] - np.uint32(self._rows * self._bundle.size)] = units[lit.inside :]
+        by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, self._rows), 2, 0)
+        return np.asarray(by_row * (self._unit / samples))
 
 
 def fetched(ledgers: Sequence[Ledger]) -> list[LitSums]:

@@ -28,7 +28,8 @@ from mitsim.transport.coordinates import rows_columns, x_y
 from mitsim.transport.histogram import Sightings
 from mitsim.transport.panes import refracted_way
 from mitsim.transport.passage import Passage
-from mitsim.transport.projector import line_wavelengths
+from mitsim.transport.projector import ProjectorRays, line_wavelengths
+from mitsim.transport.sampling import generator, panchromatic
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,14 @@ class Receiver:
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, geometry: CameraGeometry | None = None) -> None:
         self.scene, self.camera, self.passage = scene, camera, Passage(scene)
         self.geometry: CameraGeometry = geometry or camera.geometry
+
+    def of_board(self, rays: ProjectorRays) -> float:
+        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance; ``rays`` are
+        the projector's."""
+        pixel = dr.arange(mi.UInt32, rays.projector.n**2)
+        wavelengths, spectral = sampled_wavelengths(self.camera, generator(mi.UInt32(0), pixel), rays.projector.lines)
+        flux = np.array(panchromatic(rays.flux(pixel, wavelengths) * spectral))
+        return float(flux.mean(dtype=np.float64)) / (math.pi * self.geometry.scene_distance**2)
 
     def receive(
         self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool

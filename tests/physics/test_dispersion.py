@@ -91,14 +91,18 @@ def followed(bench: Bench) -> dict[str, Deposits]:
 
 
 def filed(bench: Bench) -> list[list[float]]:
-    """(lines, classes) indirect light that is filed on the device."""
+    """(lines, kinds and classes) indirect and direct light that is filed on the device."""
     lines, parts = bench.lines, (bench.loaded.scene, bench.loaded.camera, bench.projector_optics)
     assert lines is not None
-    tracer, labels = IndirectTracer(*parts, True, True), np.arange(N**2) % 5
+    labels = np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
-    ledgers = [Ledger(bundle, labels, tracer.board) for _ in lines.shares]
-    tracer.trace_into(ledgers, 3, 0, SAMPLES)
-    return [np.asarray(ledger.filed()[0].sum(axis=1)).ravel().tolist() for ledger in ledgers]
+    found: list[list[float]] = [[] for _ in lines.shares]
+    for tracer in (IndirectTracer(*parts, True, True), DirectTracer(*parts, 1)):
+        ledgers = [Ledger(bundle, labels, tracer.board) for _ in lines.shares]
+        tracer.trace_into(ledgers, 3, 0, SAMPLES)
+        for line, ledger in zip(found, ledgers, strict=True):
+            line += np.asarray(ledger.filed()[0].sum(axis=1)).ravel().tolist()
+    return found
 
 
 def flux(bench: Bench) -> list[list[float]]:
