@@ -13,17 +13,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import EVEN, GROUPS, LANES_AT_ONCE, Settings, whole
+from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
 from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
-from mitsim.capture.simulation import Simulation, Stage
+from mitsim.capture.rounds import first_samples, next_samples
+from mitsim.capture.simulation import Simulation, Stage, expected_of
 from mitsim.capture.truth import Truth, trace_truth
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.job import Progress, silent
 from mitsim.core.parallel import Behind, single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.optics.frames import ExpectedFrames, bound_of
+from mitsim.optics.frames import ExpectedFrames, bound_of, shares_of_bound
 from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.transport.histogram import Deposits
 from mitsim.transport.ledger import Ledger, LitSums, fetched
@@ -36,23 +37,11 @@ Target = Callable[[ExpectedFrames], float]
 """The relative Monte Carlo error to stop at, from the frames seen so far."""
 _MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
-_LARGEST_GROWTH = 8.0
-"""Most that the samples grow by in one round, because the first rounds know their error badly."""
-_LEAST_GROWTH, _LEAST_EVEN_GROWTH = 1.1, 4 / 3
-"""Least that they grow by: a tenth, and where all come in even numbers (2^k, 3 * 2^k) as far as the next of them."""
-_BEYOND = 1.05
-"""Growth beyond what the error asks for, so that another round is rare; even numbers are rounded up as it is."""
-_TOLD, _DOUBLED = 1.2, 1.5
+_TOLD, _OF_HEAVY = 1.2, 0.55
 """Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: eight
-groups of many paths have 1.05 to 1.17. The next round is then for the error, or double where that is small already: by
-the bound, one heavy path among cookie_bag's first 49 samples asked for 270, and 158 do."""
-_FOLLOWED_RATE, _DIRECT_RATE = 1.6, 1.2
-"""Samples grow with the error to this power: indirect light's error falls with the square root of the samples (2, less
-what direct light brings), direct light's with their 0.8th power or faster."""
-_FIRST = 0.8
-"""Part of the samples that the plan predicts with which sampling begins where most paths are of followed light: the
-prediction is safe. At 0.7 the corner needed a second round for the last tenth, by each of three seeds, which costs a
-look more: 4 to 17 % of its processor seconds and of the cookie bag's."""
+groups of many paths have 1.05 to 1.17. A heavy path counts for less among more of them, so the bound then falls with
+their number to the power 0.8 to 0.93 in place of 0.5 (cookie_bag, seeds 2 and 4): less than its power of 0.55 is
+missing."""
 _VIEW_SAMPLES = 64
 """Samples a cell of a picture to look at: below the step of eight bits."""
 _LOST = 0.1
@@ -368,40 +357,33 @@ def trace_lines(
     followed = bool(simulation.indirect or simulation.from_camera)
     streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
     groups = [_Group(simulation, labels, stream, len(benches)) for stream in streams]
-    rounds = first_round(simulation)
+    samples = first_samples(simulation)
     while True:
-        _trace(groups, samples_of(simulation, rounds))
+        _trace(groups, samples)
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
         last = lines[0].paths >= _MOST_PATHS
         enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
-        looks = _looks(lines, lighting, followed, enough)
-        lights, most, near = dict[int, Light](), 0.0, 1.0
-        more = sampling.excess([looks[line][0] for line in sorted(looks)]) if sampling.excess else 1.0
-        for line, (light, bound) in looks.items():
+        looks = _looks(lines, partial(_parts, groups), lighting, followed, enough)
+        lights, near, worst, excess = dict[int, Light](), 1.0, 0, 0.0
+        more = sampling.excess([looks[line].light for line in sorted(looks)]) if sampling.excess else 1.0
+        for line, look in looks.items():
+            light, error = look.light, look.light.sampling_error
             # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
             if sampling.target:
                 target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
             else:
                 target = plan.sampling_target
-            seen = more * (light.sampling_error if sampling.target else bound)
+            seen = more * (error if sampling.target else look.bound)
             lights[line] = replace(light, reached=seen <= target)
-            if seen > target:
-                # Capped before the power as well: a target that was set very low would overflow it.
-                most = max(most, min(_excess(seen, more * light.sampling_error, target), _LARGEST_GROWTH))
+            if seen > target and (beyond := _excess(seen, more * error, target)) > excess:
+                worst, excess = line, beyond
             near = min(near, (target / seen) ** 2 if seen > 0 else 1.0)
         progress("transport", near)
         if last or all(light.reached for light in lights.values()):
             return [lights[line] for line in range(len(own))]
-        rate, least, beyond = (
-            (_FOLLOWED_RATE, _LEAST_GROWTH, _BEYOND) if followed else (_DIRECT_RATE, _LEAST_EVEN_GROWTH, 1.0)
-        )
-        growth, done = most**rate, lines[0].samples
-        rounds *= min(max(beyond * growth, least), _LARGEST_GROWTH)
-        # Where less than a sample is needed, there is one.
-        while samples_of(simulation, rounds) == done:
-            rounds *= least
+        samples = next_samples(simulation, samples, looks[worst].variances, excess)
         # What the next round replaces is not held beside it: new memory is dear.
-        del lines, looks, lights, light
+        del lines, looks, look, lights, light
 
 
 @single_threaded_blas()
@@ -442,31 +424,45 @@ def _line_of(groups: Sequence[_Group], line: int, simulation: Simulation, plan: 
     )
 
 
-def _looks(lines: Sequence[Light], lighting: Lighting, followed: bool, enough: float) -> dict[int, tuple[Light, float]]:
-    """What :func:`_looked` finds of the light of each line, by its number: of the noisiest first, and of the others
-    when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is."""
+@dataclass(frozen=True)
+class _Look:
+    """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and what each part of the light
+    brings to the square of the latter, by the name of what was traced, up to one factor."""
+
+    light: Light
+    bound: float
+    variances: Mapping[str, float]
+
+
+Parts = Mapping[str, Sequence[FiledLight]]
+"""Groups of each part of a light, by the name of what was traced."""
+
+
+def _parts(groups: Sequence[_Group], line: int) -> Parts:
+    """Those of a ``line`` in ``groups``."""
+    return {name: [group.part(name, line) for group in groups] for name in groups[0].done}
+
+
+def _looks(
+    lines: Sequence[Light], parts: Callable[[int], Parts], lighting: Lighting, followed: bool, enough: float
+) -> dict[int, _Look]:
+    """What :func:`_looked` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
+    of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is."""
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
     looks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
-        looks[line] = _looked(lines[line], lighting, followed)
-        if looks[line][1] > enough:
+        looks[line] = _looked(lines[line], parts(line), lighting, followed)
+        if looks[line].bound > enough:
             break
     return looks
 
 
-def _mostly_followed(simulation: Simulation) -> bool:
-    """Whether most paths that a plan predicts are of light over several surfaces."""
-    samples = samples_of(simulation, 1.0)
-    paths = {name: samples[name] * stage.tracer.lanes for name, stage in simulation.tracers().items()}
-    return sum(count for name, count in paths.items() if name not in EVEN) > sum(paths.values()) / 2
-
-
-def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, float]:
-    """The light with the Monte Carlo error of the frames, and what that is below at 95 %.
+def _looked(light: Light, parts: Parts, lighting: Lighting, followed: bool) -> _Look:
+    """A look at the frames of a light.
 
     Parameters
     ----------
-    light, lighting
+    light, parts, lighting
         whose frames of which shots.
     followed
         whether it is light over several surfaces.
@@ -475,30 +471,26 @@ def _looked(light: Light, lighting: Lighting, followed: bool) -> tuple[Light, fl
     whole = tells_all(classes, shots, light.bench.geometry.frame_side)
     seen = lighting if whole else _some(lighting, MOST_CHECKED if followed else CHECKED_SHOTS)
     # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
-    expected = light.frames(seen, light.seed, leaking=False)
+    each = [(light.simulation, groups) for groups in parts.values()]
+    expected = expected_of(each, light.rows_of(seen), seen, light.seed, leaking=False)
     more = _unchecked(light, lighting, seen)
     error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
     light = replace(light, sampling_error=error)
     if whole and expected.probed is not None:
         found = Looked(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
         light = replace(light, looked=found)
-    return light, bound
+    by_part = np.concatenate([noise.reshape(len(parts), -1, len(light.groups)) for noise in expected.noise], axis=1)
+    variances = dict(zip(parts, shares_of_bound(by_part.sum(axis=1)).tolist(), strict=True))
+    if not whole:
+        for name, groups in parts.items():
+            _, more_of_part = _unchecked(replace(light, groups=tuple(groups)), lighting, seen)
+            variances[name] *= more_of_part**2
+    return _Look(light, bound, variances)
 
 
 def _excess(seen: float, error: float, target: float) -> float:
     """By how much the next round is to lower what is ``seen`` of an ``error`` to come to the ``target``, as a ratio."""
-    return min(seen / target, max(_TOLD * error / target, _DOUBLED))
-
-
-def first_round(simulation: Simulation) -> float:
-    """Times the samples that the plan of a ``simulation`` predicted with which sampling begins."""
-    return _FIRST if _mostly_followed(simulation) else 1.0
-
-
-def samples_of(simulation: Simulation, rounds: float) -> dict[str, int]:
-    """Samples of a group, by the name of what is traced: so many times those that the plan of a ``simulation``
-    predicted, in ``rounds``."""
-    return {name: int(whole(name, rounds * stage.predicted)) for name, stage in simulation.tracers().items()}
+    return min(seen / target, max(_TOLD * error / target, math.pow(seen / target, _OF_HEAVY)))
 
 
 def _some(lighting: Lighting, count: int) -> Lighting:
@@ -608,6 +600,10 @@ class _Group:
     def light(self, line: int = 0) -> FiledLight:
         """Mean over the samples, of a ``line``."""
         return reduce(add, self._means[line].values())
+
+    def part(self, name: str, line: int = 0) -> FiledLight:
+        """The same of one stage by its ``name``."""
+        return self._means[line][name]
 
     def flux(self, line: int = 0) -> FloatArray:
         """(n^2,) mean over the samples, of a ``line``."""

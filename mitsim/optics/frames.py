@@ -200,6 +200,7 @@ class ExpectedFrames:
         self._always: tuple[FloatArray, FloatArray] | None = None
         self._leaked: tuple[FloatArray, FloatArray] | None = None
         self._probed = probed if self._mixed else None
+        self._noise: FloatArray | None = None
 
     def __len__(self) -> int:
         return int(self._weights.shape[0])
@@ -265,20 +266,33 @@ class ExpectedFrames:
         The frames' energy is told by the random signs as well: as :func:`monte_carlo_error` and
         :func:`monte_carlo_bound` to a few percent, in a fraction of the time.
         """
+        parts, energy, _ = self._told
+        return (float(np.sqrt(parts.sum() / energy)), bound_of(parts, energy)) if energy else (0.0, 0.0)
+
+    @property
+    def noise(self) -> tuple[FloatArray, FloatArray]:
+        """(lights, groups) and (ambient, groups) parts of the Monte Carlo variance of all frames, up to one factor, as
+        :meth:`sampling_error` tells that of all; 0 of what was probed before."""
+        of_lights = self._told[2]
+        return of_lights[: len(self._lights)], of_lights[len(self._lights) :]
+
+    @cached_property
+    def _told(self) -> tuple[FloatArray, float, FloatArray]:
+        """By the random signs: (groups,) parts of the frames' variance, their energy, and (lights + ambient, groups)
+        squared norms of noise, not to scale."""
         count, energy = self._groups, 0.0
-        parts = np.zeros(count)
+        parts, noise = np.zeros(count), np.zeros((len(self._lights) + len(self._ambient), count))
         if count < 2:
-            return 0.0, 0.0
+            return parts, energy, noise
         for start in range(0, len(self), _AT_ONCE):
-            for probed in self._shots_probed(start, min(start + _AT_ONCE, len(self))):
+            shots, of_lights = self._shots_probed(start, min(start + _AT_ONCE, len(self)))
+            noise += of_lights
+            for probed in shots:
                 by_group = probed.reshape(self._shape[0], count, -1)
                 mean = by_group.mean(axis=1)
                 energy += float(np.square(mean).sum())
                 parts += _squares(by_group - mean[:, None])
-        if not energy:
-            return 0.0, 0.0
-        parts /= count * (count - 1)
-        return float(np.sqrt(parts.sum() / energy)), bound_of(parts, energy)
+        return parts / (count * (count - 1)), energy, noise
 
     @property
     def probed(self) -> FloatArray | None:
@@ -287,24 +301,30 @@ class ExpectedFrames:
         None where shots are formed one by one.
         """
         if self._mixed and self._probed is None:
-            self._probed = _formed(self._lights, self._basis, self._probes, False)[1]
+            self._probed, self._noise = _probed(self._lights, self._basis, self._probes)
         return self._probed
 
-    def _shots_probed(self, start: int, stop: int) -> FloatArray:
-        """(shots, m * groups * probes) frames of single groups as random signs see them."""
+    def _shots_probed(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
+        """(shots, m * groups * probes) frames of single groups as random signs see them, and (lights + ambient,
+        groups) squared norms of their noise."""
         classes, weights = self.probed, self._weights[start:stop]
         if classes is not None:
             probed = np.stack(self._of_classes.shots(classes, start, stop))
+            of_classes = np.zeros((1, len(self._lights), self._groups)) if self._noise is None else self._noise
+            noise = (np.square(weights).sum(axis=0)[:, None, None] * of_classes).sum(axis=0)
         else:
-            probed = _formed(self._lights, self._basis[start:stop], self._probes, False)[1]
+            probed, of_shots = _probed(self._lights, self._basis[start:stop], self._probes)
+            noise = of_shots.sum(axis=0)
             if self._leak_formed is not None:
                 probed += self._leak_formed[1][0]
         if self._glint is not None:  # in every group
             brought = np.repeat((self._glint.irradiance @ self._probes)[:, :, None], self._groups, axis=2)
             probed += weights[:, self._glint.classes] @ brought.reshape(len(brought), -1)
         if self._ambient:
-            probed += _formed(self._ambient, _ALL, self._probes, False)[1][0]
-        return probed
+            seen, of_one = _probed(self._ambient, _ALL, self._probes)
+            probed += seen
+            noise = np.concatenate([noise, len(weights) * of_one[0]])
+        return probed, noise
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, m, m') frames of basis lights, (b, m * groups * probes) those of groups as signs see them.
@@ -386,34 +406,55 @@ def _squares(deviations: FloatArray) -> FloatArray:
 
 
 def _formed(
-    lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray | None, with_frames: bool = True
+    lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """Frames (b, m, m') of mixtures ``basis`` (b, rows), and the groups' own as ``probes`` see them.
 
-    The latter are (b, m * groups * probes); none without probes. No frames unless ``with_frames``.
+    The latter are (b, m * groups * probes); none without probes.
     """
     shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
-    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
-    for _, parts in mixed:
-        for part in parts:
-            part.sort_indices()
-    count = basis.shape[0]
-    frames = np.zeros((count if with_frames else 0, *shape))
+    mixed, count = _mixed(lights, basis), basis.shape[0]
+    frames = np.zeros((count, *shape))
     probed = np.zeros((count, shape[0] * groups * (0 if probes is None else probes.shape[1])))
 
     def form(row: int) -> None:
         for number, (optics, parts) in enumerate(mixed):
-            estimates = [_row(part, row) for part in parts]
-            if not with_frames:
-                probed[row] += optics.probe(estimates, probes).ravel()
-                continue
-            frame, seen = optics.seen(estimates, probes, None if number else frames[row])
+            frame, seen = optics.seen([_row(part, row) for part in parts], probes, None if number else frames[row])
             if number:
                 frames[row] += frame
             probed[row] += seen.ravel()
 
     in_threads(form, range(count))
     return frames, probed
+
+
+def _probed(lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """As :func:`_formed`, without the frames; and (b, lights, groups) squared norms of the groups' differences."""
+    rows, groups = lights[0].optics.frame_shape[0], len(lights[0].groups)
+    mixed, count = _mixed(lights, basis), basis.shape[0]
+    probed, noise = np.zeros((count, rows * groups * probes.shape[1])), np.zeros((count, len(lights), groups))
+
+    def probe(row: int) -> None:
+        for number, (optics, parts) in enumerate(mixed):
+            estimates = [_row(part, row) for part in parts]
+            if not any(len(places) for places, _ in estimates):
+                continue
+            seen = optics.probe(estimates, probes)
+            by_group = seen.reshape(rows, groups, -1)
+            noise[row, number] = _squares(by_group - by_group.mean(axis=1, keepdims=True))
+            probed[row] += seen.ravel()
+
+    in_threads(probe, range(count))
+    return probed, noise
+
+
+def _mixed(lights: Sequence[Filed], basis: sparse.csr_array) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
+    """Mixtures ``basis`` (b, rows) of each group of each light, with the light's optics."""
+    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
+    for _, parts in mixed:
+        for part in parts:
+            part.sort_indices()
+    return mixed
 
 
 def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_array:
@@ -587,6 +628,22 @@ def bound_of(parts: FloatArray, energy: float) -> float:
     count = len(parts)
     spread = float(parts.var(ddof=1)) / float(parts.mean()) ** 2 * count / (count - 1) if count > 1 else 0.0
     return float(np.sqrt(parts.sum() / energy * (1 + _NORMAL * np.sqrt(spread))))
+
+
+def shares_of_bound(parts: FloatArray) -> FloatArray:
+    """(lights,) what each of several lights brings to the square of :func:`bound_of`, from their ``parts`` (lights,
+    groups) of the variance, on their scale: none less than nothing.
+
+    The bound's square is the variance and a multiple of how much groups differ in it; of that, a light brings its
+    covariance with all light.
+    """
+    total, count = parts.sum(axis=0), parts.shape[1]
+    deviation = float(total.std(ddof=1))
+    found = parts.sum(axis=1)
+    if deviation:
+        along = (parts * (total - total.mean())).sum(axis=1) / (count - 1) / deviation
+        found = found + _NORMAL * np.sqrt(count / (count - 1)) * count * along
+    return np.asarray(np.maximum(found, 0.0))
 
 
 def _row(matrix: sparse.csr_array, row: int) -> Entries:

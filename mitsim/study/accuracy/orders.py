@@ -12,8 +12,9 @@ from operator import add
 import numpy as np
 
 from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Part
-from mitsim.capture.light import Light, first_round, samples_of, traced_again
+from mitsim.capture.light import Light, traced_again
 from mitsim.capture.orders import MOST, OfOrders
+from mitsim.capture.rounds import first_samples
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.study.accuracy.findings import PartCost
@@ -49,7 +50,7 @@ class Orders:
     def __init__(self, stand: Stand, judge: Judge, parts: Parts) -> None:
         self._stand, self._judge, self._settings = stand, judge, parts.full.settings
         simulation = Simulation(stand.bench, self._settings)
-        self._samples, self._whole_s = samples_of(simulation, first_round(simulation)), parts.seconds
+        self._samples, self._whole_s = first_samples(simulation), parts.seconds
         self._changes: Changes | None = None
         self._followed: dict[int, Timed] = {}
 

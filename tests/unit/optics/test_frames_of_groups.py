@@ -5,7 +5,15 @@ import pytest
 from scipy import sparse
 
 from mitsim.optics.closed_form import FrameOptics
-from mitsim.optics.frames import ClassFrames, Filed, _probes, bound_of, monte_carlo_bound, monte_carlo_error
+from mitsim.optics.frames import (
+    ClassFrames,
+    Filed,
+    _probes,
+    bound_of,
+    monte_carlo_bound,
+    monte_carlo_error,
+    shares_of_bound,
+)
 from mitsim.optics.shadow import Directions
 from tests.unit.optics.small_camera import (
     BESIDE,
@@ -66,6 +74,45 @@ def test_the_sampling_error_is_told_without_frames(family: str) -> None:
     for without in ({"glint": exact}, {"ambient": [Filed(optics, lamps)]}):
         other, _ = expected_frames(optics, groups, labels, weights, 0, **without).sampling_error()
         assert other != pytest.approx(monte_carlo_error(frames), rel=0.02)
+
+
+@pytest.mark.parametrize("family", BESIDE)
+def test_noise_is_told_by_light(family: str) -> None:
+    """Of each light as of it alone, on one scale; what all shots are lit by counts in each of them.
+
+    (Planted: ambient light counted once, classes weighed by their share and not its square.)
+    """
+    labels, weights = BESIDE[family]
+    optics, lamps = small_optics(), Filed(small_optics(), ambient_groups(4))
+    lights = [random_groups(4, seed, spread) for seed, spread in ((7, 0.3), (8, 0.1))]
+    more = [Filed(optics, tuple(lights[1]))]
+    by_light, by_ambient = expected_frames(optics, lights[0], labels, weights, 0, more, ambient=[lamps]).noise
+
+    # Where shots are mixed, classes are formed, whose noise is taken for independent.
+    formed, scale = (np.eye(4), np.square(weights).sum(axis=0)) if family == "mixed" else (weights, np.ones(3))
+
+    def alone(groups: list[sparse.csr_array]) -> np.ndarray:
+        frames = expected_frames(optics, groups, labels, formed, 0)
+        return np.sum([times * np.array(f.by_group) for f, times in zip(frames, scale, strict=True)], axis=0)
+
+    dark = [sparse.csr_array(lights[0][0].shape)] * 4
+    (first, *_) = expected_frames(optics, dark, labels, weights, 0, ambient=[lamps])
+    apart = np.array([*(alone(groups) for groups in lights), len(weights) * np.array(first.by_group)])
+    found = np.concatenate([by_light, by_ambient])
+    assert found / found.sum() == pytest.approx(apart / apart.sum(), rel=1e-9)
+
+
+def test_lights_share_the_square_of_the_bound() -> None:
+    """They make it up; a light with a heavy path in one group has what the groups differ by, and none has less than
+    nothing. (Planted: the variance's own shares.)"""
+    rng = np.random.default_rng(2)
+    parts = 1 + 0.1 * rng.random((3, 8))
+    parts[1, 4] += 20
+    shares = shares_of_bound(parts)
+    assert np.sqrt(shares.sum()) == pytest.approx(bound_of(parts.sum(axis=0), 1.0), rel=0.02)
+    assert shares[1] > 0.7 * shares.sum() > 0.7 * parts.sum() and (shares >= 0).all()
+    even = np.ones((3, 8)) * [[1], [2], [3]]
+    assert shares_of_bound(even) == pytest.approx([8, 16, 24])
 
 
 def test_one_group_has_no_variance_to_tell() -> None:
