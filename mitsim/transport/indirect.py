@@ -174,7 +174,8 @@ class IndirectWalk(Walk):
     def vertex(self, first: bool) -> None:
         """Find, connect and leave the next surface, as :meth:`mitsim.transport.paths.Walk.vertex` does; ``first`` is
         not connected."""
-        si = self.scene.ray_intersect(self.ray, self.active)
+        # Coherent rays, of neighbouring pixels, are found faster; later ones go every way.
+        si = self.scene.ray_intersect(self.ray, mi.RayFlags.All, first, self.active)
         self.active &= si.is_valid()
         if not first:
             self._connect(si)

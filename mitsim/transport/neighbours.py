@@ -184,7 +184,7 @@ class _Block(IndirectWalk):
     def _first(self) -> None:
         """The first surface, and each path's turn there."""
         self.lit_by, self.power = mi.Ray3f(self.ray), told_apart(self.flux, self.tracer.lines)
-        self.lit_at = self.scene.ray_intersect_preliminary(self.ray, active=self.active)
+        self.lit_at = self.scene.ray_intersect_preliminary(self.ray, True, active=self.active)
         si = self.lit_at.compute_surface_interaction(self.ray, active=self.active)
         self.active &= si.is_valid()
         self.lit = mi.Bool(self.active)
