@@ -89,7 +89,7 @@ class DirectTracer(Tracer):
         ) -> tuple[Sightings, mi.PCG32]:
             seen, rng = state
             reception, received = self._received(si, direction, light, sensor, active, rng)
-            return seen.joined_by(reception.sightings(received, pixel, by_line), rng), rng
+            return seen.joined_by(reception.sightings(received, pixel, by_line), rng.next_float32()), rng
 
         by_line = self.projector.by_line
         seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(by_line), rng), seen_at)
