@@ -33,6 +33,10 @@ from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavel
 from mitsim.transport.repeats import Turns, by_pixel
 from mitsim.transport.sampling import generator, panchromatic, stratified, streams
 
+_ROOMS = (4**2, 12**2)
+"""Anchors that a path has room for: few numbers of them, as each is a kernel of its own, 0.4 s to compile; more
+than the most that a plan tries are a kernel for each number."""
+
 
 class IndirectTracer(FollowingTracer):
     """Indirect light of a projector, and its caustics, at points of the sensor."""
@@ -241,10 +245,10 @@ class AnchorsWalk(IndirectWalk):
             as for :class:`IndirectWalk`; the lane tells the pixel.
         """
         super().__init__(tracer, seed, sample, lane)
-        self._side = dr.opaque(mi.UInt32, tracer.points.anchors)
+        self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (tracer.points.anchors, tracer.points.count))
         kinds = ("direct", "indirect") if tracer.mirrors else ("indirect",)
         self._numbers = len(_differing(Sightings.none(self.by_line)))
-        size = self._numbers * tracer.points.count
+        size = self._numbers * next((room for room in _ROOMS if room >= tracer.points.count), tracer.points.count)
         self.held = {kind: dr.alloc_local(mi.Float, size, mi.Float(0)) for kind in kinds}
 
     def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
@@ -297,7 +301,6 @@ class AnchorsWalk(IndirectWalk):
 
     def _at_each(self, visit: Callable[[mi.UInt32], None], active: mi.Bool) -> None:
         """Visit every anchor, by its number, one after the other, where ``active``."""
-        count = self._side * self._side
 
         def one(number: mi.UInt32, held: dict[str, dr.Local[mi.Float]]) -> tuple[mi.UInt32, object]:
             self.held = held
@@ -305,14 +308,14 @@ class AnchorsWalk(IndirectWalk):
             return number + 1, self.held
 
         state = mi.UInt32(0), self.held
-        _, self.held = dr.while_loop(state, lambda number, _: active & (number < count), one)
+        _, self.held = dr.while_loop(state, lambda number, _: active & (number < self._count), one)
 
     def _fetched(self, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
         """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
         follow all paths again."""
-        width, count = dr.width(self.pixel), self.tracer.points.count
-        found = {kind: [dr.zeros(mi.Float, width * count) for _ in range(self._numbers)] for kind in kinds}
-        lane = dr.arange(mi.UInt32, width) * count
+        size = dr.width(self.pixel) * self.tracer.points.count
+        found = {kind: [dr.zeros(mi.Float, size) for _ in range(self._numbers)] for kind in kinds}
+        lane = dr.arange(mi.UInt32, dr.width(self.pixel)) * self._count
 
         def unpacked(number: mi.UInt32) -> None:
             for kind, values in found.items():
@@ -321,13 +324,13 @@ class AnchorsWalk(IndirectWalk):
 
         if kinds:
             self._at_each(unpacked, mi.Bool(True))
-        dr.eval(found, also)
-        pixel, number = dr.repeat(self.pixel, count), dr.tile(dr.arange(mi.UInt32, count), width)
-        deposits = []
+        dr.eval(found, self.pixel, also)
+        index, deposits = dr.arange(mi.UInt32, size), []
+        pixel, anchor = dr.gather(mi.UInt32, self.pixel, index // self._count), self._anchor(index % self._count)
         for kind, (value, row, column, inverse_depth, *lines) in found.items():
             by_line = mi.UnpolarizedSpectrum(*lines) if lines else None
             seen = Sightings(value, pixel, row, column, inverse_depth, by_line)
-            deposits.append(Deposits.fetched(seen, KINDS[kind], self._anchor(number)))
+            deposits.append(Deposits.fetched(seen, KINDS[kind], anchor))
         return deposits
 
 
