@@ -266,7 +266,13 @@ class AnchorsWalk(IndirectWalk):
         return self._fetched(("direct",) if self.tracer.mirrors else (), [ledger.sums for ledger in ledgers])
 
     def deposits(self, further: bool) -> list[Deposits]:
-        """Light on the host of every path at every anchor, those of a path one after the other."""
+        """Light on the host of every path at every anchor, those of a path one after the other.
+
+        Parameters
+        ----------
+        further
+            as for :meth:`mitsim.transport.paths.Walk.deposits`.
+        """
         self.follow(further)
         return self._fetched(tuple(self.held))
 
