@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,17 +14,24 @@ import numpy as np
 import pytest
 
 from mitsim.capture.bench import Bench
+from mitsim.capture.colour import ColourBench
 from mitsim.capture.opening import open_bench
+from mitsim.core.colours import RUN
 from mitsim.transport.cells import aligned_grid
 from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.ledger import Ledger
+from mitsim.transport.ledger import Ledger, fetched
 from mitsim.transport.receiver import SensorPoints
+from tests.conftest import write_small_scene
 from tests.unit.transport.test_indirect import CORNER, MIRROR, N
+from tests.unit.transport.test_neighbours import WALL
+from tests.unit.transport.test_neighbours_by_line import LINES, SHARES
+from tests.unit.transport.test_neighbours_by_line import SHINY as COLOURED
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
+BEFORE = MIRROR.replace('x="-40"', 'x="-29" y="40"')
 pytestmark = pytest.mark.usefixtures("variant")
 
 
@@ -42,9 +52,7 @@ class Alone(SensorPoints):
 def beside(shared_scene: Callable[..., Path], variant: str) -> Bench:
     """A mirror before the upper half of a shiny wall, and a large sensor."""
     return open_bench(
-        shared_scene(
-            "beside", extra=CORNER + MIRROR.replace('x="-40"', 'x="-29" y="40"'), pitch=0.375, mask_feature=0.3
-        ),
+        shared_scene("beside", extra=CORNER + BEFORE, pitch=0.375, mask_feature=0.3),
         variant,
         for_render=True,
     )
@@ -55,20 +63,65 @@ def anchored(bench: Bench, points: SensorPoints) -> IndirectTracer:
     return IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, True, True, points=points)
 
 
+def compared(bench: Bench) -> tuple[int, list[str]]:
+    """Fewest entries of a kind at an anchor, and what differs between paths to all anchors and to each alone."""
+    points = SensorPoints(bench.geometry.half_width, 3)
+    together, fewest, different = anchored(bench, points).trace(4, 0, 32), 2**30, []
+    for index in range(points.count):
+        alone = anchored(bench, Alone(points.half_width, of_several=points, index=index)).trace(4, 0, 32)
+        at = together.where((together.anchor_row == index // 3) & (together.anchor_column == index % 3))
+        for kind in (DIRECT, INDIRECT):
+            mine, own = at.where(at.kind == kind), alone.where(alone.kind == kind)
+            fewest = min(fewest, mine.value.size)
+            names = ("pixel", "value", "row", "column", "inverse_depth", "lines")
+            different += [name for name in names if not np.array_equal(getattr(mine, name), getattr(own, name))]
+    return fewest, different
+
+
 def test_a_path_is_the_same_at_every_anchor(beside: Bench) -> None:
     """Followed once for all anchors, it brings each what it would bring it alone, bit for bit. (Planted: the number
     that draws of caustics for that of indirect light; what the first anchor keeps joined to the light of all; the last
     anchor left out.)"""
-    points = SensorPoints(beside.geometry.half_width, 3)
-    together = anchored(beside, points).trace(4, 0, 32)
-    for index in range(points.count):
-        alone = anchored(beside, Alone(points.half_width, of_several=points, index=index)).trace(4, 0, 32)
-        at = together.where((together.anchor_row == index // 3) & (together.anchor_column == index % 3))
-        for kind in (DIRECT, INDIRECT):
-            mine, own = at.where(at.kind == kind), alone.where(alone.kind == kind)
-            assert mine.value.size > 100
-            for name in ("pixel", "value", "row", "column", "inverse_depth"):
-                assert np.array_equal(getattr(mine, name), getattr(own, name)), name
+    fewest, different = compared(beside)
+    assert fewest > 100 and not different
+
+
+def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
+    """The same of three lines at once, and of each line what its ledger and the host hold; its process has a spectral
+    variant for good."""
+    place = Path(folder)
+    (place / "lines.toml").write_text(
+        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {list(LINES)}\n'
+        f"radiant_shares = {list(SHARES)}\n"
+    )
+    extra = WALL.format(turn=90, x=-30, bsdf=COLOURED) + BEFORE
+    opened = open_bench(
+        write_small_scene(place, "lit", n=N, extra=extra), "llvm_ad_spectral", None, place / "lines.toml"
+    )
+    bench = ColourBench.of(opened, RUN).whole
+    tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
+    bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
+    ledgers = Ledger.of_lines(len(LINES), bundle, labels, tracer.board)
+    tracer.trace_into(ledgers, 4, 0, 32)
+    host = tracer.trace(4, 0, 32)
+    light = host.where(host.kind == INDIRECT).by_line(len(LINES))
+    sums = zip(ledgers, fetched(ledgers), strict=True)
+    held = [float(ledger.filed(counted)[0].sum()) for ledger, counted in sums]
+    return *compared(bench), [held, [float(bundle.file(each, labels).sum()) for each in light]]
+
+
+def test_a_path_in_several_lines_is_the_same_at_every_anchor(tmp_path: Path) -> None:
+    """With the light of each line, in ledgers of each. (Planted: the first line's light for that of all.)"""
+    program = (
+        "import json, sys; from tests.unit.transport.test_indirect_anchors import in_lines; "
+        "print(json.dumps(in_lines(sys.argv[1])))"
+    )
+    command, root = [sys.executable, "-c", program, str(tmp_path)], Path(__file__).parents[3]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
+    assert done.returncode == 0, done.stderr
+    fewest, different, (held, host) = json.loads(done.stdout.splitlines()[-1])
+    assert fewest > 100 and not different
+    assert held == pytest.approx(host, rel=1e-5) and np.ptp(held) > 0.1 * max(held)
 
 
 @pytest.mark.parametrize("launch", [2**22, 9 * 512 + 5])
