@@ -19,7 +19,7 @@ import numpy.typing as npt
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.histogram import DIRECT, Deposits, Sightings
 from mitsim.transport.ledger import Ledger
-from mitsim.transport.paths import Tracer, launches
+from mitsim.transport.paths import Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, Reception, SensorPoints, sampled_wavelengths
 from mitsim.transport.sampling import shuffled, stratified, streams
@@ -81,7 +81,7 @@ class DirectTracer(Tracer):
             as for :meth:`trace`.
         """
         for tracer in self.apart:
-            for sample, lane in launches(self.lanes, first, samples, self.lanes_per_launch):
+            for sample, lane in self._launches(first, samples):
                 seen, _, anchor = tracer._sightings(seed, sample, lane)
                 lights = seen.by_line(len(ledgers))
                 for place, share in ledgers[0].shares(seen, anchor):
@@ -118,7 +118,7 @@ class DirectTracer(Tracer):
         ) -> tuple[Sightings, mi.PCG32]:
             seen, rng = state
             reception, received = self._received(si, direction, light, sensor, active, rng)
-            return seen.joined_by(reception.sightings(received, pixel, by_line), rng), rng
+            return seen.joined_by(reception.sightings(received, pixel, by_line), rng.next_float32()), rng
 
         by_line = self.projector.by_line
         seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(by_line), rng), seen_at)

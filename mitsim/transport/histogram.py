@@ -66,13 +66,14 @@ class Sightings:
         """No light yet, which may be told apart ``by_line``."""
         return cls.of(mi.UnpolarizedSpectrum(0), by_line, mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
-    def joined_by(self, more: Sightings, rng: mi.PCG32) -> Sightings:
-        """Of these and ``more`` one, drawn by ``rng`` in proportion to its light, which carries the light of both.
+    def joined_by(self, more: Sightings, number: mi.Float) -> Sightings:
+        """Of these and ``more`` one, drawn by a random ``number`` in proportion to its light, which carries the light
+        of both.
 
         By line it carries its own light over the chance that it is drawn.
         """
         total = self.value + more.value
-        new = rng.next_float32() * total < more.value
+        new = number * total < more.value
         places = ((getattr(more, name), getattr(self, name)) for name in ("pixel", "row", "column", "inverse_depth"))
         joined = Sightings(total, *(dr.select(new, theirs, mine) for theirs, mine in places))
         if self.lines is not None and more.lines is not None:

@@ -1,9 +1,9 @@
 """Indirect light from the projector's side: every pixel's rays, followed over any number of surfaces to the sensor.
 
 At each surface after the first the light that a path carries is connected to the sensor: its centre, a random point,
-or each of several anchors, for which a path is the same (:mod:`mitsim.transport.receiver`). So every path that meets a
-second surface counts, and it counts for its own pixel. Of the connections of a path one is handed out, drawn in
-proportion to its light, and it carries the light of all.
+or each of several anchors, for which a path is the same and is followed once (:mod:`mitsim.transport.receiver`). So
+every path that meets a second surface counts, and it counts for its own pixel. Of the connections of a path, to one
+anchor, one is handed out, drawn in proportion to its light, and it carries the light of all.
 
 Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side
 (:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.paths.camera_part` divides it.
@@ -14,7 +14,7 @@ in it. Paths end at random (Russian roulette) with a probability that keeps the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cached_property
 
@@ -24,13 +24,17 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.histogram import DIRECT, Deposits
+from mitsim.transport.histogram import DIRECT, Deposits, Sightings
 from mitsim.transport.ledger import Ledger
-from mitsim.transport.paths import FollowingTracer, Walk, camera_part, is_delta, launches
+from mitsim.transport.paths import KINDS, FollowingTracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
 from mitsim.transport.repeats import Turns, by_pixel
 from mitsim.transport.sampling import stratified, streams
+
+_ROOMS = (4**2, 12**2)
+"""Anchors that a path has room for: few numbers of them, as each is a kernel of its own, 0.4 s to compile; more
+than the most that a plan tries are a kernel for each number."""
 
 
 class IndirectTracer(FollowingTracer):
@@ -80,6 +84,11 @@ class IndirectTracer(FollowingTracer):
         """Paths of one sample: one per projector pixel and anchor, or as often as they are repeated."""
         return len(self.turns) if self.turns else self.projector.n**2 * self.points.count
 
+    @property
+    def per_lane(self) -> int:
+        """Anchors that each lane follows its path to: all of them."""
+        return self.points.count
+
     @cached_property
     def board(self) -> float:
         """Irradiance [W m^-2] that light compares to."""
@@ -98,7 +107,7 @@ class IndirectTracer(FollowingTracer):
         launched = [
             tracer._walk(seed, *launch).file(ledgers)
             for tracer in self.apart
-            for launch in launches(self.lanes, first, samples, self.lanes_per_launch)
+            for launch in self._launches(first, samples)
         ]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
@@ -106,7 +115,7 @@ class IndirectTracer(FollowingTracer):
         return self._walk(seed, sample, lane).deposits(further=True)
 
     def _walk(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> IndirectWalk:
-        return IndirectWalk(self, seed, sample, lane)
+        return (IndirectWalk if self.points.count == 1 else AnchorsWalk)(self, seed, sample, lane)
 
 
 class IndirectWalk(Walk):
@@ -211,3 +220,121 @@ class IndirectWalk(Walk):
         self.active &= self._goes_on(self.scattered + 1)
         self.straight &= passing
         self.ray = self._onward(si, onward, passing)
+
+
+class AnchorsWalk(IndirectWalk):
+    """Paths to several anchors: each is followed once, and connected to one anchor after the other.
+
+    Each anchor's light is what it would be alone: the same random numbers choose which connection is handed out.
+    """
+
+    STATE = (*IndirectWalk.STATE[:-1], "held")
+
+    def __init__(self, tracer: IndirectTracer, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> None:
+        """Paths before their first surface.
+
+        Parameters
+        ----------
+        tracer, seed, sample, lane
+            as for :class:`IndirectWalk`; the lane tells the pixel.
+        """
+        super().__init__(tracer, seed, sample, lane)
+        self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (tracer.points.anchors, tracer.points.count))
+        kinds = ("direct", "indirect") if tracer.mirrors else ("indirect",)
+        self._numbers = len(_differing(Sightings.none(self.by_line)))
+        size = self._numbers * next((room for room in _ROOMS if room >= tracer.points.count), tracer.points.count)
+        self.held = {kind: dr.alloc_local(mi.Float, size, mi.Float(0)) for kind in kinds}
+
+    def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
+        """Follow all paths; indirect light goes into ``ledgers``, caustics to the host."""
+        self.follow(further=True)
+        drawn = self.rng.next_float32()
+
+        def filed(number: mi.UInt32) -> None:
+            seen = self._held("indirect", number)
+            place = ledgers[0].place(seen, drawn, self._anchor(number))
+            for ledger, light in zip(ledgers, seen.by_line(len(ledgers)), strict=True):
+                ledger.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
+
+        self._at_each(filed, mi.Bool(True))
+        return self._fetched(("direct",) if self.tracer.mirrors else (), [ledger.sums for ledger in ledgers])
+
+    def deposits(self, further: bool) -> list[Deposits]:
+        """Light on the host of every path at every anchor, those of a path one after the other.
+
+        Parameters
+        ----------
+        further
+            as for :meth:`mitsim.transport.paths.Walk.deposits`.
+        """
+        self.follow(further)
+        return self._fetched(tuple(self.held))
+
+    def _connect(self, si: mi.SurfaceInteraction3f) -> None:
+        """Light that this surface sends to every anchor."""
+        rng, drawn = self.rng, {kind: self.rng.next_float32() for kind in ("direct", "indirect")}
+
+        def connected(number: mi.UInt32) -> None:
+            self._at, self._drawn = number, drawn
+            self.sensor = self.tracer.points.at(*self._anchor(number), rng)
+            self._take(si, self._way(si))
+
+        self._at_each(connected, self.active)
+
+    def _keep(self, kind: str, seen: Sightings) -> None:
+        if kind in self.held:
+            joined = self._held(kind, self._at).joined_by(seen, self._drawn[kind])
+            for place, value in enumerate(_differing(joined)):
+                self.held[kind][self._at * self._numbers + place] = value
+
+    def _held(self, kind: str, number: mi.UInt32) -> Sightings:
+        """Light of a ``kind`` at an anchor of each path."""
+        value, row, column, inverse_depth, *lines = (
+            self.held[kind][number * self._numbers + place] for place in range(self._numbers)
+        )
+        by_line = mi.UnpolarizedSpectrum(*lines) if lines else None
+        return Sightings(value, self.pixel, row, column, inverse_depth, by_line)
+
+    def _anchor(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """Row and column of an anchor by its number."""
+        return number // self._side, number % self._side
+
+    def _at_each(self, visit: Callable[[mi.UInt32], None], active: mi.Bool) -> None:
+        """Visit every anchor, by its number, one after the other, where ``active``."""
+
+        def one(number: mi.UInt32, held: dict[str, dr.Local[mi.Float]]) -> tuple[mi.UInt32, object]:
+            self.held = held
+            visit(number)
+            return number + 1, self.held
+
+        state = mi.UInt32(0), self.held
+        _, self.held = dr.while_loop(state, lambda number, _: active & (number < self._count), one)
+
+    def _fetched(self, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
+        """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
+        follow all paths again."""
+        size = dr.width(self.pixel) * self.tracer.points.count
+        found = {kind: [dr.zeros(mi.Float, size) for _ in range(self._numbers)] for kind in kinds}
+        lane = dr.arange(mi.UInt32, dr.width(self.pixel)) * self._count
+
+        def unpacked(number: mi.UInt32) -> None:
+            for kind, values in found.items():
+                for into, value in zip(values, _differing(self._held(kind, number)), strict=True):
+                    dr.scatter(into, value, lane + number)
+
+        if kinds:
+            self._at_each(unpacked, mi.Bool(True))
+        dr.eval(found, self.pixel, also)
+        index, deposits = dr.arange(mi.UInt32, size), []
+        pixel, anchor = dr.gather(mi.UInt32, self.pixel, index // self._count), self._anchor(index % self._count)
+        for kind, (value, row, column, inverse_depth, *lines) in found.items():
+            by_line = mi.UnpolarizedSpectrum(*lines) if lines else None
+            seen = Sightings(value, pixel, row, column, inverse_depth, by_line)
+            deposits.append(Deposits.fetched(seen, KINDS[kind], anchor))
+        return deposits
+
+
+def _differing(seen: Sightings) -> list[mi.Float]:
+    """What differs between the anchors of a path, of :class:`Sightings`."""
+    lines = () if seen.lines is None else seen.lines
+    return [seen.value, seen.row, seen.column, seen.inverse_depth, *lines]

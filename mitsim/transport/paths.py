@@ -113,6 +113,15 @@ class Tracer(ABC):
         """Paths, or connections, of one sample."""
 
     @property
+    def per_lane(self) -> int:
+        """Paths, or connections, that each lane of a kernel stands for."""
+        return 1
+
+    def _launches(self, first: int, samples: int) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
+        """As :func:`launches`, ``lanes_per_launch`` paths of all lanes together."""
+        return launches(self.lanes // self.per_lane, first, samples, max(1, self.lanes_per_launch // self.per_lane))
+
+    @property
     def apart(self) -> Sequence[Self]:
         """Itself, or where glass parts light of several wavelengths, the same for each of them alone."""
         projectors = self.projector.apart
@@ -145,7 +154,7 @@ class Tracer(ABC):
         launched = [
             tracer._launch(_seeds([seed], _ALL, sample)[0], sample, lane)
             for tracer in self.apart
-            for sample, lane in launches(self.lanes, first, samples, self.lanes_per_launch)
+            for sample, lane in self._launches(first, samples)
         ]
         return Deposits.joined([deposits for parts in launched for deposits in parts])
 
@@ -157,7 +166,7 @@ class Tracer(ABC):
             return [self.trace(seed, 0, samples) for seed in seeds]
         for start in range(0, len(seeds), together):
             few = seeds[start : start + together]
-            ((sample, lane),) = launches(self.lanes, 0, samples * len(few), self.lanes_per_launch)
+            ((sample, lane),) = self._launches(0, samples * len(few))
             launched = [tracer._launch(*_seeds(few, samples, sample), lane) for tracer in tracers]
             parts = [deposits for of_one in launched for deposits in of_one]
             for look in range(len(few)):
@@ -233,7 +242,7 @@ class Walk(ABC):
 
     def _keep(self, kind: str, seen: Sightings) -> None:
         """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
-        self.kept[kind] = self.kept[kind].joined_by(seen, self.rng)
+        self.kept[kind] = self.kept[kind].joined_by(seen, self.rng.next_float32())
 
     def _wanted(self, order: mi.UInt32) -> mi.Bool:
         """Whether light of an ``order`` is kept."""

@@ -33,14 +33,15 @@ def alike(one: Deposits, other: Deposits) -> bool:
 
 
 @pytest.mark.parametrize("launch", [2**22, 3 * 256])
-@pytest.mark.parametrize("name", ["direct", "anchored", "indirect", "from_camera"])
+@pytest.mark.parametrize("name", ["direct", "anchored", "indirect", "at anchors", "from_camera"])
 def test_looks_together_are_looks_one_by_one(
     bench: Bench, name: str, launch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four in a launch and one more, or launches that hold too few. (Planted: the sample's number of the first look
     for all of them, the lanes of the look before.)"""
     settings = Settings(depth=bench.geometry.scene_distance, effects=frozenset(effects.present(bench)))
-    tracer = getattr(Simulation(bench, replace(settings, anchors=2)), name)
+    simulation = Simulation(bench, replace(settings, anchors=2, followed_anchors=2))
+    tracer = simulation.at_anchors[0] if name == "at anchors" else getattr(simulation, name)
     monkeypatch.setattr(Tracer, "lanes_per_launch", launch)
     together = tracer.trace_looks(SEEDS, 3)
     assert len(together) == len(SEEDS) and not alike(together[0], together[1])

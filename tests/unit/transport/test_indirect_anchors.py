@@ -1,0 +1,151 @@
+"""Indirect light that is followed once for several anchors, against the same paths to each of them alone."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from mitsim.capture.bench import Bench
+from mitsim.capture.colour import ColourBench
+from mitsim.capture.opening import open_bench
+from mitsim.core.colours import RUN
+from mitsim.transport.cells import aligned_grid
+from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
+from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.ledger import Ledger, fetched
+from mitsim.transport.receiver import SensorPoints
+from tests.conftest import write_small_scene
+from tests.unit.transport.test_indirect import CORNER, MIRROR, N
+from tests.unit.transport.test_neighbours import WALL
+from tests.unit.transport.test_neighbours_by_line import LINES, SHARES
+from tests.unit.transport.test_neighbours_by_line import SHINY as COLOURED
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+BEFORE = MIRROR.replace('x="-40"', 'x="-29" y="40"')
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@dataclass(frozen=True)
+class Alone(SensorPoints):
+    """One anchor of several."""
+
+    of_several: SensorPoints | None = None
+    index: int = 0
+
+    def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
+        assert self.of_several is not None
+        side = self.of_several.anchors
+        return self.of_several.at(row + self.index // side, column + self.index % side, rng)
+
+
+@pytest.fixture(scope="module")
+def beside(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    """A mirror before the upper half of a shiny wall, and a large sensor."""
+    return open_bench(
+        shared_scene("beside", extra=CORNER + BEFORE, pitch=0.375, mask_feature=0.3),
+        variant,
+        for_render=True,
+    )
+
+
+def anchored(bench: Bench, points: SensorPoints) -> IndirectTracer:
+    loaded = bench.loaded
+    return IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, True, True, points=points)
+
+
+def compared(bench: Bench) -> tuple[int, list[str]]:
+    """Fewest entries of a kind at an anchor, and what differs between paths to all anchors and to each alone."""
+    points = SensorPoints(bench.geometry.half_width, 3)
+    together, fewest, different = anchored(bench, points).trace(4, 0, 32), 2**30, []
+    for index in range(points.count):
+        alone = anchored(bench, Alone(points.half_width, of_several=points, index=index)).trace(4, 0, 32)
+        at = together.where((together.anchor_row == index // 3) & (together.anchor_column == index % 3))
+        for kind in (DIRECT, INDIRECT):
+            mine, own = at.where(at.kind == kind), alone.where(alone.kind == kind)
+            fewest = min(fewest, mine.value.size)
+            names = ("pixel", "value", "row", "column", "inverse_depth", "lines")
+            different += [name for name in names if not np.array_equal(getattr(mine, name), getattr(own, name))]
+    return fewest, different
+
+
+def test_a_path_is_the_same_at_every_anchor(beside: Bench) -> None:
+    """Followed once for all anchors, it brings each what it would bring it alone, bit for bit. (Planted: the number
+    that draws of caustics for that of indirect light; what the first anchor keeps joined to the light of all; the last
+    anchor left out.)"""
+    fewest, different = compared(beside)
+    assert fewest > 100 and not different
+
+
+def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
+    """The same of three lines at once, and of each line what its ledger and the host hold; its process has a spectral
+    variant for good."""
+    place = Path(folder)
+    (place / "lines.toml").write_text(
+        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {list(LINES)}\n'
+        f"radiant_shares = {list(SHARES)}\n"
+    )
+    extra = WALL.format(turn=90, x=-30, bsdf=COLOURED) + BEFORE
+    opened = open_bench(
+        write_small_scene(place, "lit", n=N, extra=extra), "llvm_ad_spectral", None, place / "lines.toml"
+    )
+    bench = ColourBench.of(opened, RUN).whole
+    tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
+    bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
+    ledgers = Ledger.of_lines(len(LINES), bundle, labels, tracer.board)
+    tracer.trace_into(ledgers, 4, 0, 32)
+    host = tracer.trace(4, 0, 32)
+    light = host.where(host.kind == INDIRECT).by_line(len(LINES))
+    sums = zip(ledgers, fetched(ledgers), strict=True)
+    held = [float(ledger.filed(counted)[0].sum()) for ledger, counted in sums]
+    return *compared(bench), [held, [float(bundle.file(each, labels).sum()) for each in light]]
+
+
+def test_a_path_in_several_lines_is_the_same_at_every_anchor(tmp_path: Path) -> None:
+    """With the light of each line, in ledgers of each. (Planted: the first line's light for that of all.)"""
+    program = (
+        "import json, sys; from tests.unit.transport.test_indirect_anchors import in_lines; "
+        "print(json.dumps(in_lines(sys.argv[1])))"
+    )
+    command, root = [sys.executable, "-c", program, str(tmp_path)], Path(__file__).parents[3]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
+    assert done.returncode == 0, done.stderr
+    fewest, different, (held, host) = json.loads(done.stdout.splitlines()[-1])
+    assert fewest > 100 and not different
+    assert held == pytest.approx(host, rel=1e-5) and np.ptp(held) > 0.1 * max(held)
+
+
+@pytest.mark.parametrize("launch", [2**22, 9 * 512 + 5])
+def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The light that is handed out, by anchor and class of pixels; the same units however paths are launched. (Planted:
+    rows for columns of anchors; launches that begin with the first path again.)"""
+    points = SensorPoints(beside.geometry.half_width, 3)
+    tracer, labels = anchored(beside, points), np.arange(N**2) % 5
+    reach = beside.geometry.reach(beside.geometry.scene_distance)
+    bundle = Bundle(aligned_grid(*beside.windows, 2 * N, 1, reach), 3, (400.0, 300.0))
+    whole, parts = (Ledger(bundle, labels, tracer.board) for _ in range(2))
+    caustics, host = tracer.trace_into([whole], 4, 0, 8), tracer.trace(4, 0, 8)
+    units = np.array(whole.sums)
+    monkeypatch.setattr(IndirectTracer, "lanes_per_launch", launch)
+    again = Deposits.joined([tracer.trace_into([parts], 4, first, 4) for first in (0, 4)])
+    assert units.any() and np.array_equal(np.array(parts.sums), units)
+    for name in ("kind", "pixel", "anchor_row", "anchor_column", "value"):
+        assert np.array_equal(getattr(again, name), getattr(caustics, name)), name
+    assert np.array_equal(caustics.value, host.value[host.kind == DIRECT]) and caustics.value.size
+    expected = bundle.file(host.where(host.kind == INDIRECT), labels)
+    found = whole.filed()[0]
+    # Which layer light is filed in is drawn: all layers together are the same.
+    by_place = [np.asarray(light.toarray()).reshape(light.shape[0], 2, -1).sum(axis=1) for light in (expected, found)]
+    near = np.isclose(*by_place, rtol=1e-5, atol=1e-7 * by_place[0].max())
+    # Rounding moves what lies on the edge of a cell.
+    assert (by_place[0] > 0).sum() > 500 and near.mean() > 0.999
+    assert by_place[1].sum() == pytest.approx(by_place[0].sum(), rel=1e-5)
