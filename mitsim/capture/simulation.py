@@ -187,11 +187,23 @@ class Simulation(Trays):
         return self._ledgers(self.indirect, self.followed.bundle, labels, lines)
 
     def coarse_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
-        """The same of direct light at anchors, where its paths are many for its cells."""
+        """The same of direct light at anchors, where its paths are many for its cells.
+
+        Parameters
+        ----------
+        labels, lines
+            as for :meth:`smooth_ledgers`.
+        """
         return self._ledgers(self.anchored, self.coarse.bundle, labels, lines, self.settings.anchored_samples)
 
     def sharp_ledgers(self, labels: Labels, lines: int) -> tuple[Ledger, ...]:
-        """The same of :attr:`apart`, whose pixels have a row each."""
+        """The same of :attr:`apart`, whose pixels have a row each.
+
+        Parameters
+        ----------
+        labels, lines
+            as for :meth:`smooth_ledgers`; rows do not hang on classes.
+        """
         del labels
         sharp, rows = self.settings.sharp, np.zeros(self.bench.n**2, dtype=np.int64)
         if sharp is not None:
