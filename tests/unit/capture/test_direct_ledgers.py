@@ -1,9 +1,12 @@
 """Direct light that is filed on the device: what the host files of the same paths, place by place."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -80,3 +83,22 @@ def test_few_paths_for_many_cells_are_left_to_the_host(bench: Bench) -> None:
     many = replace(SETTINGS, anchored_samples=1000.0, sharp_samples=1000.0)
     stages = Simulation(bench, many).tracers()
     assert len(stages["anchored"].ledgers(labels, 3)) == 3 == len(stages["sharp"].ledgers(labels, 3))
+
+
+def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) -> None:
+    """Ledgers refuse what is no light; what the sharpest lobe of Mitsuba brings is, and what is dim is not rounded
+    away. (Planted: light compared to a board's own; `_LOBE` of 2^20.)"""
+    simulation = Simulation(bench, SETTINGS)
+    tracer = simulation.anchored
+    assert tracer is not None
+    lobe = mi.load_dict({"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 1e-6})
+    square = dr.zeros(mi.SurfaceInteraction3f)
+    square.wi = mi.Vector3f(0, 0, 1)
+    brightest = math.pi * float(np.max(np.array(lobe.eval(mi.BSDFContext(), square, mi.Vector3f(0, 0, 1)))))
+    assert brightest > 2e7
+    board = tracer.receiver.of_board(tracer.rays)
+    (ledger,) = simulation.coarse_ledgers(np.zeros(N * N, dtype=np.int64), 1)
+    for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
+        ledger.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))
+    filed, *_ = ledger.filed()
+    np.testing.assert_allclose(filed.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)
