@@ -25,8 +25,9 @@ EVEN = ("direct", "anchored", "occluded", "sharp")
 """Light whose points come from a Sobol sequence alone, so that the number of samples matters."""
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
-GROUPS = 8
-"""Independent estimates of the light: eight tell their spread, the Monte Carlo error, to a quarter (1 / sqrt(14))."""
+GROUPS = 4
+"""Independent estimates of the light, whose spread is the Monte Carlo error: of light of many paths, whose noise is of
+many kinds, four tell it as well as more (docs/physics.md), and each takes its own filing, forming and probing."""
 LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 LOOKS = 4

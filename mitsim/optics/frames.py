@@ -5,6 +5,7 @@ The closed form of one light distribution is :mod:`mitsim.optics.closed_form`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
+from scipy.special import stdtrit
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
@@ -36,8 +38,8 @@ _COLUMNS = 2**14
 """Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
 _FLOAT = 8
 """Bytes of a pixel of a frame."""
-_NORMAL = 1.645
-"""Standard deviations above which a normal deviate is in 5 % of cases."""
+_SURE = 0.95
+"""How often an error is to be below its bound."""
 _MOST_COLUMNS = 2**22
 """Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all, and
 20 to add two unsorted matrices."""
@@ -621,13 +623,19 @@ def bound_of(parts: FloatArray, energy: float) -> float:
 
     The error that was made is one draw, and its estimate another. Where few paths make the noise, groups of the light
     differ much in the energy of theirs, and so would other draws: with v the relative variance of that energy among G
-    groups, the squared error is below 1 + 1.645 sqrt(v G / (G - 1)) times its estimate.
+    groups, the squared error is below 1 + t sqrt(v G / (G - 1)) times its estimate. Student's t of G - 1 degrees of
+    freedom, as v is an estimate too.
     """
     if not energy or not parts.sum():
         return 0.0
     count = len(parts)
-    spread = float(parts.var(ddof=1)) / float(parts.mean()) ** 2 * count / (count - 1) if count > 1 else 0.0
-    return float(np.sqrt(parts.sum() / energy * (1 + _NORMAL * np.sqrt(spread))))
+    spread = float(parts.std(ddof=1) / parts.mean()) * _deviations(count) if count > 1 else 0.0
+    return float(np.sqrt(parts.sum() / energy * (1 + spread)))
+
+
+def _deviations(count: int) -> float:
+    """Standard deviations of so many groups' energies from their mean to the bound on an error's."""
+    return float(stdtrit(count - 1, _SURE)) * math.sqrt(count / (count - 1))
 
 
 def shares_of_bound(parts: FloatArray) -> FloatArray:
@@ -642,7 +650,7 @@ def shares_of_bound(parts: FloatArray) -> FloatArray:
     found = parts.sum(axis=1)
     if deviation:
         along = (parts * (total - total.mean())).sum(axis=1) / (count - 1) / deviation
-        found = found + _NORMAL * np.sqrt(count / (count - 1)) * count * along
+        found = found + _deviations(count) * count * along
     return np.asarray(np.maximum(found, 0.0))
 
 
