@@ -61,8 +61,9 @@ _AS_GOOD = 1.1
 _COARSE_CELLS = (1, 2, 4, 8)
 """As for fine light."""
 _BOUND_OVER_ERROR = 1.1
-"""Sampling stops by the 95 % bound on its error, which lies so far above its estimate where eight groups of many paths
-tell it (1.05 to 1.17 in photograph, gift card, corner, cookie bag, metal blade, compact disc)."""
+"""Sampling stops by the 95 % bound on its error, which lies so far above its estimate where four groups of many paths
+tell it at best (1.04 to 1.3 in photograph, gift card, corner, metal blade, compact disc, colour checker); predicting
+1.17 saves the rounds that it takes in half of them, and no time (metal blade, compact disc: 4 % more work)."""
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,8 @@ Target = Callable[[ExpectedFrames], float]
 _MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _TOLD, _OF_HEAVY = 1.2, 0.55
-"""Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: eight
-groups of many paths have 1.05 to 1.17. A heavy path counts for less among more of them, so the bound then falls with
+"""Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: four
+groups of many paths have 1.04 to 1.3, 1.15 in the middle. A heavy path counts for less among more of them, so the bound then falls with
 their number to the power 0.8 to 0.93 in place of 0.5 (cookie_bag, seeds 2 and 4): less than its power of 0.55 is
 missing."""
 _VIEW_SAMPLES = 64
@@ -48,8 +48,8 @@ _LOST = 0.1
 """Part of the accuracy that light beyond all cells may have: it falls on one edge of the sensor, so a hundredth of the
 pixels may have it, and their frames are then off by ten times as much."""
 _BY_CHANCE = 1.5
-"""Ratio of the variance over 49 shots to that over eight of them which eight groups of equal shots exceed by chance in
-one of fifty (20000 trials: 1.37 in one of twenty, 1.58 in one of a hundred)."""
+"""Ratio of the variance over 49 shots to that over 16 of them which four groups of equal shots exceed by chance in one
+of fifty (20000 trials: 1.37 in one of twenty, 1.57 in one of a hundred)."""
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,11 @@ from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import Lighting, PatternFamily
 from mitsim.rig.recipe import load_recipe
 
-_FIREFLIES = 0.8
-"""Part of the variance in one of 8 groups: a single heavy path gives 0.875, and ordinary noise 0.2 to 0.4.
+_FIREFLIES = 0.72
+"""Part of the variance in one of four groups: a single heavy path gives 0.75, and ordinary noise 0.3 to 0.5.
 
-Normal noise gives 0.8 once in 600 runs if it is the same in all pixels of all frames (Grubbs' test), else never.
+Normal noise gives 0.72 once in 12 runs if it is the same in all pixels of all frames, once in 150 if it is of two such
+kinds, once in 2000 if of three, and else never.
 """
 _DROWNED = 1.0
 """Noise over the projector's light at which ambient light has ended the dynamic range: 49 dots of lamp_bench give 29 dB

@@ -297,7 +297,7 @@ class RunManifest(RunHead):
     sensor_noise: float | None = Field(None, description="relative noise of the sensor over all frames, closed form")
     heaviest_group: float | None = Field(
         default=None,
-        description="largest part of the Monte Carlo variance in one of 8 groups of the light; above 0.8 a few "
+        description="largest part of the Monte Carlo variance in one of the groups of the light; above 0.72 a few "
         "heavy paths make it",
     )
     truth_error: float | None = Field(

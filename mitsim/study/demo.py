@@ -181,7 +181,9 @@ def _page(evidence: _Evidence) -> ReportData:
         exposure=f"equal peak: each family's brightest pixel fills {100 * Exposure().fraction:.0f} % of the full well",
         calibration={**session, "status": f"{factors.status}{beyond}"},
         budget=(
-            BudgetRow("Monte Carlo", shots.manifest.mc_error, "rendering noise of the expected frames, from 8 groups"),
+            BudgetRow(
+                "Monte Carlo", shots.manifest.mc_error, "rendering noise of the expected frames, from its groups"
+            ),
             BudgetRow(
                 "Discretisation", light.plan.systematic_error, "anchors, cells and layers, predicted by the plan"
             ),

@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.robustness("Light"
 
 
 def heavy_frames(weight: float, seed: int = 0) -> tuple[ExpectedFrames, np.ndarray]:
-    """Eight groups of the same noise, one of them with one more path that brings ``weight`` of all light."""
+    """Groups of the same noise, one of them with one more path that brings ``weight`` of all light."""
     geometry = CameraGeometry(pixels=32, mask="open")
     axis = Directions.cells(np.linspace(-0.15, 0.15, 9))
     rng = np.random.default_rng(seed)
@@ -40,7 +40,7 @@ def heavy_frames(weight: float, seed: int = 0) -> tuple[ExpectedFrames, np.ndarr
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(weight=st.sampled_from([0.0, 1e-3, 1.0, 1e3, 1e6]), seed=st.integers(0, 2**16))
 def test_a_heavy_path_shows_and_is_kept(weight: float, seed: int) -> None:
-    """Its group brings 7/8 of the variance; the frame is that of all light, linear and unclipped."""
+    """Its group brings 3/4 of the variance; the frame is that of all light, linear and unclipped."""
     frames, groups = heavy_frames(weight, seed)
     frame = next(iter(frames))
     plain = next(iter(heavy_frames(0.0, seed)[0]))
@@ -48,9 +48,9 @@ def test_a_heavy_path_shows_and_is_kept(weight: float, seed: int) -> None:
         groups.mean(axis=0).sum() / (groups.mean(axis=0).sum() - weight * 64 / GROUPS), rel=0.05
     )
     if weight >= 1:
-        assert frame.heaviest == pytest.approx(7 / 8, abs=0.01)
+        assert frame.heaviest == pytest.approx(1 - 1 / GROUPS, abs=0.01)
     if weight == 0:
-        assert 1 / 8 <= frame.heaviest < 0.8
+        assert 1 / GROUPS <= frame.heaviest < 0.72
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_a_capture_tells_of_fireflies(
 ) -> None:
     """Roughness 1e-3 without the look for sharp lobes: of 16 384 connections one or two meet the lobe, or none.
 
-    With seed 21 one does, and its group brings nearly 7/8 of the variance; with seed 2 it is shared among several.
+    With seed 21 one does, and its group brings nearly 3/4 of the variance; with seed 2 it is shared among several.
     """
     bench = open_bench(small_scene(**glossy(1e-3)))
     plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
@@ -68,7 +68,7 @@ def test_a_capture_tells_of_fireflies(
     for seed, fireflies in ((21, True), (2, False)):
         result = bench.capture("uniform", tmp_path / f"run{seed}", accuracy=2e-2, seed=seed)
         heaviest = result.manifest.heaviest_group
-        gate = {"at_least": 0.8} if fireflies else {"at_most": 0.8}
+        gate = {"at_least": 0.72} if fireflies else {"at_most": 0.72}
         measured(heaviest, **gate, what=f"share of the heaviest group, seed {seed}")
         assert any("fireflies" in warning for warning in result.warnings) is fireflies
         manifest = json.loads((tmp_path / f"run{seed}" / "manifest.json").read_text())
@@ -82,4 +82,4 @@ def test_ordinary_scenes_have_none(white: Bench, small_scene: Callable[..., Path
     for name, bench in (("white", white), ("glossy", open_bench(small_scene(**glossy(0.1))))):
         result = bench.capture("uniform", tmp_path / name, accuracy=2e-2, seed=1, effects={"diffraction": False})
         assert not any("fireflies" in warning or "sharp" in warning for warning in result.warnings)
-        assert result.manifest.heaviest_group < 0.8
+        assert result.manifest.heaviest_group < 0.72

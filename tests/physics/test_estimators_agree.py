@@ -17,7 +17,7 @@ z (`--junitxml` shows it).
 
 Significance. A sum's variance comes from the spread between independent passes, pixel by pixel, and adds up over
 pixels, which a box filter keeps independent; 262 144 pixels times 7 degrees of freedom make it exact to a fraction of a
-percent, so z is normal. The factored frame's own variance comes from its eight groups and is added. With alpha = 1e-3
+percent, so z is normal. The factored frame's own variance comes from its groups and is added. With alpha = 1e-3
 for the whole module, Bonferroni over CASES cases of 69 sums each. Seeds are fixed. The mutation tests show what the
 check sees.
 """

@@ -71,9 +71,8 @@ def test_refusals(refused: Callable[..., str], lab: Any) -> None:
 
 def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     """By the lines of docs/exchange.md: of the same seed to single precision, as capture traces the same paths; of
-    another seed within the error that both files state. 16 frames, each lit by its own 16 of 256 projector pixels,
-    whose 8 groups tell 1792 degrees of freedom: the ratio of variances deviates by sqrt(4 / 1792), 5 %. (Planted: the
-    error of one group, other electrons a joule.)"""
+    another seed within the error that both files state: the square of their difference, over what both state of it,
+    varies by 0.2 among pairs of seeds. (Planted: the error of one group, other electrons a joule.)"""
     shots = ms.load_run(lab.run)
     for seed in (0, 1):
         options = "--patterns", "dots:4", "-o", tmp_path / f"{seed}.h5", "--seed", seed, "--json"
@@ -99,7 +98,7 @@ def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any],
         square += float(np.square(frame - other).sum())
         error += float((own**2 + others**2).sum())
     assert np.sqrt(apart / energy) < 1e-6
-    assert square / error == pytest.approx(1, abs=0.25), "five standard deviations"
+    assert square / error == pytest.approx(1, abs=0.6), "three standard deviations"
 
 
 def test_patterns_are_drawn(call: Callable[..., Any], tmp_path: Path) -> None:

@@ -77,11 +77,14 @@ def test_light_by_class_serves_no_other_family(bench: Bench, plan: Plan, family:
     assert np.allclose(white, stacked(by_class.frames(family, 0)).sum(axis=0), rtol=1e-9)
 
 
-def test_a_target_stops_the_sampling(bench: Bench, plan: Plan, family: Lighting) -> None:
-    """It is asked with the frames seen so far, eight of the sixteen, and its answer is the error to stop at.
+def test_a_target_stops_the_sampling(
+    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is asked with the frames seen so far, here eight of the sixteen, and its answer is the error to stop at.
 
     The error of all sixteen is told by random signs alone, the frames' energy too: 0.7 % off here.
     """
+    monkeypatch.setattr("mitsim.capture.light.CHECKED_SHOTS", 8)
     asked: list[float] = []
 
     def target(frames: ExpectedFrames) -> float:
@@ -106,7 +109,7 @@ def test_shots_that_are_looked_at(
     effects: tuple[str, ...],
     looked_at: int,
 ) -> None:
-    """All, where frames of few classes tell of them; else eight, and more of followed light, as a heavy path may strike
+    """All, where frames of few classes tell of them; else some, here eight, and more of followed light, as a heavy path may strike
     another; again after each round. (Planted: eight always.)"""
     target, asked = plan.sampling_target, []
 
@@ -116,6 +119,7 @@ def test_shots_that_are_looked_at(
 
     monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
     monkeypatch.setattr("mitsim.capture.light.tells_all", lambda *_: classes_tell)
+    monkeypatch.setattr("mitsim.capture.light.CHECKED_SHOTS", 8)
     plan = replace(plan, settings=replace(plan.settings, effects=frozenset(effects)))
     assert trace_light(bench, plan, family, 3).reached and asked == [looked_at] * 2
 

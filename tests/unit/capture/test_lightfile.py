@@ -118,7 +118,7 @@ def test_a_scene_without_lamps_and_mirrors_has_none_in_its_file(
     light = trace_light(plain, plan, Lighting.uniform(N), 0)
     with h5py.File(light.save(tmp_path / "light.h5")) as file:
         assert set(file) == {"light"} and set(file["light"]) == {"fine"}
-        assert file["light/fine"].attrs["shape"][0] == 8 * N**2
+        assert file["light/fine"].attrs["shape"][0] == len(light.groups) * N**2
     by_class = trace_light(plain, plan, Lighting.uniform(N), 0, Sampling(by_pixel=False))
     with pytest.raises(MitsimError, match="traced for one family alone"):
         by_class.save(tmp_path / "other.h5")

@@ -9,6 +9,7 @@ import pytest
 
 from mitsim.capture import exposer as exposing
 from mitsim.capture.cost import frames_bytes
+from mitsim.capture.evidence import GROUPS
 from mitsim.capture.exposer import frames_at_once
 from mitsim.capture.shooting import Shooting, Totals
 from mitsim.core.errors import MitsimError
@@ -86,7 +87,7 @@ def test_frames_take_as_much_memory_as_is_predicted(mixed: bool, monkeypatch: py
         def _write(self, name, channels, metadata) -> None:
             """Kept by nobody."""
 
-    expected = expected_frames(small_optics(pixels), random_groups(8, 7), labels, weights, 0)
+    expected = expected_frames(small_optics(pixels), random_groups(GROUPS, 7), labels, weights, 0)
     shooting = Shooting(parse_patterns("dots:6", 12), Nowhere(), exposer(), None, np.zeros((pixels, pixels)))
     tracemalloc.start()
     try:

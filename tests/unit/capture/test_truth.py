@@ -15,7 +15,7 @@ import pytest
 from mitsim.capture import truth as module
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import EFFECTS
-from mitsim.capture.evidence import Settings
+from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.opening import open_bench
 from mitsim.capture.planning import make_plan
@@ -162,7 +162,7 @@ def test_it_shares_no_error_with_the_frames(bench: Bench, printed: np.ndarray) -
     plan = make_plan(bench, lighting, 1e-2, 0, dict.fromkeys(EFFECTS, False))
     plan = replace(plan, settings=replace(plan.settings, direct_samples=float(module.TRUTH_SAMPLES)))
     light = trace_light(bench, plan, lighting, 3, Sampling(by_pixel=False, target=lambda _: np.inf))
-    assert light.paths == 8 * N**2 * module.TRUTH_SAMPLES, "the first round is what was predicted"
+    assert light.paths == GROUPS * N**2 * module.TRUTH_SAMPLES, "the first round is what was predicted"
     found, answer = trace_truth(bench, plan.settings, 3, np.full(N * N, np.inf)), exact(printed / 255)
     of_frames = (light.flux / found.board_flux).reshape(N, N) - answer
     of_truth = found.reflectance - answer
