@@ -39,9 +39,9 @@ _MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _TOLD, _OF_HEAVY = 1.2, 0.55
 """Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: four
-groups of many paths have 1.04 to 1.3, 1.15 in the middle. A heavy path counts for less among more of them, so the bound then falls with
-their number to the power 0.8 to 0.93 in place of 0.5 (cookie_bag, seeds 2 and 4): less than its power of 0.55 is
-missing."""
+groups of many paths have 1.04 to 1.3, 1.15 in the middle. A heavy path counts for less among more of them, so the bound
+then falls with their number to the power 0.8 to 0.93 in place of 0.5 (cookie_bag, seeds 2 and 4): less than its power
+of 0.55 is missing."""
 _VIEW_SAMPLES = 64
 """Samples a cell of a picture to look at: below the step of eight bits."""
 _LOST = 0.1

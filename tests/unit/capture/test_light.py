@@ -109,8 +109,8 @@ def test_shots_that_are_looked_at(
     effects: tuple[str, ...],
     looked_at: int,
 ) -> None:
-    """All, where frames of few classes tell of them; else some, here eight, and more of followed light, as a heavy path may strike
-    another; again after each round. (Planted: eight always.)"""
+    """All, where frames of few classes tell of them; else some, here eight, and more of followed light, as a heavy path
+    may strike another; again after each round. (Planted: eight always.)"""
     target, asked = plan.sampling_target, []
 
     def told(frames: ExpectedFrames) -> tuple[float, float]:
