@@ -57,15 +57,16 @@ def test_a_heavy_path_shows_and_is_kept(weight: float, seed: int) -> None:
 def test_a_capture_tells_of_fireflies(
     measured: Recorder, small_scene: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Roughness 1e-3 without the look for sharp lobes: of 16 384 connections one or two meet the lobe, or none.
+    """Roughness 1e-3 without the look for sharp lobes: of 32 768 connections a few meet the lobe, or none.
 
-    With seed 21 one does, and its group brings nearly 3/4 of the variance; with seed 2 it is shared among several.
+    With seed 27 one outweighs the others, and its group brings nearly 3/4 of the variance; with seed 4 the groups share
+    it.
     """
     bench = open_bench(small_scene(**glossy(1e-3)))
     plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
-    plan = replace(plan, settings=Settings(Z, direct_samples=16), sampling_target=1e9, warnings=())
+    plan = replace(plan, settings=Settings(Z, direct_samples=32), sampling_target=1e9, warnings=())
     monkeypatch.setattr("mitsim.capture.run.make_plan", lambda *_: plan)
-    for seed, fireflies in ((21, True), (2, False)):
+    for seed, fireflies in ((27, True), (4, False)):
         result = bench.capture("uniform", tmp_path / f"run{seed}", accuracy=2e-2, seed=seed)
         heaviest = result.manifest.heaviest_group
         gate = {"at_least": 0.72} if fireflies else {"at_most": 0.72}
