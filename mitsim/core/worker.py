@@ -106,15 +106,26 @@ def advise(text: str) -> None:
 @contextmanager
 def held_back() -> Iterator[None]:
     """Signals that stop this process wait until the block ends: native code that is being imported turns what they
-    raise into errors of its own. Threads that begin in it leave them to the main one for good."""
+    raise into errors of its own, or ends the process. Threads that begin in it leave them to the main one for good;
+    those that were there, as of a library for linear algebra, may still take one, which is kept for the end."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+    kept: list[int] = []
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+    handlers = {number: handler for number in _STOPS if callable(handler := signal.getsignal(number))}
+    if threading.current_thread() is not threading.main_thread():
+        handlers = {}  # which run in the main thread alone
     try:
+        for number in handlers:
+            signal.signal(number, lambda taken, _: kept.append(taken))
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if kept:
+            signal.raise_signal(kept[0])
 
 
 def stopped() -> bool:
