@@ -93,10 +93,10 @@ def test_a_worker_that_dies_leaves_one_clear_line(work: str, name: str, words: s
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_the_parent_stops_the_worker(number: signal.Signals) -> None:
-    # A shell's background jobs ignore SIGINT, and so would what they start.
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # A shell's background jobs ignore SIGINT, those of nohup SIGHUP, and so would what they start.
+    before = signal.signal(number, signal.SIG_DFL)
     process, _ = started(TELL)
-    signal.signal(signal.SIGINT, before)
+    signal.signal(number, before)
     process.send_signal(number)
     words = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
     assert (*process.communicate(timeout=20), process.returncode) == ("", f"mitsim: {words}\n", 128 + number)
