@@ -63,7 +63,7 @@ _COARSE_CELLS = (1, 2, 4, 8)
 _BOUND_OVER_ERROR = 1.1
 """Sampling stops by the 95 % bound on its error, which lies so far above its estimate where four groups of many paths
 tell it at best (1.04 to 1.3 in photograph, gift card, corner, metal blade, compact disc, colour checker); predicting
-1.17 saves the rounds that it takes in half of them, and no time (metal blade, compact disc: 4 % more work)."""
+1.17 saves no time (processor seconds of gift card, compact disc, metal blade, photograph, five seeds: within 3 %)."""
 
 
 @dataclass(frozen=True)
