@@ -160,6 +160,7 @@ class Apparatus:
             pixel_pitch_mm=self.geometry.pixel_pitch,
             row_pitch_mm=self.geometry.row_pitch,
             mask_distance_mm=self.geometry.mask_distance,
+            stop_tan=self.geometry.tan_half_fov,
         )
 
     def _centre(self, axis: int) -> float:

@@ -343,6 +343,9 @@ class Parallax(_Part):
     pixel_pitch_mm: Distance = Field(description="between columns of (binned) sensor pixels, and between rows")
     row_pitch_mm: Distance | None = Field(default=None, description="between rows, where pixels are not square")
     mask_distance_mm: Distance = Field(description="sensor to the mask")
+    stop_tan: Distance | None = Field(
+        default=None, description="tangent at which a square field stop ends, along both axes; none: not known"
+    )
 
     @model_validator(mode="after")
     def _a_window_behind_a_mask(self) -> Parallax:

@@ -9,15 +9,17 @@ from __future__ import annotations
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import ArgumentError
 from mitsim.core.measurement import Measurement
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import centred, centred_columns
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import FactorOfDepths, stated_parallax
+from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, stated_parallax
+from mitsim.reconstruct.noise import FrameNoise
 
 RANGE = 0.25
-"""Depths that are looked for, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm moves light by an eighth of
-a window of 0.3 rad."""
+"""Depths that are looked for where no range is given, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm
+moves light by an eighth of a window of 0.3 rad."""
 _LEFT_OUT = 1e-6
 """Part of the factors' energy that the common basis of all depths may leave out: below their noise's."""
 
@@ -29,13 +31,15 @@ class AllDepths:
     ----------
     shots, factors
         of the same camera; MitsimError for factors without parallax.
-    limit
-        largest change of 1/z [1/mm], either way.
+    shifts
+        least and largest change of 1/z [1/mm]; ArgumentError where too little of the sensor knows all these depths.
 
     Attributes
     ----------
     parallax, patterns
         of the factors and the shots.
+    noise
+        of the measurements on the whole sensor.
     frames
         measurements on the bases.
     energy, outside
@@ -45,7 +49,7 @@ class AllDepths:
         their number, and what part of the sensor they are of.
     """
 
-    def __init__(self, shots: Capture, factors: Factors, limit: float) -> None:
+    def __init__(self, shots: Capture, factors: Factors, shifts: tuple[float, float]) -> None:
         self.parallax, self.patterns = stated_parallax(factors), shots.patterns
         self._sides = tuple(
             FactorOfDepths(side, self.parallax, axis) for axis, side in enumerate((factors.left, factors.right))
@@ -53,16 +57,26 @@ class AllDepths:
         self._centre = factors.manifest.centre
         self._parts, self._bases = [], list[FloatArray]()
         for side in self._sides:
-            shifts = np.linspace(-limit, limit, 2 * int(np.ceil(limit * side.reach)) + 1)
-            found = [side.at(shift) for shift in (*shifts, -limit, limit)]
+            tried = np.linspace(*shifts, max(int(np.ceil((shifts[1] - shifts[0]) * side.reach)) + 1, 2))
+            found = [side.at(shift) for shift in tried]
             part = slice(max(each.start for _, each in found), min(each.stop for _, each in found))
+            if part.stop - part.start < LEAST_PART * len(side.factor):
+                near, far = (1 / (1 / self.parallax.depth_mm + shift) for shift in reversed(shifts))
+                raise ArgumentError(
+                    "depth_range",
+                    f"{near:.4g} to {far:.4g} mm: {max(part.stop - part.start, 0)} of {len(side.factor)} sensor rows or "
+                    f"columns know the shadow at all of these depths; give a range nearer to the calibrated "
+                    f"{self.parallax.depth_mm:g} mm",
+                )
             self._parts.append(part)
             self._bases.append(_basis([self._own(columns[part]) for columns, _ in found]))
         self.energy, kept = 0.0, list[Measurement]()
+        self.noise = FrameNoise(shots.manifest)
         for each in shots.measured((len(factors.left), len(factors.right))):
             frame = each.frame[self._parts[0], self._parts[1]]
             frame = centred(frame) if self._centre else frame
             self.energy += float(np.square(frame).sum())
+            self.noise.add(each)
             small = self._bases[0].T @ frame @ self._bases[1]
             kept.append(Measurement(small, each.row, each.column, small, each.shots, 0))
         self.frames = tuple(kept)
@@ -102,6 +116,27 @@ class AllDepths:
 
     def _own(self, columns: FloatArray) -> FloatArray:
         return centred_columns(columns) if self._centre else columns
+
+
+def searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
+    """Least and largest change of 1/z [1/mm] of the depths that are looked for.
+
+    Parameters
+    ----------
+    factors
+        with their parallax.
+    depth_range
+        nearest and farthest depth [mm], ArgumentError where the mask is beyond the nearest; None: :data:`RANGE`.
+    """
+    parallax = stated_parallax(factors)
+    if depth_range is None:
+        return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
+    near, far = depth_range
+    if near <= parallax.mask_distance_mm:
+        raise ArgumentError(
+            "depth_range", f"{near:g} to {far:g} mm: begin above {parallax.mask_distance_mm:g} mm, where the mask is"
+        )
+    return 1 / far - 1 / parallax.depth_mm, 1 / near - 1 / parallax.depth_mm
 
 
 def _basis(factors: list[FloatArray]) -> FloatArray:

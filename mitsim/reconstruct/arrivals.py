@@ -75,7 +75,7 @@ class Arrivals:
         periods = [int(own.max()) + 1 for own in self._classes]
         self.width = min(most, _unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
         self.reach = beside + self.width / 2 + (max(OFFSETS) + _MARGIN) * self.pixel
-        self.depths = AllDepths(shots, factors, self.reach)
+        self.depths = AllDepths(shots, factors, (-self.reach, self.reach))
         self._margin = int(np.ceil(self.reach / self.pixel)) + 1
 
     @property

@@ -2,11 +2,15 @@
 
 Only what lies in the model's range counts, whatever lambda: the energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2 of
 :mod:`mitsim.reconstruct.misfit`. It has a narrow valley at the true depth, and others where dots of period k see their
-neighbours' light; so depths are first tried in steps of a pixel of parallax, and the best is refined.
+neighbours' light: parallax by k pixels moves the image by as much, and all that tells the two apart are the image's
+edges and what the sensor's own width adds to parallax. So depths are tried in steps of a pixel of parallax, every valley
+that may be the lowest is followed to its bottom, and those that chance or the model's own misfit may have made lower are
+named beside the lowest.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,38 +18,82 @@ from scipy.optimize import minimize_scalar
 
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.alldepths import RANGE, AllDepths
+from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.alldepths import AllDepths, searched
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import stated_parallax
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.misfit import CHANCE
+from mitsim.reconstruct.noise import factor_energy
+from mitsim.reconstruct.solver import Prepared, prepare
 
 _STEP = 1.0
 """Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
 _RESOLUTION = 0.01
-"""Projector pixels of parallax to which the best is refined: 0.06 mm at 400 mm and a baseline of 60 mm; chosen, below
+"""Projector pixels of parallax to which valleys are refined: 0.06 mm at 400 mm and a baseline of 60 mm; chosen, below
 the millimetre that is asked for."""
-_FEWEST = 16
+_FEWEST = 32
 """Steps at least, where there is no baseline and only the sensor's own width tells depth."""
 _LEAST_RISE = 1e-4
 """Part of the measurements' energy that a pixel of parallax must add to what is left over, or depth is not told: the
-square of 1 %, more than a cubic leaves between columns of 5 um. Uniform light stays below it, and was 5 mm off."""
+square of 1 %, which misfits that are not flagged may reach in places. Uniform light stays below it, and was 5 mm off."""
+_SIMILAR = 2.0
+"""A valley's depth below the step next to it is at most so many times that of the lowest valley; chosen, as valleys of
+one scene have one shape (measured: within 30 %)."""
+_OPPOSED = 4.0
+"""Times the unexplained energy S by which two depths must differ: r being what the wrong one does not explain of the
+light of the right one, its energy is less than that of the right one only if 2 r.d > |r|^2 for the misfit d of energy S;
+so |r|^2 < 4 S."""
+_LAMBDA = 1e-3
+"""Of the image by which the factors' noise is weighed, over the largest sigma^2: 1e-2 and 1e-4 change that by less than
+a tenth."""
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another depth [mm] that explains the measurements as well, and what it explains less, rms part of all of them."""
+
+    mm: float
+    difference: float
 
 
 @dataclass(frozen=True)
 class Depth:
-    """A depth [mm]; its standard error [mm] where it was found, and why it is not to be trusted, or nothing."""
+    """A depth whose factors are used.
+
+    Attributes
+    ----------
+    mm
+        depth.
+    error_mm
+        standard error of one that was found; where another depth explains as much, the distance to it.
+    doubt
+        why it is not to be trusted, or nothing.
+    range_mm
+        nearest and farthest depth that were tried; None where it was given.
+    alternatives
+        depths that explain the measurements as well.
+    at_end
+        whether it is an end of the range.
+    """
 
     mm: float
     error_mm: float | None = None
     doubt: str = ""
+    range_mm: tuple[float, float] | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    at_end: bool = False
 
     def __str__(self) -> str:
-        error = "" if self.error_mm is None else f" +- {self.error_mm:.1g}, by the least misfit"
-        return f"focus: {self.mm:.6g} mm{error}"
+        others = "".join(f" or {other.mm:.6g}" for other in self.alternatives)
+        found = f"focus: {self.mm:.6g}{others} mm"
+        if self.error_mm is None or self.range_mm is None:
+            return found
+        near, far = self.range_mm
+        return f"{found} +- {self.error_mm:.1g}, by the least misfit from {near:.0f} to {far:.0f} mm"
 
 
 @single_threaded_blas()
-def best_depth(shots: Capture, factors: Factors) -> Depth:
+def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
     """The one depth whose factors explain most of the measurements.
 
     Parameters
@@ -54,32 +102,16 @@ def best_depth(shots: Capture, factors: Factors) -> Depth:
         of a scene.
     factors
         of the same camera, with their parallax.
+    depth_range
+        nearest and farthest depth [mm] that are tried; None: a quarter of 1/z either way of the calibrated one.
 
     Raises
     ------
     MitsimError
-        for a calibration without parallax, or a frame that cannot be read.
+        for a calibration without parallax, or a frame that cannot be read; ArgumentError for a range that too little of
+        the sensor knows.
     """
-    parallax = stated_parallax(factors)
-    search = _Search(shots, factors)
-    pixel = 1 / search.reach
-    limit = RANGE / parallax.depth_mm
-    steps = max(int(np.ceil(limit / (_STEP * pixel))), _FEWEST)
-    shifts = np.linspace(-limit, limit, 2 * steps + 1)
-    scores = [search.left_over(shift) for shift in shifts]
-    best = int(np.argmin(scores))
-    ends = shifts[max(best - 1, 0)], shifts[min(best + 1, len(shifts) - 1)]
-    result = minimize_scalar(search.left_over, bounds=ends, method="bounded", options={"xatol": _RESOLUTION * pixel})
-    shift = float(result.x)
-    error, rise = search.certainty(shift, pixel)
-    mm = 1 / (1 / parallax.depth_mm + shift)
-    doubt = ""
-    if best in (0, len(shifts) - 1):
-        near, far = (1 / (1 / parallax.depth_mm + end) for end in (limit, -limit))
-        doubt = f"The depth that explains most is at the end of what was tried, {near:.0f} to {far:.0f} mm."
-    elif not (error < pixel and rise > _LEAST_RISE):
-        doubt = "These patterns hardly tell depth: use shifting dots."
-    return Depth(mm, float(np.hypot(error, _RESOLUTION * pixel)) * mm**2, doubt)
+    return _Search(shots, factors, depth_range).found()
 
 
 class _Search:
@@ -87,29 +119,120 @@ class _Search:
 
     Attributes
     ----------
-    reach
-        projector pixels of parallax for a change of 1/z by 1/mm, the larger of both axes.
+    pixel
+        change of 1/z [1/mm] that moves light by one projector pixel, along the axis where it moves more.
     """
 
-    def __init__(self, shots: Capture, factors: Factors) -> None:
-        self._all = AllDepths(shots, factors, RANGE / stated_parallax(factors).depth_mm)
-        self.reach = max(self._all.reach(axis) for axis in (0, 1))
+    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
+        self._ends = searched(factors, depth_range)
+        self._all = AllDepths(shots, factors, self._ends)
+        self._inverse, self._factor_noise = 1 / stated_parallax(factors).depth_mm, factors.manifest.noise
+        self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
+        self._unknowns = self._all.shape[0] * self._all.shape[1]
+
+    def found(self) -> Depth:
+        """The lowest valley, and all that may be as low."""
+        valleys = sorted(self._valleys())
+        least, shift = valleys[0]
+        error, rise = self._certainty(shift, least)
+        range_mm = self._mm(self._ends[1]), self._mm(self._ends[0])
+        mm, at_end = self._mm(shift), min(abs(shift - end) for end in self._ends) < 2 * _RESOLUTION * self.pixel
+        local = float(np.hypot(error, _RESOLUTION * self.pixel)) * mm**2
+        misfit = self._misfit(shift, least) if len(valleys) > 1 else 0.0
+        ties = [valley for valley in valleys[1:] if valley[0] - least < self._indifferent(valley[0] - least, least, misfit)]
+        others = tuple(
+            Alternative(self._mm(other), float(np.sqrt((left - least) / self._all.energy))) for left, other in ties
+        )
+        doubt = ""
+        if at_end:
+            doubt = (
+                f"The depth that explains most is at the end of the range that was tried, {range_mm[0]:.0f} to "
+                f"{range_mm[1]:.0f} mm: widen it, or calibrate nearer to the scene."
+            )
+        elif not (error < self.pixel and rise > _LEAST_RISE):
+            doubt = "These patterns hardly tell depth: use shifting dots."
+        elif others:
+            named = " and ".join(f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in others)
+            doubt = (
+                f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better than "
+                f"{named}, within chance and what no depth explains; use dots of a longer period, or give the range of "
+                "depths."
+            )
+        return Depth(mm, float(np.hypot(local, max((abs(other.mm - mm) for other in others), default=0.0))), doubt,
+                     range_mm, others, at_end)
 
     def left_over(self, shift: float) -> float:
-        """Energy of the measurements, less a constant, that factors moved by ``shift`` of 1/z leave."""
+        """Energy of the measurements that factors moved by ``shift`` of 1/z leave."""
+        return self._left_over(*self._summed(shift))
+
+    def _valleys(self) -> Iterator[tuple[float, float]]:
+        """Energy left over at the bottom of the lowest valley, and of those that may be as low; and the change of 1/z."""
+        steps = max(int(np.ceil((self._ends[1] - self._ends[0]) / (_STEP * self.pixel))), _FEWEST)
+        shifts = np.linspace(*self._ends, steps + 1)
+        scores = np.array([self.left_over(shift) for shift in shifts])
+        beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
+        lows = sorted(np.flatnonzero(scores <= beside), key=lambda index: scores[index])
+        least = below = np.inf
+        for index in lows:
+            if scores[index] - _SIMILAR * below > least:
+                break
+            left, shift = self._bottom(shifts[max(index - 1, 0)], shifts[min(index + 1, steps)])
+            if left < least:
+                half = shifts[1] - shifts[0]
+                around = [self.left_over(float(np.clip(shift + part * half, *self._ends))) for part in (-0.5, 0.5)]
+                least, below = left, max(around) - left
+            yield left, shift
+
+    def _bottom(self, first: float, last: float) -> tuple[float, float]:
+        """Least energy left over between two changes of 1/z, and where."""
+        least = minimize_scalar(
+            self.left_over, bounds=(first, last), method="bounded", options={"xatol": _RESOLUTION * self.pixel}
+        )
+        return float(least.fun), float(least.x)
+
+    def _certainty(self, shift: float, least: float) -> tuple[float, float]:
+        """Standard error of the ``shift`` that leaves ``least``, from a parabola through quarters of a pixel: what is
+        left over rises by its own mean over a datum; and how much more is left a pixel beside, over all energy."""
+        before, after = (self.left_over(shift + part * self.pixel) for part in (-0.25, 0.25))
+        rise = min(self.left_over(shift + self.pixel), self.left_over(shift - self.pixel)) - least
+        curvature = (before - 2 * least + after) / (self.pixel / 4) ** 2
+        error = float(np.sqrt(2 * self._variance(least) / curvature)) if curvature > 0 else float("inf")
+        return error, float(rise / self._all.energy)
+
+    def _variance(self, least: float) -> float:
+        return least / max(self._all.data - self._unknowns, 1)
+
+    def _indifferent(self, difference: float, least: float, misfit: float) -> float:
+        """Energy by which two depths may differ of which either is the right one.
+
+        With noise of variance v in the measurements, what of their light the wrong depth does not explain, |r|^2 = D,
+        has the variance 4 v D, and the noise that one depth explains and the other does not at most 4 v^2 n n'.
+        """
+        variance = self._variance(least)
+        chance = CHANCE * float(np.sqrt(4 * variance * difference + 4 * variance**2 * self._unknowns))
+        return max(chance, _OPPOSED * misfit)
+
+    def _misfit(self, shift: float, least: float) -> float:
+        """Energy that the depth of ``shift`` leaves beyond what noise and rendering of frames and factors leave; 0 where
+        the noise is not stated."""
+        noise, stated = self._all.noise, self._factor_noise
+        if not (noise.stated and stated):
+            return 0.0
+        prepared, sums = self._summed(shift)
+        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
+        expected = float(noise.variance.mean()) * (self._all.data - self._unknowns) + self._all.part * noise.rendering
+        return max(least - expected - factor_energy(prepared, self._all.patterns, stated, image), 0.0)
+
+    def _summed(self, shift: float) -> tuple[Prepared, Accumulator]:
         prepared = prepare(self._all.side(0, shift), self._all.side(1, shift), *self._all.patterns)
         sums = prepared.accumulator()
         for each in self._all.frames:
             sums.add(each.frame, each.row, each.column)
-        problem = prepared.problem(sums)
-        return -float(np.square(problem.projected[problem.sigma > 0]).sum())
+        return prepared, sums
 
-    def certainty(self, shift: float, pixel: float) -> tuple[float, float]:
-        """Standard error of the ``shift`` that leaves least, from a parabola through quarters of a ``pixel``: what is
-        left over rises by its own mean over a datum; and how much more is left a pixel beside, over all energy."""
-        before, least, after = (self.left_over(shift + part * pixel) for part in (-0.25, 0, 0.25))
-        rise = min(self.left_over(shift + pixel), self.left_over(shift - pixel)) - least
-        curvature = (before - 2 * least + after) / (pixel / 4) ** 2
-        variance = (self._all.energy + least) / max(self._all.data - self._all.shape[0] * self._all.shape[1], 1)
-        error = float(np.sqrt(2 * variance / curvature)) if curvature > 0 else float("inf")
-        return error, float(rise / self._all.energy)
+    def _left_over(self, prepared: Prepared, sums: Accumulator) -> float:
+        problem = prepared.problem(sums)
+        return self._all.energy - float(np.square(problem.projected[problem.sigma > 0]).sum())
+
+    def _mm(self, shift: float) -> float:
+        return 1 / (self._inverse + shift)

@@ -135,7 +135,12 @@ class DepthMap:
 
 
 @single_threaded_blas()
-def depth_map(shots: Capture, factors: Factors, lam: float | Literal["auto"] = "auto") -> DepthMap:
+def depth_map(
+    shots: Capture,
+    factors: Factors,
+    lam: float | Literal["auto"] = "auto",
+    depth_range: tuple[float, float] | None = None,
+) -> DepthMap:
     """The depth of each projector pixel, and the image with all of them in focus.
 
     Parameters
@@ -153,15 +158,15 @@ def depth_map(shots: Capture, factors: Factors, lam: float | Literal["auto"] = "
         for other patterns than dots, a rig without parallax, a calibration that does not state it, or a frame that
         cannot be read.
     """
-    return _Search(shots, factors).found(lam)
+    return _Search(shots, factors, depth_range).found(lam)
 
 
 class _Search:
     """Depths by pixel, and what they leave of all measurements."""
 
-    def __init__(self, shots: Capture, factors: Factors) -> None:
+    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
-        plane = best_depth(shots, factors)
+        plane = best_depth(shots, factors, depth_range)
         self._plane = 0.0 if plane.doubt else 1 / plane.mm - 1 / stated_parallax(factors).depth_mm
         self._arrivals = Arrivals(shots, factors, abs(self._plane))
         self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel

@@ -28,6 +28,7 @@ from mitsim.core.manifests import Parallax
 from mitsim.core.measurement import Ambient, Measurement
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.asked import check_parallax
+from mitsim.reconstruct.between import Between
 from mitsim.reconstruct.factors import Factors
 
 _NEIGHBOURS = 4
@@ -68,6 +69,10 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
             "focus", f"{depth_mm:g}: give a depth above {parallax.mask_distance_mm:g} mm, where the mask is"
         )
     shift = 1 / depth_mm - 1 / parallax.depth_mm
+    if shift == 0:
+        # The calibration's own, to the last bit.
+        shape = len(factors.left), len(factors.right)
+        return Focused(replace(factors, lacking=()), slice(0, shape[0]), slice(0, shape[1]), shape)
     left, rows = FactorOfDepths(factors.left, parallax, 0).at(shift)
     right, columns = FactorOfDepths(factors.right, parallax, 1).at(shift)
     for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
@@ -77,7 +82,6 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
                 f"{depth_mm:g}: {max(known.stop - known.start, 0)} of {size} sensor rows or columns know the shadow "
                 f"there; give a depth nearer to the calibrated {parallax.depth_mm:g} mm, or calibrate at that depth",
             )
-    # Without a copy the factors of the calibrated depth are the calibration's own, to the last bit.
     shape = len(factors.left), len(factors.right)
     return Focused(replace(factors, left=left[rows], right=right[columns], lacking=()), rows, columns, shape)
 
@@ -131,7 +135,24 @@ class FactorOfDepths:
         place = (np.arange(rows) - (rows - 1) / 2) * self._pitch
         column = np.arange(count) + (self.edges - self._parallax_pixels[2] * place[:, None]) * shift
         shadows, known = self._seen(column, np.arange(count))
-        return shadows, _whole(known)
+        return shadows * self._passed(column), _whole(known)
+
+    def _passed(self, column: FloatArray) -> FloatArray:
+        """(m, k) part of the light from each ``column`` (m, k) that the field stop lets through; 1 where the
+        calibration does not state one, or it cut into the window there already."""
+        if self.parallax.stop_tan is None:
+            return np.ones_like(column)
+        rows, count = self.factor.shape
+        pixel = 1 / (self._parallax_pixels[2])
+        first = (self.parallax.row_tan, self.parallax.column_tan)[self.axis][0]
+        place = (np.arange(rows) - (rows - 1) / 2) * self._pitch / self.parallax.depth_mm
+
+        def part(column: FloatArray) -> FloatArray:
+            tangent = first + (column + 0.5) * pixel - place[:, None]
+            return np.clip((self.parallax.stop_tan - np.abs(tangent)) / pixel + 0.5, 0.0, 1.0)
+
+        cut = part(np.broadcast_to(np.arange(count), self.factor.shape)).min() < 1
+        return np.ones_like(column) if cut else part(column)
 
     def beyond(self, margin: int) -> tuple[FloatArray, slice]:
         """(m, ``margin`` + n + ``margin``) columns at the calibrated depth, with those beside the window, which no
@@ -140,6 +161,7 @@ class FactorOfDepths:
         rows, count = self.factor.shape
         column = np.arange(-margin, count + margin)
         shadows, known = self._seen(np.broadcast_to(column, (rows, column.size)), column)
+        shadows[:, margin : margin + count] = self.factor
         return shadows, _whole(known)
 
     def _seen(
@@ -154,8 +176,12 @@ class FactorOfDepths:
         steps = np.where(column < 0, -before, np.where(column > count - 1, after, 0)).astype(np.intp)
         within, row = column - steps * step, np.arange(rows)[:, None] + steps
         known = (row >= 0) & (row < rows) & (within >= 0) & (within <= count - 1)
-        brightness = self.brightness(own) / self.brightness(within)
-        return _cubic(self.factor, np.clip(row, 0, rows - 1), within) * brightness, known
+        inside = np.clip(within, 0, count - 1)
+        return self._shadow.at(np.clip(row, 0, rows - 1), inside) * self.brightness(own), known
+
+    @cached_property
+    def _shadow(self) -> Between:
+        return Between(self.factor / self.brightness(np.arange(self.factor.shape[1])), self._step)
 
     @property
     def edges(self) -> FloatArray:

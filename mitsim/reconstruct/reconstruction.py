@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.asked import MARKOV, TIKHONOV, TV, check_asked
-from mitsim.reconstruct.causes import Evidence
+from mitsim.reconstruct.causes import Cause, Evidence
 from mitsim.reconstruct.cost import BYTES_A_NUMBER, is_kept, predicted, slab_numbers
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depthmap import DepthMap, depth_map
@@ -42,6 +42,7 @@ def reconstruct(
     method: str = TIKHONOV,
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
+    depth_range: tuple[float, float] | None = None,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -64,14 +65,17 @@ def reconstruct(
     margin
         cells round the projector's window that are solved for too, lit in every pattern, and left out of the image:
         they take up light from outside the window (:mod:`mitsim.reconstruct.margin`). By ``tikhonov``, without focus.
+    depth_range
+        nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
+        calibrated depth.
 
     Raises
     ------
     MitsimError
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
-        another lambda, method, focus or margin, or a calibration that does not state its parallax.
+        another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    asked = inputs(shots, factors, lam, method, focus, margin)
+    asked = inputs(shots, factors, lam, method, focus, margin, depth_range)
     factors.check_fit(shots)
     beside = Margin(margin) if margin else None
     if beside:
@@ -83,7 +87,7 @@ def reconstruct(
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
-    depth = _depth(shots, factors, lam, focus)
+    depth = _depth(shots, factors, lam, focus, depth_range)
     found = time.perf_counter()
     if isinstance(depth, Depth):
         of_depth = focused(factors, depth.mm)
@@ -98,6 +102,8 @@ def reconstruct(
         solution = solve_tv(prepared, frames, lam) if method == TV else prepared.solve(frames, lam)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution)
+    if misfit and misfit.flagged and isinstance(depth, Depth) and depth.at_end:
+        misfit = replace(misfit, cause=Cause.DEPTH)
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
     if isinstance(solution, Solution) and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
         solution = prepared.solve(frames, lam, explained=False)
@@ -263,34 +269,41 @@ def inputs(
     method: str,
     focus: float | str | None = None,
     margin: int = 0,
-) -> dict[str, str | float]:
+    depth_range: tuple[float, float] | None = None,
+) -> dict[str, Any]:
     """What decides an image.
 
     Parameters
     ----------
     shots, factors
         told by their fingerprints.
-    lam, method, focus, margin
-        as asked for; ArgumentError for an unknown method, or another lambda, focus or margin than reconstruct takes.
+    lam, method, focus, margin, depth_range
+        as asked for; ArgumentError for an unknown method, or another lambda, focus, margin or range than reconstruct
+        takes.
     """
-    check_asked(lam, method, focus, margin)
-    asked: dict[str, str | float] = {
+    check_asked(lam, method, focus, margin, depth_range)
+    asked: dict[str, Any] = {
         "run": shots.fingerprint,
         "calibration": factors.fingerprint,
         "lambda": lam,
         "method": method,
     }
     asked |= {} if focus is None else {"focus": focus}
+    asked |= {} if depth_range is None else {"depth_range": list(depth_range)}
     return {**asked, "margin": margin} if margin else asked
 
 
 def _depth(
-    shots: Capture, factors: Factors, lam: float | Literal["auto"], focus: float | str | None
+    shots: Capture,
+    factors: Factors,
+    lam: float | Literal["auto"],
+    focus: float | str | None,
+    depth_range: tuple[float, float] | None,
 ) -> Depth | DepthMap | None:
     if focus == "map":
-        return depth_map(shots, factors, lam)
+        return depth_map(shots, factors, lam, depth_range)
     if focus == "auto":
-        return best_depth(shots, factors)
+        return best_depth(shots, factors, depth_range)
     return None if focus is None else Depth(float(focus))
 
 
