@@ -189,11 +189,11 @@ def mosaic_options(options: Mapping[str, Any], way: str) -> dict[str, Any]:
 
     check_way(way)
     check_joint(options["lam"])
-    for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0)):
+    for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0), ("depth_range", None)):
         if options[name] != neutral:
             raise MitsimError(
-                f"--{name} {options[name]}: runs behind colour filters are solved by tikhonov at the calibrated depth; "
-                "leave it out"
+                f"--{name.replace('_', '-')} {options[name]}: runs behind colour filters are solved by tikhonov at the "
+                "calibrated depth; leave it out"
             )
     return {"lam": options["lam"], "overwrite": options["overwrite"], "way": way}
 

@@ -11,7 +11,7 @@ from mitsim.cli.colour import mosaic_options, reconstruct_lines
 from mitsim.cli.options import Json, Quiet, Variant, number_of
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 
 app = typer.Typer()
 
@@ -32,6 +32,15 @@ def reconstruct(
         typer.Option(
             help="depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
             metavar="auto|MM|map",
+        ),
+    ] = None,
+    depth_range: Annotated[
+        str | None,
+        typer.Option(
+            "--depth-range",
+            help="nearest and farthest depth that auto and map look for; 1/z within a quarter of the calibrated one's "
+            "if not given",
+            metavar="A:B",
         ),
     ] = None,
     margin: Annotated[
@@ -70,11 +79,13 @@ def reconstruct(
 
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
+    limits = None if depth_range is None else _two_depths(depth_range)
+    place: dict[str, Any] = {"focus": depth, "margin": margin, "depth_range": limits}
     output = output or run / "reconstruction"
     if not is_mosaic(run):
-        check_asked(strength, method, depth, margin)
+        check_asked(strength, method, depth, margin, limits)
     if is_coloured(run):
-        options = {"lam": strength, "method": method, "overwrite": overwrite, "focus": depth, "margin": margin}
+        options = {"lam": strength, "method": method, "overwrite": overwrite, **place}
         if is_mosaic(run):
             options = mosaic_options(options, mosaic or JOINT)
         elif mosaic is not None:
@@ -93,7 +104,6 @@ def reconstruct(
     from mitsim.study.quality import reconstruct as reconstruct_folder
 
     held = memory_from_here()
-    place: dict[str, Any] = {"focus": depth, "margin": margin}
     result = reconstruct_folder(run, calibration, output, strength, method, overwrite, **place)
     payload = {**result.summary(), "memory_bytes": memory_since(held)}
     lines = [payload["status"]]
@@ -107,3 +117,14 @@ def reconstruct(
         lines.append(str(result.reconstruction.focus))
     lines += result.reconstruction.trust
     return finish(as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
+
+
+def _two_depths(text: str) -> tuple[float, float]:
+    """The two numbers of A:B."""
+    near, colon, far = text.partition(":")
+    try:
+        if colon:
+            return float(near), float(far)
+    except ValueError:
+        pass
+    raise ArgumentError("depth_range", f"{text!r}: give the nearest and the farthest depth [mm], such as 350:450")

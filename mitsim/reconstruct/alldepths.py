@@ -64,8 +64,8 @@ class AllDepths:
                 near, far = (1 / (1 / self.parallax.depth_mm + shift) for shift in reversed(shifts))
                 raise ArgumentError(
                     "depth_range",
-                    f"{near:.4g} to {far:.4g} mm: {max(part.stop - part.start, 0)} of {len(side.factor)} sensor rows or "
-                    f"columns know the shadow at all of these depths; give a range nearer to the calibrated "
+                    f"{near:.4g} to {far:.4g} mm: {max(part.stop - part.start, 0)} of {len(side.factor)} sensor rows "
+                    f"or columns know the shadow at all of these depths; give a range nearer to the calibrated "
                     f"{self.parallax.depth_mm:g} mm",
                 )
             self._parts.append(part)
@@ -110,6 +110,10 @@ class AllDepths:
     def reach(self, axis: int) -> float:
         """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees, along an ``axis``."""
         return self._sides[axis].reach
+
+    def smoothing(self, shift: float) -> float:
+        """Variance of noise in the factors at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones."""
+        return float(np.mean([side.noise(shift) ** 2 for side in self._sides]))
 
     def _moved(self, axis: int, shift: float | FloatArray) -> FloatArray:
         return self._sides[axis].at(shift)[0][self._parts[axis]]

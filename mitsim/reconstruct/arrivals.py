@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter, median_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.alldepths import RANGE, AllDepths
+from mitsim.reconstruct.alldepths import AllDepths
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import pixels_of_parallax, stated_parallax
 from mitsim.reconstruct.solver import prepare
@@ -47,8 +47,10 @@ class Arrivals:
     ----------
     shots, factors
         under shifting dots, and of the same camera; MitsimError for other patterns, and for a rig without parallax.
+    ends
+        least and largest change of 1/z [1/mm] of the depths that are looked for.
     beside
-        change of 1/z [1/mm] of the middle of the depths that are looked for, at most.
+        change of 1/z [1/mm] of the middle of those that are told apart, at most.
 
     Attributes
     ----------
@@ -60,12 +62,12 @@ class Arrivals:
         changes of 1/z that are told apart, and the largest that is tried, either way.
     """
 
-    def __init__(self, shots: Capture, factors: Factors, beside: float) -> None:
+    def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
         self._classes = [_classes(patterns) for patterns in shots.patterns]
         parallax, counts = stated_parallax(factors), (factors.left.shape[1], factors.right.shape[1])
-        most = 2 * RANGE / parallax.depth_mm
+        self._span = ends[1] - ends[0]
         moves = [max(map(abs, pixels_of_parallax(parallax, axis, count)[:2])) for axis, count in enumerate(counts)]
-        self._open = [move * most > _LEAST_PARALLAX for move in moves]
+        self._open = [move * self._span > _LEAST_PARALLAX for move in moves]
         if not any(self._open):
             raise MitsimError(
                 f"focus map: camera and projector of calibration {factors.name} have no baseline, so depth moves no "
@@ -73,15 +75,18 @@ class Arrivals:
             )
         self.pixel = 1 / max(moves)
         periods = [int(own.max()) + 1 for own in self._classes]
-        self.width = min(most, _unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
+        self.width = min(self._span, _unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
         self.reach = beside + self.width / 2 + (max(OFFSETS) + _MARGIN) * self.pixel
+        # All depths moved by a whole period are tried as well.
+        self.reach += self.width if self.limited else 0.0
         self.depths = AllDepths(shots, factors, (-self.reach, self.reach))
-        self._margin = int(np.ceil(self.reach / self.pixel)) + 1
+        reached = self.reach - (self.width if self.limited else 0.0)
+        self._margin = int(np.ceil(reached / self.pixel)) + 1
 
     @property
     def limited(self) -> bool:
         """Whether the dots' period limits the range of depths."""
-        return self.width < 2 * RANGE / self.depths.parallax.depth_mm
+        return self.width < self._span
 
     def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
         """Changes of 1/z by pixel where most light arrives, and how much more than elsewhere.

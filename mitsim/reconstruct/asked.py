@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import ArgumentError, MitsimError
 
@@ -46,7 +46,7 @@ def check_asked(
         raise ArgumentError("margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus")
 
 
-def _check_range(depth_range: object, focus: float | str | None) -> None:
+def _check_range(depth_range: Any, focus: float | str | None) -> None:
     """ArgumentError for a ``depth_range`` that is none, or where no depth is looked for."""
     two = isinstance(depth_range, (tuple, list)) and len(depth_range) == 2
     real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in depth_range)

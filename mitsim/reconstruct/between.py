@@ -17,14 +17,14 @@ from scipy.linalg import solveh_banded
 from mitsim.core.arrays import FloatArray
 
 _ROWS = 5
-"""Sensor rows to either side whose numbers a row is given: of 2, 3 and 5 the most leave least, 1.9e-3, 1.7e-3, 1.5e-3 of
-columns of 15 um with noise of 2e-3 (a polynomial through their own row: 2.8e-2); more are another shadow behind masks
-with thickness."""
+"""Sensor rows to either side whose numbers a row is given: of 2, 3 and 5 the most leave least, 1.9e-3, 1.7e-3, 1.5e-3
+of columns of 15 um with noise of 2e-3 (a polynomial through their own row: 2.8e-2); more are another shadow behind
+masks with thickness."""
 _KNOTS = 4
 """Knots a column: with 2, columns of 15 um are off by 2.5e-3 with noise of 2e-3 instead of 1.5e-3."""
 _STIFFNESS = 1e-2
-"""Weight of the squared third differences of neighbouring coefficients over that of a number's error: with 1e-3 noise of
-2e-3 leaves 1.7e-3 instead of 1.5e-3, without noise 1.0e-3 instead of 1.2e-3."""
+"""Weight of the squared third differences of neighbouring coefficients over that of a number's error: with 1e-3 noise
+of 2e-3 leaves 1.7e-3 instead of 1.5e-3, without noise 1.0e-3 instead of 1.2e-3."""
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 """Third difference of four neighbours."""
 

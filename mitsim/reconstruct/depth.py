@@ -3,9 +3,9 @@
 Only what lies in the model's range counts, whatever lambda: the energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2 of
 :mod:`mitsim.reconstruct.misfit`. It has a narrow valley at the true depth, and others where dots of period k see their
 neighbours' light: parallax by k pixels moves the image by as much, and all that tells the two apart are the image's
-edges and what the sensor's own width adds to parallax. So depths are tried in steps of a pixel of parallax, every valley
-that may be the lowest is followed to its bottom, and those that chance or the model's own misfit may have made lower are
-named beside the lowest.
+edges and what the sensor's own width adds to parallax. So depths are tried in steps of a pixel of parallax, every
+valley that may be the lowest is followed to its bottom, and those that chance or the model's own misfit may have made
+lower are named beside the lowest.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _FEWEST = 32
 """Steps at least, where there is no baseline and only the sensor's own width tells depth."""
 _LEAST_RISE = 1e-4
 """Part of the measurements' energy that a pixel of parallax must add to what is left over, or depth is not told: the
-square of 1 %, which misfits that are not flagged may reach in places. Uniform light stays below it, and was 5 mm off."""
+square of 1 %, above what fitting scenes leave (3.5e-3). Uniform light stays below it, and was 5 mm off."""
 _SIMILAR = 2.0
 """A valley's depth below the step next to it is at most so many times that of the lowest valley; chosen, as valleys of
 one scene have one shape (measured: within 30 %)."""
 _OPPOSED = 4.0
 """Times the unexplained energy S by which two depths must differ: r being what the wrong one does not explain of the
-light of the right one, its energy is less than that of the right one only if 2 r.d > |r|^2 for the misfit d of energy S;
-so |r|^2 < 4 S."""
+light of the right one, less is left of it than of the right one only if 2 r.d > |r|^2 for the misfit d of energy S; so
+|r|^2 < 4 S."""
 _LAMBDA = 1e-3
 """Of the image by which the factors' noise is weighed, over the largest sigma^2: 1e-2 and 1e-4 change that by less than
 a tenth."""
@@ -92,6 +92,24 @@ class Depth:
         return f"{found} +- {self.error_mm:.1g}, by the least misfit from {near:.0f} to {far:.0f} mm"
 
 
+def by_chance(difference: float, variance: float, unknowns: int) -> float:
+    """Energy by which noise may make what two models leave over differ.
+
+    The light that the wrong one does not explain, of energy D, meets noise: 4 v D. The noise that one of them takes up
+    and the other does not has the variance 4 v^2 times the unknowns, or less.
+
+    Parameters
+    ----------
+    difference
+        D that was found.
+    variance
+        v of a datum.
+    unknowns
+        of each model.
+    """
+    return CHANCE * float(np.sqrt(4 * variance * max(difference, 0.0) + 4 * variance**2 * unknowns))
+
+
 @single_threaded_blas()
 def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
     """The one depth whose factors explain most of the measurements.
@@ -139,7 +157,9 @@ class _Search:
         mm, at_end = self._mm(shift), min(abs(shift - end) for end in self._ends) < 2 * _RESOLUTION * self.pixel
         local = float(np.hypot(error, _RESOLUTION * self.pixel)) * mm**2
         misfit = self._misfit(shift, least) if len(valleys) > 1 else 0.0
-        ties = [valley for valley in valleys[1:] if valley[0] - least < self._indifferent(valley[0] - least, least, misfit)]
+        ties = [
+            valley for valley in valleys[1:] if valley[0] - least < self._indifferent(valley[0] - least, least, misfit)
+        ]
         others = tuple(
             Alternative(self._mm(other), float(np.sqrt((left - least) / self._all.energy))) for left, other in ties
         )
@@ -154,24 +174,32 @@ class _Search:
         elif others:
             named = " and ".join(f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in others)
             doubt = (
-                f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better than "
-                f"{named}, within chance and what no depth explains; use dots of a longer period, or give the range of "
-                "depths."
+                f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better "
+                f"than {named}, within chance and what no depth explains; use dots of a longer period, or give the "
+                "range of depths."
             )
-        return Depth(mm, float(np.hypot(local, max((abs(other.mm - mm) for other in others), default=0.0))), doubt,
-                     range_mm, others, at_end)
+        return Depth(
+            mm,
+            float(np.hypot(local, max((abs(other.mm - mm) for other in others), default=0.0))),
+            doubt,
+            range_mm,
+            others,
+            at_end,
+        )
 
     def left_over(self, shift: float) -> float:
         """Energy of the measurements that factors moved by ``shift`` of 1/z leave."""
-        return self._left_over(*self._summed(shift))
+        prepared, sums = self._summed(shift)
+        problem = prepared.problem(sums)
+        return self._all.energy - float(np.square(problem.projected[problem.sigma > 0]).sum())
 
     def _valleys(self) -> Iterator[tuple[float, float]]:
-        """Energy left over at the bottom of the lowest valley, and of those that may be as low; and the change of 1/z."""
+        """Energy left over at the bottom of the lowest valley and of those that may be as low, and changes of 1/z."""
         steps = max(int(np.ceil((self._ends[1] - self._ends[0]) / (_STEP * self.pixel))), _FEWEST)
         shifts = np.linspace(*self._ends, steps + 1)
         scores = np.array([self.left_over(shift) for shift in shifts])
         beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
-        lows = sorted(np.flatnonzero(scores <= beside), key=lambda index: scores[index])
+        lows = sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index]))
         least = below = np.inf
         for index in lows:
             if scores[index] - _SIMILAR * below > least:
@@ -200,28 +228,24 @@ class _Search:
         return error, float(rise / self._all.energy)
 
     def _variance(self, least: float) -> float:
-        return least / max(self._all.data - self._unknowns, 1)
+        """Of a datum, by what the best depth leaves."""
+        return float(least / max(self._all.data - self._unknowns, 1))
 
     def _indifferent(self, difference: float, least: float, misfit: float) -> float:
-        """Energy by which two depths may differ of which either is the right one.
-
-        With noise of variance v in the measurements, what of their light the wrong depth does not explain, |r|^2 = D,
-        has the variance 4 v D, and the noise that one depth explains and the other does not at most 4 v^2 n n'.
-        """
-        variance = self._variance(least)
-        chance = CHANCE * float(np.sqrt(4 * variance * difference + 4 * variance**2 * self._unknowns))
-        return max(chance, _OPPOSED * misfit)
+        """Energy by which two depths may differ of which either is the right one."""
+        return max(by_chance(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
 
     def _misfit(self, shift: float, least: float) -> float:
-        """Energy that the depth of ``shift`` leaves beyond what noise and rendering of frames and factors leave; 0 where
-        the noise is not stated."""
+        """Energy that the depth of ``shift`` leaves beyond what noise of frames and factors and rendering leave; 0
+        where the noise is not stated."""
         noise, stated = self._all.noise, self._factor_noise
         if not (noise.stated and stated):
             return 0.0
         prepared, sums = self._summed(shift)
         image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
         expected = float(noise.variance.mean()) * (self._all.data - self._unknowns) + self._all.part * noise.rendering
-        return max(least - expected - factor_energy(prepared, self._all.patterns, stated, image), 0.0)
+        of_factors = self._all.smoothing(shift) * factor_energy(prepared, self._all.patterns, stated, image)
+        return float(max(least - expected - of_factors, 0.0))
 
     def _summed(self, shift: float) -> tuple[Prepared, Accumulator]:
         prepared = prepare(self._all.side(0, shift), self._all.side(1, shift), *self._all.patterns)
@@ -229,10 +253,6 @@ class _Search:
         for each in self._all.frames:
             sums.add(each.frame, each.row, each.column)
         return prepared, sums
-
-    def _left_over(self, prepared: Prepared, sums: Accumulator) -> float:
-        problem = prepared.problem(sums)
-        return self._all.energy - float(np.square(problem.projected[problem.sigma > 0]).sum())
 
     def _mm(self, shift: float) -> float:
         return 1 / (self._inverse + shift)

@@ -22,8 +22,9 @@ from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimu
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
+from mitsim.reconstruct.alldepths import searched
 from mitsim.reconstruct.arrivals import LAMBDAS, MEDIAN, OFFSETS, STEP, Arrivals
-from mitsim.reconstruct.depth import best_depth
+from mitsim.reconstruct.depth import Alternative, best_depth, by_chance
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import stated_parallax
 from mitsim.reconstruct.misfit import Balance, Misfit
@@ -69,6 +70,10 @@ class DepthMap:
         of the sensor, which these measurements are of.
     doubt
         why it is not to be trusted, or nothing.
+    range_mm
+        nearest and farthest depth that were looked for.
+    smoothing
+        variance of the factors' noise at these depths, over that of the calibrated ones.
     """
 
     image: FloatArray
@@ -80,6 +85,8 @@ class DepthMap:
     data: int
     part: float
     doubt: str = ""
+    range_mm: tuple[float, float] | None = None
+    smoothing: float = 1.0
 
     def __str__(self) -> str:
         if self.doubt:
@@ -99,6 +106,11 @@ class DepthMap:
         return Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
 
     @property
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """None: depths by pixel that may be others are not told at all."""
+        return ()
+
+    @property
     def told(self) -> np.ndarray:
         """(n, n') whether each depth is told."""
         return np.asarray(self.confidence >= _TOLD)
@@ -111,13 +123,13 @@ class DepthMap:
         noise
             of all measurements.
         factor_energy
-            what noisy factors add to all frames; None: not stated.
+            what noise of the calibrated factors adds to all frames; None: not stated.
         print_energy
             what print within a pixel may add to them.
         """
         spare = 1 - 2 * self.image.size / self.data  # a reflectance and a depth for each pixel
         variance = float(noise.variance.mean()) * self.data * spare
-        expected = variance + self.part * (noise.rendering + (factor_energy or 0.0))
+        expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
         whole = self.left_over, self.energy, expected, self.data / noise.variance.size
         residual, energy, allowed, pixels = (np.array([[value]]) for value in whole)
         balance = Balance(residual, energy, allowed, pixels, factor_energy is not None)
@@ -151,6 +163,8 @@ def depth_map(
         of the same camera, with their parallax.
     lam
         of the image; ``auto``: what its own residual asks for.
+    depth_range
+        nearest and farthest depth [mm] that are looked for; None: a quarter of 1/z either way of the calibrated one.
 
     Raises
     ------
@@ -167,18 +181,21 @@ class _Search:
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
         plane = best_depth(shots, factors, depth_range)
-        self._plane = 0.0 if plane.doubt else 1 / plane.mm - 1 / stated_parallax(factors).depth_mm
-        self._arrivals = Arrivals(shots, factors, abs(self._plane))
+        self._ends = searched(factors, depth_range)
+        self._middle = (self._ends[0] + self._ends[1]) / 2
+        self._plane = self._middle if plane.doubt else 1 / plane.mm - 1 / stated_parallax(factors).depth_mm
+        self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._plane), abs(self._middle)))
         self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
         self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
 
     def found(self, lam: float | Literal["auto"]) -> DepthMap:
         """The depths that explain most, and the image at ``lam``; in doubt the calibrated one everywhere."""
-        tried = {(look, 0.0): self._left_over(self._arrivals.most(look, 0.0)[0]) for look in LAMBDAS}
+        middle = self._middle / self.pixel
+        tried = {(look, middle): self._left_over(self._arrivals.most(look, middle)[0]) for look in LAMBDAS}
         if self._arrivals.limited:
             look = min(tried, key=lambda start: tried[start])[0]
             plane = self._plane / self.pixel
-            offsets = {*OFFSETS, plane, *(plane + offset for offset in OFFSETS)}
+            offsets = {start + offset for start in (middle, plane) for offset in (0.0, *OFFSETS)} - {middle}
             tried |= {(look, offset): self._left_over(self._arrivals.most(look, offset)[0]) for offset in offsets}
         start = min(tried, key=lambda start: tried[start])
         rivals = [other for other, left_over in tried.items() if left_over < _RIVAL * tried[start]]
@@ -191,7 +208,10 @@ class _Search:
         solved = self._pixels.final(shift, solved) if lam == "auto" else solved
         z = 1 / (1 / self._all.parallax.depth_mm + shift)
         known = self._all.energy, self._all.data, self._all.part
-        return DepthMap(solved.image, z, confidence, solved.lam, solved.left_over, *known, doubt)
+        inverse = 1 / self._all.parallax.depth_mm
+        range_mm = 1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])
+        smoothing = self._all.smoothing(float(np.median(shift)))
+        return DepthMap(solved.image, z, confidence, solved.lam, solved.left_over, *known, doubt, range_mm, smoothing)
 
     def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
         """Why depths are not to be trusted, or nothing.
@@ -216,6 +236,23 @@ class _Search:
                 f"{self.width / self.pixel:.0f} apart: depths may be off by a whole period, so the image is that of "
                 "the calibrated one. Use dots of a longer period along the baseline, such as dots:7x16."
             )
+        return self._periods_away(shift, told) if self._arrivals.limited else ""
+
+    def _periods_away(self, shift: FloatArray, told: np.ndarray) -> str:
+        """Doubt where all depths, moved by a whole period of the dots, explain as much, or nothing."""
+        found = self._pixels.solve(shift)
+        median = float(np.median(shift[told]))
+        for move in (-self.width, self.width):
+            if self._ends[0] <= median + move <= self._ends[1]:
+                more = self._left_over(shift + move) - found.left_over
+                if more < by_chance(more, self._pixels.variance(found), 2 * shift.size):
+                    inverse = 1 / self._all.parallax.depth_mm
+                    return (
+                        "Depths may be off by a whole period of the dots: with a median of "
+                        f"{1 / (inverse + median):.4g} or {1 / (inverse + median + move):.4g} mm they explain as much, "
+                        "so the image is that of the calibrated one. Use dots of a longer period along the baseline, "
+                        "or give the range of depths."
+                    )
         return ""
 
     def _left_over(self, shift: FloatArray) -> float:

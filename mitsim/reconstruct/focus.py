@@ -38,6 +38,8 @@ _DEGREE = 4
 """Of the polynomial that brightness over columns is: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
 """Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
+_HIDDEN = 0.5
+"""Part of a pixel's light from which it counts as hidden: chosen, as more of it is then missing than seen."""
 LEAST_PART = 0.5
 """Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
 
@@ -45,12 +47,13 @@ LEAST_PART = 0.5
 @dataclass(frozen=True, eq=False)
 class Focused:
     """``factors`` of a depth, on the sensor's ``rows`` and ``columns`` where these are known; ``sensor`` is the whole's
-    shape."""
+    shape, and ``hidden`` the part of the scene's pixels that the field stop takes most of the light of."""
 
     factors: Factors
     rows: slice
     columns: slice
     sensor: tuple[int, int]
+    hidden: float = 0.0
 
     def of(self, shots: Capture) -> Capture:
         """What that part of the sensor saw of ``shots``."""
@@ -73,8 +76,8 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
         # The calibration's own, to the last bit.
         shape = len(factors.left), len(factors.right)
         return Focused(replace(factors, lacking=()), slice(0, shape[0]), slice(0, shape[1]), shape)
-    left, rows = FactorOfDepths(factors.left, parallax, 0).at(shift)
-    right, columns = FactorOfDepths(factors.right, parallax, 1).at(shift)
+    sides = [FactorOfDepths(side, parallax, axis) for axis, side in enumerate((factors.left, factors.right))]
+    (left, rows), (right, columns) = (side.at(shift) for side in sides)
     for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
         if known.stop - known.start < LEAST_PART * size:
             raise ArgumentError(
@@ -82,8 +85,15 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
                 f"{depth_mm:g}: {max(known.stop - known.start, 0)} of {size} sensor rows or columns know the shadow "
                 f"there; give a depth nearer to the calibrated {parallax.depth_mm:g} mm, or calibrate at that depth",
             )
-    shape = len(factors.left), len(factors.right)
-    return Focused(replace(factors, left=left[rows], right=right[columns], lacking=()), rows, columns, shape)
+    manifest, noise = factors.manifest, factors.manifest.noise
+    if noise:
+        less = {
+            name: getattr(noise, name) * side.noise(shift) for name, side in zip(("left", "right"), sides, strict=True)
+        }
+        manifest = manifest.model_copy(update={"noise": noise.model_copy(update=less)})
+    moved = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
+    seen = [float((side.hidden(shift) < _HIDDEN).mean()) for side in sides]
+    return Focused(moved, rows, columns, (len(factors.left), len(factors.right)), 1 - seen[0] * seen[1])
 
 
 def stated_parallax(factors: Factors) -> Parallax:
@@ -131,28 +141,42 @@ class FactorOfDepths:
         shift
             1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
         """
-        rows, count = self.factor.shape
-        place = (np.arange(rows) - (rows - 1) / 2) * self._pitch
-        column = np.arange(count) + (self.edges - self._parallax_pixels[2] * place[:, None]) * shift
-        shadows, known = self._seen(column, np.arange(count))
-        return shadows * self._passed(column), _whole(known)
+        column = self._moved(shift)
+        shadows, known = self._seen(column, np.arange(self.factor.shape[1]))
+        passed = self._passed(column)
+        mean = passed.mean(axis=0)
+        # The image stays light relative to the board's, as the sensor as a whole sees it.
+        return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
+
+    def hidden(self, shift: float) -> FloatArray:
+        """(n,) part of each column's light that the field stop keeps from the sensor at another depth: 1/z changed by
+        ``shift`` [1/mm]; 0 where the calibration states no stop, or its own window was cut."""
+        return np.asarray(1 - self._passed(self._moved(shift)).mean(axis=0))
+
+    def noise(self, shift: float) -> float:
+        """Standard deviation of noise in columns at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones:
+        less, as each number is fitted to many."""
+        white = np.random.default_rng(0).standard_normal(self.factor.shape)
+        row, within, _ = self._sources(self._moved(shift))
+        return float(np.sqrt(np.mean(np.square(Between(white, self._step).at(row, within)))))
+
+    def _moved(self, shift: float | FloatArray) -> FloatArray:
+        """(m, n) column that each sensor row saw at the calibrated depth where it now sees each scene pixel."""
+        return np.arange(self.factor.shape[1]) + (self.edges - self._parallax_pixels[2] * self._place[:, None]) * shift
 
     def _passed(self, column: FloatArray) -> FloatArray:
-        """(m, k) part of the light from each ``column`` (m, k) that the field stop lets through; 1 where the
-        calibration does not state one, or it cut into the window there already."""
-        if self.parallax.stop_tan is None:
+        """(m, k) part of the light from each ``column`` (m, k) that the field stop lets through."""
+        stop = self.parallax.stop_tan
+        if stop is None:
             return np.ones_like(column)
-        rows, count = self.factor.shape
-        pixel = 1 / (self._parallax_pixels[2])
-        first = (self.parallax.row_tan, self.parallax.column_tan)[self.axis][0]
-        place = (np.arange(rows) - (rows - 1) / 2) * self._pitch / self.parallax.depth_mm
-
-        def part(column: FloatArray) -> FloatArray:
-            tangent = first + (column + 0.5) * pixel - place[:, None]
-            return np.clip((self.parallax.stop_tan - np.abs(tangent)) / pixel + 0.5, 0.0, 1.0)
-
-        cut = part(np.broadcast_to(np.arange(count), self.factor.shape)).min() < 1
-        return np.ones_like(column) if cut else part(column)
+        pixel = 1 / self._parallax_pixels[2]
+        first = (self.parallax.row_tan if self.axis == 0 else self.parallax.column_tan)[0]
+        ends = first + (np.array([0.5, self.factor.shape[1] - 0.5])) * pixel
+        from_edge = np.abs(self._place).max() / self.parallax.depth_mm
+        if np.abs(ends).max() + from_edge + pixel / 2 > stop:
+            return np.ones_like(column)  # the calibrated columns are cut themselves, nobody knows how far
+        tangent = first + (column + 0.5) * pixel - self._place[:, None] / self.parallax.depth_mm
+        return np.clip((stop - np.abs(tangent)) / pixel + 0.5, 0.0, 1.0)
 
     def beyond(self, margin: int) -> tuple[FloatArray, slice]:
         """(m, ``margin`` + n + ``margin``) columns at the calibrated depth, with those beside the window, which no
@@ -169,6 +193,13 @@ class FactorOfDepths:
     ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Shadows (m, k) of places between columns, also beside the window, with the brightness of the columns ``own``
         (k,); and whether the sensor sees them."""
+        row, within, known = self._sources(column)
+        return self._shadow.at(row, within) * self.brightness(own), known
+
+    def _sources(
+        self, column: npt.NDArray[np.floating | np.integer]
+    ) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.bool_]]:
+        """Rows and columns of the factor that saw the shadow of places between columns (m, k), and whether any did."""
         rows, count = self.factor.shape
         # Columns that one sensor pixel's step along the sensor makes up for.
         step = self._step
@@ -176,8 +207,7 @@ class FactorOfDepths:
         steps = np.where(column < 0, -before, np.where(column > count - 1, after, 0)).astype(np.intp)
         within, row = column - steps * step, np.arange(rows)[:, None] + steps
         known = (row >= 0) & (row < rows) & (within >= 0) & (within <= count - 1)
-        inside = np.clip(within, 0, count - 1)
-        return self._shadow.at(np.clip(row, 0, rows - 1), inside) * self.brightness(own), known
+        return np.clip(row, 0, rows - 1), np.clip(within, 0.0, count - 1.0), known
 
     @cached_property
     def _shadow(self) -> Between:
@@ -232,6 +262,12 @@ class FactorOfDepths:
         parallax = self.parallax
         inverse = 1 / parallax.mask_distance_mm - 1 / parallax.depth_mm
         return self._pitch * inverse * self._parallax_pixels[2]
+
+    @cached_property
+    def _place(self) -> FloatArray:
+        """(m,) place of each sensor row, from their middle [mm]."""
+        rows = len(self.factor)
+        return np.asarray((np.arange(rows) - (rows - 1) / 2) * self._pitch)
 
     @property
     def _pitch(self) -> float:

@@ -88,10 +88,14 @@ def reconstruct(
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
     depth = _depth(shots, factors, lam, focus, depth_range)
+    flags = (depth.doubt,) if depth and depth.doubt else ()
     found = time.perf_counter()
     if isinstance(depth, Depth):
         of_depth = focused(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
+        if of_depth.hidden:
+            hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
+            flags = (*flags, f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
     data = accumulated(shots, factors, method)
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
@@ -110,7 +114,7 @@ def reconstruct(
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status
-    flags = (*status.flags, *((depth.doubt,) if depth and depth.doubt else ()), *_flags(shots, factors))
+    flags = (*status.flags, *flags, *_flags(shots, factors))
     image = solution.image
     if beside:
         image = beside.inside(image)

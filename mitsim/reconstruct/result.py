@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,7 @@ class Reconstruction:
     uncertainties: Uncertainty | None
     status: Status
     seconds: dict[str, float]
-    inputs: dict[str, str | float]
+    inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None
     predicted: Predicted | None = None
 
@@ -118,6 +118,8 @@ class Reconstruction:
             "residual": self.residual,
             "focus_mm": self.focus.mm if isinstance(self.focus, Depth) else None,
             "focus_error_mm": self.focus.error_mm if isinstance(self.focus, Depth) else None,
+            "focus_range_mm": self.focus.range_mm if self.focus else None,
+            "focus_alternatives": [asdict(other) for other in self.focus.alternatives] if self.focus else None,
             "depths": self.depths.summary() if self.depths else None,
             "misfit": self.misfit and self.misfit.summary(),
             **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),

@@ -54,7 +54,7 @@ def reconstruct(
     overwrite
         whether an earlier image of other inputs may be replaced.
     **place
-        ``focus`` and ``margin``, as there.
+        ``focus``, ``margin`` and ``depth_range``, as there.
     """
     started = time.perf_counter()
     shots, factors = load_run(run), load_calibration(calibration)

@@ -76,7 +76,7 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> 
     (Planted: light looked for on the other side; the derivative's sign; edges left as pooled, 12 dB.)"""
     run, factors, true = shots(cards(), patterns, baseline), calibrated(baseline), 1 / cards() - 1 / 400
     found, one = depth_map(run, factors), reconstruct(run, factors)
-    depths = AllDepths(run, factors, 4e-4)
+    depths = AllDepths(run, factors, (-4e-4, 4e-4))
     known = PixelDepths(depths, 4e-4, 5e-6)
     ideal = known.final(true, known.solve(true)).image
     error = np.abs(found.mm - cards())
@@ -147,7 +147,7 @@ def test_the_step_is_the_derivative() -> None:
 
     (Planted: one half of the derivative of u v^T.)"""
     run, factors = shots(np.full((N, N), 400.0), "dots:4x8"), calibrated()
-    depths = AllDepths(run, factors, 4e-4)
+    depths = AllDepths(run, factors, (-4e-4, 4e-4))
     model, pixel = PixelDepths(depths, 4e-4, 5e-6), 0.3 / N / 60
     bright = PRINT > 0.5
     # Columns between those that are computed, 5e-6 apart, and their slopes against differences over a tenth of that.
