@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter, median_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.alldepths import AllDepths
 from mitsim.reconstruct.factors import Factors
@@ -74,7 +75,7 @@ class Arrivals:
                 "light; give a depth, or auto"
             )
         self.pixel = 1 / max(moves)
-        periods = [int(own.max()) + 1 for own in self._classes]
+        periods = [own.shape[1] for own in shots.patterns]
         self.width = min(self._span, _unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
         self.reach = beside + self.width / 2 + (max(OFFSETS) + _MARGIN) * self.pixel
         # All depths moved by a whole period are tried as well.
@@ -155,10 +156,34 @@ class Arrivals:
         return found
 
 
+def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:
+    """Change of 1/z [1/mm] that moves the light of dots onto the place of others; inf for other patterns, and where
+    depth moves no light.
+
+    Parameters
+    ----------
+    patterns
+        P_L (n, K) and P_R (n', K').
+    parallax
+        of the calibration.
+    """
+    ends = [pixels_of_parallax(parallax, axis, len(lit))[:2] for axis, lit in enumerate(patterns)]
+    moves = np.array([max(map(abs, each)) for each in ends])
+    if not (moves.any() and all(_dotted(lit) for lit in patterns)):
+        return np.inf
+    pixel = 1 / moves.max()
+    return float(_unambiguous(moves * pixel, [lit.shape[1] for lit in patterns]) * pixel)
+
+
+def _dotted(patterns: FloatArray) -> bool:
+    """Whether each pixel is lit by one of the (n, K) ``patterns``, as dots light it."""
+    values = np.sort(patterns, axis=1)
+    return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
+
+
 def _classes(patterns: FloatArray) -> np.ndarray:
     """(n,) which of the (n, K) ``patterns`` lights each pixel; MitsimError where it is not one of them, as of dots."""
-    values = np.sort(patterns, axis=1)
-    if values[:, :-1].any() or (values[:, -1] != 1).any():
+    if not _dotted(patterns):
         raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
     return np.asarray(patterns.argmax(axis=1))
 

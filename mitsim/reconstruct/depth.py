@@ -20,6 +20,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.alldepths import AllDepths, searched
+from mitsim.reconstruct.arrivals import parallax_period
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import stated_parallax
 from mitsim.reconstruct.misfit import CHANCE
@@ -33,9 +34,9 @@ _RESOLUTION = 0.01
 the millimetre that is asked for."""
 _FEWEST = 32
 """Steps at least, where there is no baseline and only the sensor's own width tells depth."""
-_LEAST_RISE = 1e-4
-"""Part of the measurements' energy that a pixel of parallax must add to what is left over, or depth is not told: the
-square of 1 %, above what fitting scenes leave (3.5e-3). Uniform light stays below it, and was 5 mm off."""
+_LEAST_RISE = 2e-5
+"""Part of the measurements' energy that a pixel of parallax must add to what is left over, or depth is not told.
+Uniform light stays below it (5e-8 to 2e-5), and there print within pixels moves depth by up to 12 standard errors."""
 _SIMILAR = 2.0
 """A valley's depth below the step next to it is at most so many times that of the lowest valley; chosen, as valleys of
 one scene have one shape (measured: within 30 %)."""
@@ -73,7 +74,7 @@ class Depth:
     alternatives
         depths that explain the measurements as well.
     at_end
-        whether it is an end of the range.
+        whether it is an end of the range, or beyond it by a period of the dots.
     """
 
     mm: float
@@ -142,8 +143,14 @@ class _Search:
     """
 
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
-        self._ends = searched(factors, depth_range)
-        self._all = AllDepths(shots, factors, self._ends)
+        self._ends, self._period = searched(factors, depth_range), np.inf
+        beyond = 0.0
+        if depth_range is None:
+            # A surface beyond the range, but for a period, is within it: only where a range is given that is excluded.
+            self._period = parallax_period(shots.patterns, stated_parallax(factors))
+            beyond = min(self._period, self._ends[1])
+        self._tried = self._ends[0] - beyond, self._ends[1] + beyond
+        self._all = AllDepths(shots, factors, self._tried)
         self._inverse, self._factor_noise = 1 / stated_parallax(factors).depth_mm, factors.manifest.noise
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
         self._unknowns = self._all.shape[0] * self._all.shape[1]
@@ -151,12 +158,14 @@ class _Search:
     def found(self) -> Depth:
         """The lowest valley, and all that may be as low."""
         valleys = sorted(self._valleys())
+        valleys = sorted([*valleys, *self._beyond(valleys[0][1])])
         least, shift = valleys[0]
         error, rise = self._certainty(shift, least)
         range_mm = self._mm(self._ends[1]), self._mm(self._ends[0])
-        mm, at_end = self._mm(shift), min(abs(shift - end) for end in self._ends) < 2 * _RESOLUTION * self.pixel
+        margin = 2 * _RESOLUTION * self.pixel
+        mm, at_end = self._mm(shift), not self._ends[0] + margin < shift < self._ends[1] - margin
         local = float(np.hypot(error, _RESOLUTION * self.pixel)) * mm**2
-        misfit = self._misfit(shift, least) if len(valleys) > 1 else 0.0
+        misfit = self._misfit(shift, least)
         ties = [
             valley for valley in valleys[1:] if valley[0] - least < self._indifferent(valley[0] - least, least, misfit)
         ]
@@ -166,10 +175,13 @@ class _Search:
         doubt = ""
         if at_end:
             doubt = (
-                f"The depth that explains most is at the end of the range that was tried, {range_mm[0]:.0f} to "
-                f"{range_mm[1]:.0f} mm: widen it, or calibrate nearer to the scene."
+                f"End of range: {mm:.1f} mm, which explains most, is not within the depths that were tried, "
+                f"{range_mm[0]:.0f} to {range_mm[1]:.0f} mm; give another range of depths, or calibrate nearer to the "
+                "scene."
             )
-        elif not (error < self.pixel and rise > _LEAST_RISE):
+        elif not (
+            error < self.pixel and rise > max(self._indifferent(rise, least, misfit), _LEAST_RISE * self._all.energy)
+        ):
             doubt = "These patterns hardly tell depth: use shifting dots."
         elif others:
             named = " and ".join(f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in others)
@@ -211,6 +223,17 @@ class _Search:
                 least, below = left, max(around) - left
             yield left, shift
 
+    def _beyond(self, shift: float) -> Iterator[tuple[float, float]]:
+        """The same of depths beyond the range that are a period of the dots from the best ``shift`` within it, or
+        several."""
+        if np.isfinite(self._period):
+            for end, step in zip(self._tried, (-self._period, self._period), strict=True):
+                away = shift + step
+                while self._ends[0] <= away <= self._ends[1]:
+                    away += step
+                if abs(away) < abs(end):
+                    yield self._bottom(away - _STEP * self.pixel, away + _STEP * self.pixel)
+
     def _bottom(self, first: float, last: float) -> tuple[float, float]:
         """Least energy left over between two changes of 1/z, and where."""
         least = minimize_scalar(
@@ -220,12 +243,12 @@ class _Search:
 
     def _certainty(self, shift: float, least: float) -> tuple[float, float]:
         """Standard error of the ``shift`` that leaves ``least``, from a parabola through quarters of a pixel: what is
-        left over rises by its own mean over a datum; and how much more is left a pixel beside, over all energy."""
+        left over rises by its own mean over a datum; and how much more is left a pixel beside."""
         before, after = (self.left_over(shift + part * self.pixel) for part in (-0.25, 0.25))
         rise = min(self.left_over(shift + self.pixel), self.left_over(shift - self.pixel)) - least
         curvature = (before - 2 * least + after) / (self.pixel / 4) ** 2
         error = float(np.sqrt(2 * self._variance(least) / curvature)) if curvature > 0 else float("inf")
-        return error, float(rise / self._all.energy)
+        return error, float(rise)
 
     def _variance(self, least: float) -> float:
         """Of a datum, by what the best depth leaves."""

@@ -181,7 +181,7 @@ class _Search:
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
         plane = best_depth(shots, factors, depth_range)
-        self._ends = searched(factors, depth_range)
+        self._ends, self._given = searched(factors, depth_range), depth_range is not None
         self._middle = (self._ends[0] + self._ends[1]) / 2
         self._plane = self._middle if plane.doubt else 1 / plane.mm - 1 / stated_parallax(factors).depth_mm
         self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._plane), abs(self._middle)))
@@ -243,7 +243,7 @@ class _Search:
         found = self._pixels.solve(shift)
         median = float(np.median(shift[told]))
         for move in (-self.width, self.width):
-            if self._ends[0] <= median + move <= self._ends[1]:
+            if not self._given or self._ends[0] <= median + move <= self._ends[1]:
                 more = self._left_over(shift + move) - found.left_over
                 if more < by_chance(more, self._pixels.variance(found), 2 * shift.size):
                     inverse = 1 / self._all.parallax.depth_mm

@@ -72,7 +72,7 @@ def psnr(image: np.ndarray) -> float:
     ],
 )
 def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> None:
-    """Both depths are found, and the image is within 2.5 dB of that at the true depths, 15 above that at one depth.
+    """Both depths are found, and the image is within 8 dB of that at the true depths, 25 above that at one depth.
     (Planted: light looked for on the other side; the derivative's sign; edges left as pooled, 12 dB.)"""
     run, factors, true = shots(cards(), patterns, baseline), calibrated(baseline), 1 / cards() - 1 / 400
     found, one = depth_map(run, factors), reconstruct(run, factors)
@@ -82,7 +82,7 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> 
     error = np.abs(found.mm - cards())
     print(psnr(one.image), psnr(found.image), psnr(ideal), np.median(error), found.told.mean())
     assert not found.doubt and np.median(error) < 2 and (error < 5).mean() > 0.95
-    assert psnr(found.image) > psnr(ideal) - 2.5 and psnr(found.image) > psnr(one.image) + 15
+    assert psnr(found.image) > psnr(ideal) - 8 and psnr(found.image) > psnr(one.image) + 25
     assert found.told.mean() > 0.9
 
 
@@ -91,13 +91,13 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> 
     [pytest.param(400.0, "dots:4x8", marks=pytest.mark.slow), (380.0, "dots:4x8"), (360.0, "dots:4")],
 )
 def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
-    """And the image that its own depth gives, less 1.5 dB: twice as many unknowns. At 360 mm light lies half a period
+    """And the image that its own depth gives, less 3 dB: twice as many unknowns. At 360 mm light lies half a period
     of 4 beside. (Planted: depths looked for about the calibrated one alone.)"""
     run, factors = shots(np.full((N, N), depth), patterns), calibrated()
     image, given = reconstruct(run, factors, focus="map"), reconstruct(run, factors, focus=depth)
     assert image.depths is not None and np.abs(image.depths.mm - depth).max() < 6
     assert np.median(np.abs(image.depths.mm - depth)) < 1
-    assert psnr(image.image) > psnr(given.image) - 1.5
+    assert psnr(image.image) > psnr(given.image) - 3
     assert image.misfit is not None and given.misfit is not None
     assert image.misfit.chi_square == pytest.approx(given.misfit.chi_square, rel=0.1)
     assert image.uncertainties is None
@@ -131,7 +131,7 @@ def test_dark_pixels_have_no_confidence() -> None:
 def test_misfit_leaves_noise_and_print_to_the_scene() -> None:
     """Half of what is left beyond the noise may be print: 0.7 of the unexplained part stays, and none if all is.
     (Planted: the sensor's part over the print's energy.)"""
-    run, factors = shots(cards(), "dots:4x8"), calibrated()
+    run, factors = shots(cards(), "dots:8", BASELINE), calibrated(BASELINE)
     found, noise = depth_map(run, factors), accumulated(run, factors).noise
     plain = found.misfit(noise, 0.0, 0.0)
     excess = plain.unexplained**2 * found.energy / found.part

@@ -19,18 +19,23 @@ from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import FactorOfDepths, focused
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
-from tests.ideal_sessions import PITCH, PIXELS, Bench, picture
+from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
 
 N = 40
 """Projector pixels a side of images: each 15 um in the mask's plane, a quarter of a feature."""
 FINE = 128
 """The same of the paper's projector: 5 um."""
+COARSE = 64
+"""The same for depths beside each other, whose search takes a second: 9 um."""
+DIM = PEAK / 100
+"""Electrons of the brightest pixel where noise hides which of two depths is right."""
 BASELINE = 25.0, -60.0
 WINDOW = 0.3
 PARALLAX = Parallax(
@@ -69,18 +74,20 @@ def psnr(image: Reconstruction) -> float:
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("depth", [330.0, 360.0, 398.0, 440.0, 520.0])
-def test_moved_columns_are_those_of_the_depth(depth: float, axis: int) -> None:
-    """Within 0.8 %: a cubic leaves 0.2 to 0.6 % between columns of 5 um. Unmoved ones are 2 to 100 % off."""
-    factor, truth = shadow(400.0, axis, FINE), shadow(depth, axis, FINE)
+@pytest.mark.parametrize(("n", "limit"), [(FINE, 3e-4), (N, 1.6e-3)])
+def test_moved_columns_are_those_of_the_depth(depth: float, axis: int, n: int, limit: float) -> None:
+    """Within 0.03 % of columns of 5 um, and 0.16 % of 15: each row is given its neighbours' places between its own.
+    Unmoved ones are 2 to 100 % off. (Planted: neighbours' numbers at the other side; the own row alone.)"""
+    factor, truth = shadow(400.0, axis, n), shadow(depth, axis, n)
     found, known = FactorOfDepths(factor, PARALLAX, axis).at(1 / depth - 1 / 400)
 
     def error(columns: np.ndarray) -> float:
         return float(np.linalg.norm((columns - truth)[known]) / np.linalg.norm(truth[known]))
 
     print(depth, axis, error(found), error(factor), known)
-    assert error(found) < 0.008 and error(found) < error(factor) / 5
+    assert error(found) < limit and error(found) < error(factor) / 5
     # Light leaves the window by less than 0.04 rad, 80 um in the mask's plane: four sensor pixels, and one for margin.
-    assert 0 < PIXELS - (known.stop - known.start) <= 5
+    assert 0 < PIXELS - (known.stop - known.start) <= 6
 
 
 @pytest.mark.parametrize("depth", [360.0, 440.0])
@@ -183,12 +190,129 @@ def test_a_plane_off_the_calibrated_distance_comes_into_focus(depth: float) -> N
     assert found.inputs["focus"] == "auto" and "focus" not in plain.inputs
 
 
-def test_a_depth_that_is_not_told_is_flagged() -> None:
-    """Uniform light takes a moved image for an image; and a sheet nearer than all that is tried is not found."""
-    uniform = reconstruct(shots(380.0, "uniform"), calibrated(), 1e-3, focus="auto")
+def test_a_depth_that_is_not_told_is_flagged(fine: Factors) -> None:
+    """Uniform light takes a moved image for an image; and of a sheet nearer than all that is tried the end is found."""
+    uniform = reconstruct(beside(480.0, "uniform"), fine, 1e-3, focus="auto")
     assert not uniform.ok and "hardly tell depth" in str(uniform.status)
     near = reconstruct(shots(290.0), calibrated(), focus="auto")
-    assert not near.ok and "320 to 533 mm" in str(near.status)
+    assert not near.ok and "End of range" in str(near.status) and "320 to 533 mm" in str(near.status)
+
+
+BESIDE = PARALLAX.model_copy(update={"row_mm": (0.0, 0.0)})
+"""The projector beside the camera, so that dots a period apart lie on one line."""
+
+
+def beside(depth: float, patterns: str, peak: float = PEAK, dark: int = 0) -> Capture:
+    """The window's first and last ``dark`` columns show nothing."""
+    left, right = (shadow(depth, axis, COARSE, (0.0, BASELINE[1])) for axis in (0, 1))
+    scene = picture(n=COARSE)
+    scene[:, :dark], scene[:, COARSE - dark :] = 0.0, 0.0
+    return Bench(left, right, peak=peak).run(patterns, scene, 0)
+
+
+@pytest.fixture(scope="module")
+def fine() -> Factors:
+    factors = Bench(*(shadow(400.0, axis, COARSE) for axis in (0, 1))).calibrated(0, error=1e-3)
+    return replace(factors, manifest=factors.manifest.model_copy(update={"parallax": BESIDE}))
+
+
+@pytest.mark.parametrize(("depth", "patterns"), [(480.0, "dots:4"), (450.0, "dots:7"), (353.0, "dots:5")])
+def test_a_depth_is_not_taken_for_one_a_period_away(fine: Factors, depth: float, patterns: str) -> None:
+    """Depths are tried a pixel of parallax apart, and the valley of another may lie nearer to one of them. (Planted:
+    the valley of the best of these alone.)"""
+    found = best_depth(beside(depth, patterns), fine)
+    print(depth, patterns, found)
+    assert not found.doubt and not found.alternatives and abs(found.mm - depth) < 2 * found.error_mm < 0.5
+
+
+def test_two_depths_that_explain_as_much_are_named(fine: Factors) -> None:
+    """In dim light and without an edge in view, until a range excludes one. (Planted: no chance; the misfit's energy for the difference's.)"""
+    dim, other = beside(480.0, "dots:4", DIM, dark=8), 1 / (1 / 480 + 4 * WINDOW / COARSE / 60)
+    image = reconstruct(dim, fine, focus="auto")
+    depth = image.focus
+    print(depth, image.status)
+    assert isinstance(depth, Depth) and not image.ok and "whole periods of the dots" in str(image.status)
+    named = sorted([depth.mm, *(each.mm for each in depth.alternatives)])
+    assert any(abs(mm - 480) < 1 for mm in named) and any(abs(mm - other) < 1 for mm in named)
+    assert depth.error_mm is not None and depth.error_mm >= max(abs(mm - depth.mm) for mm in named)
+    summary = image.summary()
+    assert summary["focus_alternatives"][0].keys() == {"mm", "difference"}
+    assert summary["focus_range_mm"] == pytest.approx((320, 533.3), abs=0.1)
+    known = best_depth(dim, fine, (460.0, 500.0))
+    assert not known.doubt and not known.alternatives and abs(known.mm - 480) < 2 * known.error_mm
+    assert known.range_mm == pytest.approx((460, 500))
+
+
+@pytest.mark.parametrize("depth", [308.0, 556.0])
+def test_a_depth_beyond_the_range_is_not_taken_for_one_within(fine: Factors, depth: float) -> None:
+    """A period of the dots away is a depth within. (Planted: depths within the range alone: 324.8 and 511 mm, without
+    a word.)"""
+    found = best_depth(beside(depth, "dots:4"), fine)
+    print(found)
+    assert found.at_end and "End of range" in found.doubt and abs(found.mm - depth) < 2 * found.error_mm
+
+
+@pytest.mark.parametrize(
+    ("depth_range", "focus", "fragment"),
+    [
+        ((450.0, 350.0), "auto", "nearer one first"),
+        ((-1.0, 350.0), "auto", "above 0"),
+        ((350.0, np.inf), "auto", "two depths"),
+        ((350.0,), "map", "two depths"),
+        ("ab", "auto", "two depths"),
+        ((350.0, np.nan), "auto", "two depths"),
+        ((350.0, 450.0), None, "focus auto or map"),
+        ((350.0, 450.0), 400.0, "focus auto or map"),
+        ((1.0, 450.0), "auto", "where the mask is"),
+        ((60.0, 450.0), "auto", "nearer to the calibrated 400 mm"),
+    ],
+)
+def test_a_range_that_is_none_is_refused(depth_range: object, focus: str | float | None, fragment: str) -> None:
+    with pytest.raises(ArgumentError, match=fragment) as caught:
+        reconstruct(shots(400.0), calibrated(), focus=focus, depth_range=depth_range)  # type: ignore[arg-type]
+    assert caught.value.argument == "depth_range" and "\n" not in str(caught.value)
+
+
+def test_the_field_stop_cuts_what_moves_beyond_it() -> None:
+    """A stop at 0.16: at 330 mm light of the window's edge, 0.15 as calibrated, comes from 0.18. Columns are as bright
+    in the mean as a board there would be, with their light on the part of the sensor that sees them. (Planted: places
+    on the sensor the other way round.)"""
+    stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
+    factor, shift = np.ones((PIXELS, FINE)), 1 / 330 - 1 / 400
+    side = FactorOfDepths(factor, stopped, 1)
+    found, hidden = side.at(shift)[0], side.hidden(shift)
+    place = (np.arange(PIXELS) - (PIXELS - 1) / 2) * PITCH
+    centre = (np.arange(FINE) + 0.5) * WINDOW / FINE - WINDOW / 2
+    tangent = centre + BASELINE[1] * shift - place[:, None] / 330
+    seen = np.clip((0.16 - np.abs(tangent)) / (WINDOW / FINE) + 0.5, 0, 1)
+    np.testing.assert_allclose(hidden, 1 - seen.mean(axis=0), atol=1e-9)
+    lit = hidden < 1
+    np.testing.assert_allclose(found[:, lit], (seen / np.maximum(seen.mean(axis=0), 1e-9))[:, lit], atol=1e-6)
+    assert not found[:, ~lit].any() and 0 < (hidden > 0.5).sum() < FINE / 4
+    unstated = FactorOfDepths(factor, PARALLAX, 1)
+    assert not unstated.hidden(shift).any() and not side.hidden(0.0).any()
+
+
+def test_light_that_the_field_stop_hides_is_told() -> None:
+    factors = calibrated()
+    stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
+    factors = replace(factors, manifest=factors.manifest.model_copy(update={"parallax": stopped}))
+    assert focused(factors, 395.0).hidden == 0 and "field stop" not in str(reconstruct(shots(395.0), factors).status)
+    image = reconstruct(shots(340.0), factors, focus=340.0)
+    assert not image.ok and "the field stop takes most of the light" in str(image.status)
+
+
+def test_noise_of_moved_columns_is_stated() -> None:
+    """Less than that of the calibrated ones, since each number is fitted to many; measured with another draw, 5 %.
+    (Planted: the calibrated noise.)"""
+    white = np.random.default_rng(7).standard_normal((PIXELS, N))
+    side = FactorOfDepths(1000 + white, PARALLAX, 0)
+    shift = 1 / 360 - 1 / 400
+    found, known = side.at(shift)
+    noise = float(np.std((found - 1000)[known]))
+    assert side.noise(shift) == pytest.approx(noise, rel=0.1) and noise < 0.8
+    moved, own = focused(calibrated(), 360.0).factors.manifest.noise, calibrated().manifest.noise
+    assert moved is not None and own is not None and moved.left == pytest.approx(own.left * side.noise(shift))
 
 
 def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) -> None:
