@@ -180,10 +180,12 @@ class _Search:
 
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
-        plane = best_depth(shots, factors, depth_range)
         self._ends, self._given = searched(factors, depth_range), depth_range is not None
+        inverse = 1 / stated_parallax(factors).depth_mm
+        plane = best_depth(shots, factors, (1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])))
         self._middle = (self._ends[0] + self._ends[1]) / 2
-        self._plane = self._middle if plane.doubt else 1 / plane.mm - 1 / stated_parallax(factors).depth_mm
+        # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
+        self._plane = self._middle if plane.at_end else 1 / plane.mm - inverse
         self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._plane), abs(self._middle)))
         self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
         self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)

@@ -138,7 +138,7 @@ def test_misfit_leaves_noise_and_print_to_the_scene() -> None:
     assert plain.unexplained > 3.5e-3 and plain.flagged and plain.stated
     assert found.misfit(noise, 0.0, excess / 2).unexplained == pytest.approx(plain.unexplained / 2**0.5, rel=1e-6)
     assert found.misfit(noise, 0.0, 1.01 * excess).unexplained == 0
-    assert found.misfit(noise, excess, 0.0).unexplained == pytest.approx(0, abs=1e-6)
+    assert found.misfit(noise, excess / found.smoothing, 0.0).unexplained == pytest.approx(0, abs=1e-6)
     assert not found.misfit(noise, None, 0.0).stated
 
 
