@@ -1,11 +1,11 @@
-"""Depths found of prints beside the calibrated distance: by print, dots and depth, and whether within their errors.
+"""Depths of prints beside the calibrated distance, as they are found: by print, dots and depth.
 
     python benchmarks/depths.py RESULT.json [--depths 330 340 ...] [--families dots:4 ...] [--prints ...] [--n 64]
         [--exposure 0.8]
 
 A sheet is moved from 330 to 480 mm before a camera of 256 x 320 pixels that was calibrated at 400 mm with a projector
-of n x n pixels 60 mm beside it. Light is traced once for each print and depth. RESULT.json holds for each run the depth
-that ``--focus auto`` finds, its stated error, alternatives and doubt, whether the image is flagged, its unexplained part
+of n x n pixels 60 mm beside it. Light is traced once for each print and depth. RESULT.json holds of each run the depth
+that ``--focus auto`` finds, its error, alternatives and doubt, whether the image is flagged, its unexplained part
 and PSNR; and counts of runs that are within two stated errors, flagged, or neither, which is silently wrong. An
 interrupted run goes on where it was. 256 runs take 15 minutes on two cores with n = 64.
 """

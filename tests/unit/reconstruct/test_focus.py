@@ -226,7 +226,7 @@ def test_a_depth_is_not_taken_for_one_a_period_away(fine: Factors, depth: float,
 
 
 def test_two_depths_that_explain_as_much_are_named(fine: Factors) -> None:
-    """In dim light and without an edge in view, until a range excludes one. (Planted: no chance; the misfit's energy for the difference's.)"""
+    """In dim light and without an edge in view, until a range excludes one. (Planted: no chance.)"""
     dim, other = beside(480.0, "dots:4", DIM, dark=8), 1 / (1 / 480 + 4 * WINDOW / COARSE / 60)
     image = reconstruct(dim, fine, focus="auto")
     depth = image.focus
