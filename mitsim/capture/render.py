@@ -120,6 +120,8 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     """
     import mitsuba as mi
 
+    from mitsim.scene.guard.outline import one_line
+
     if loaded.unfit.reference is not None:
         raise loaded.unfit.reference
     if loaded.parting and mi.is_spectral:
@@ -138,9 +140,12 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
         try:
             image = np.array(mi.render(loaded.scene, sensor=loaded.camera, spp=each, seed=child), dtype=np.float64)
         except RuntimeError as error:
+            cause: BaseException = error
+            while cause.__cause__ is not None:  # what Dr.Jit raises says only that something below it failed
+                cause = cause.__cause__
             raise MitsimError(
-                f"{loaded.path}: the integrator cannot render this sensor ({' '.join(str(error).split())[-200:]}); "
-                "use path, direct or volpath"
+                f"{loaded.path}: Mitsuba cannot render this scene in {mi.variant()}: {one_line(cause)}; change what it "
+                "names, or try --variant llvm_ad_rgb or llvm_ad_spectral"
             ) from None
         finally:
             loaded.camera.stratify(None)

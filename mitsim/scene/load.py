@@ -78,7 +78,7 @@ def load_scene(
     MitsimError
         one line that names the file for anything wrong with it.
     """
-    checked = check_file(path, defines or {}, outside)
+    checked = check_file(path, defines or {}, outside, mi.variant())
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()

@@ -103,10 +103,14 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
 def _lost_by_integrator(
     outline: Outline, tree: _References, cause: tuple[mi.parser.SceneNode, str] | None
 ) -> MitsimError | None:
-    """The refusal of an integrator that loses light at the ``cause``, a node and the name of its property."""
+    """The refusal of an integrator that has no paths from the camera, or that loses light at the ``cause``, a node and
+    the name of its property."""
     found = (node for node in tree.nodes if node.props.plugin_name() in PLUGINS["integrator"].split())
     integrator = next(found, None)
     plugin = integrator.props.plugin_name() if integrator is not None else "path"  # Mitsuba's own default
+    if integrator is not None and plugin == "ptracer":
+        rule = "it starts paths at lamps alone, and mitsim_lensless needs those of the camera; use path or volpath"
+        return outline.tag(integrator).refusal("integrator", repr(plugin), rule)
     if cause is None or plugin in _VOLUMETRIC:
         return None
     place, what = outline.tag(cause[0]), tree.plugin(*cause)

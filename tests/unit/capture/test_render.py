@@ -15,7 +15,7 @@ def test_an_integrator_without_a_camera_side_is_refused(small_scene: Callable[..
     scene = small_scene()
     scene.write_text(scene.read_text().replace('<integrator type="path">', '<integrator type="ptracer">'))
     assert "ptracer" in scene.read_text()
-    with pytest.raises(MitsimError, match="cannot render this sensor"):
+    with pytest.raises(MitsimError, match=r"xml:3: integrator: got 'ptracer' .* use path or volpath"):
         open_bench(scene, for_render=True).render(spp=4)
 
 
