@@ -385,7 +385,7 @@ class Bench(Apparatus):
     def render(
         self,
         estimator: Literal["reference", "factored"] = "reference",
-        spp: int = 64,
+        spp: int | None = None,
         accuracy: float = 1e-3,
         seed: int = 0,
         effects: Mapping[str, bool] | None = None,
@@ -398,7 +398,7 @@ class Bench(Apparatus):
         estimator
             ``reference``: the scene's own integrator, path by path; ``factored``: what all captures are made with.
         spp
-            samples a pixel of the reference.
+            samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 where it has none.
         accuracy, effects
             of the factored estimator: relative error, and effects switched on or off by name.
         seed

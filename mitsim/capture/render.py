@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
 """The others of Mitsuba 3.9.1 order their strata by a hash that is no random permutation of few of them: some two of a
 path's numbers correlate, over 2^19 paths by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 a pixel."""
+_SAMPLES = 64
+"""Samples a pixel where neither request nor scene states them, as the shipped scenes have it: a few seconds."""
 _SAMPLES_A_PASS = 64
 """Samples a pixel of one pass: 2^24 paths of a 512 x 512 sensor, which fit in memory."""
 
@@ -169,6 +171,19 @@ def _of_sampler(loaded: LoadedScene) -> tuple[str, ...]:
     )
 
 
+def _samples(bench: Bench, estimator: str, spp: int | None) -> int:
+    """Samples a pixel: ``spp`` as asked for, or those of the scene; MitsimError for too few or too many."""
+    check_samples(estimator, spp)
+    stated = bench.loaded.samples
+    if spp is not None or stated is None:
+        return spp or _SAMPLES
+    try:
+        check_samples(estimator, stated)
+    except MitsimError as error:
+        raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {error}") from None
+    return stated
+
+
 @contextmanager
 def projected(bench: Bench, pattern: FloatArray) -> Iterator[None]:
     """Show a ``pattern`` (n, n) of 0..1 on the ``bench``'s projector while the context lasts, for the reference."""
@@ -193,7 +208,7 @@ def projected(bench: Bench, pattern: FloatArray) -> Iterator[None]:
 def render(
     bench: Bench,
     estimator: str,
-    spp: int,
+    spp: int | None,
     accuracy: float,
     seed: int,
     effects: Mapping[str, bool] | None = None,
@@ -215,7 +230,7 @@ def render(
         as there.
     """
     job = job or Job()
-    check_samples(estimator, spp)
+    spp = _samples(bench, estimator, spp)
     warnings: tuple[str, ...] = ()
     started = time.perf_counter()
     if estimator == REFERENCE:

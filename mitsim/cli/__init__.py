@@ -294,7 +294,9 @@ def render(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
     estimator: Annotated[str, typer.Option(help="reference or factored")] = "reference",
-    spp: Annotated[int, typer.Option(help="samples a pixel of the reference")] = 64,
+    spp: Annotated[
+        int | None, typer.Option(help="samples a pixel of the reference", show_default="the scene's sample_count, or 64")
+    ] = None,
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
     projector: Projector = None,

@@ -52,7 +52,8 @@ class CheckedScene:
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
     the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
     ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
-    into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way.
+    into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way;
+    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none.
     """
 
     outline: Outline
@@ -65,6 +66,7 @@ class CheckedScene:
     small_lamps: tuple[Tag, ...]
     coloured: tuple[Tag, ...]
     parting: tuple[Tag, ...]
+    samples: int | None
 
 
 def check_file(
@@ -105,7 +107,7 @@ def check_file(
     listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
     facts = tuple(files.used), tree.limits, unfit
     shown, small = listed
-    return CheckedScene(outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting))
+    return CheckedScene(outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting), tree.samples)
 
 
 @contextmanager
@@ -135,6 +137,7 @@ class _Tree:
     texels: int = 0
     coloured: list[Tag] = field(default_factory=list)
     parting: list[Tag] = field(default_factory=list)
+    samples: int | None = None
 
     def check(self) -> None:
         """MitsimError for the first object that a scene cannot have."""
@@ -231,6 +234,10 @@ class _Tree:
             raise tag.refusal("texels", self.texels, f"all bitmaps together may have {MOST_TEXELS}")
 
     def _check_camera(self, node: mi.parser.SceneNode) -> None:
+        for below in self._below(node):
+            props = self.nodes[below].props
+            if props.plugin_name() in PLUGINS["sampler"].split() and "sample_count" in props:
+                self.samples = int(props["sample_count"])
         values = {name: node.props[name] for name in CameraGeometry.model_fields if name in node.props}
         try:
             CameraGeometry(**values)
