@@ -124,8 +124,10 @@ def _extra(tag: str, plugin: str) -> str:
         film = '<film type="hdrfilm"><integer name="width" value="1"/><integer name="height" value="1"/>'
         film += '<rfilter type="box"/></film>'
         sensor = f'<sensor type="{plugin}">{FLOAT.format("aperture_radius", 1) if plugin == "thinlens" else ""}{film}'
-        return PLATE.format(x=0, y=0, z=500, inside=sensor + "</sensor>") if plugin == "irradiancemeter" else (
-            sensor + "</sensor>"
+        return (
+            PLATE.format(x=0, y=0, z=500, inside=sensor + "</sensor>")
+            if plugin == "irradiancemeter"
+            else (sensor + "</sensor>")
         )
     return ""
 

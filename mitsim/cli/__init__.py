@@ -295,7 +295,8 @@ def render(
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
     estimator: Annotated[str, typer.Option(help="reference or factored")] = "reference",
     spp: Annotated[
-        int | None, typer.Option(help="samples a pixel of the reference", show_default="the scene's sample_count, or 64")
+        int | None,
+        typer.Option(help="samples a pixel of the reference", show_default="the scene's sample_count, or 64"),
     ] = None,
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,

@@ -110,7 +110,15 @@ def load_scene(
     shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
     lit = tuple(zip(small, checked.small_lamps, strict=True))
-    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit, checked.coloured, checked.parting, checked.samples
+    facts = (
+        *_polished(scene, checked.unfit),
+        checked.unfit,
+        shapes,
+        lit,
+        checked.coloured,
+        checked.parting,
+        checked.samples,
+    )
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")

@@ -107,7 +107,9 @@ def check_file(
     listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
     facts = tuple(files.used), tree.limits, unfit
     shown, small = listed
-    return CheckedScene(outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting), tree.samples)
+    return CheckedScene(
+        outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting), tree.samples
+    )
 
 
 @contextmanager

@@ -95,7 +95,7 @@ def _blurred(outline: Outline, tree: _References) -> MitsimError | None:
         kind = picture.props["filter_type"] if "filter_type" in picture.props else "bilinear"  # Mitsuba's default
         if kind != "nearest":
             rule = (
-                'the projector\'s pixels would run into each other, where patterns need them even; give its bitmap <string '
+                "the projector's pixels would run into each other, where patterns need them even; give its bitmap <string "
                 'name="filter_type" value="nearest"/>, and blur_pixels of the projector\'s TOML file for a blur'
             )
             return outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)

@@ -46,7 +46,11 @@ def test_a_camera_captures_as_its_file_says_or_is_told_what_it_lacks(camera: Pat
 
 def test_the_page_of_formats_lists_every_camera() -> None:
     page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
-    rows = [line.split("|")[1:4] for line in page.splitlines() if re.match(r"\| `(imx|mt9|ov)\w*\d", line) and line.count("|") == 5]
+    rows = [
+        line.split("|")[1:4]
+        for line in page.splitlines()
+        if re.match(r"\| `(imx|mt9|ov)\w*\d", line) and line.count("|") == 5
+    ]
     listed = {name: verbs for names, _, verbs in rows for name in re.findall(r"`(\w+)`", names)}
     assert listed.keys() == {camera.stem for camera in SENSORS}
     for camera in SENSORS:
