@@ -229,7 +229,7 @@ def test_the_json_of_a_page_is_json(page: str) -> None:
 def test_the_figures_of_readmes_tour_are_what_its_commands_print(tmp_path: Path) -> None:
     """To one of the last digit printed; seconds and memory are the machine's. `python -m tests.tour` writes them anew.
 
-    (Seen failing: 50.81 dB and a Monte Carlo error of 3.0e-4, where a release later the commands gave 49.71 and 4.3e-4.)
+    (Seen failing: 50.81 dB and a Monte Carlo error of 3.0e-4, where the commands gave 49.71 and 4.3e-4.)
     """
     stale = {verb: tour.differences(tour.stated(verb)[1], now) for verb, now in tour.outputs(tmp_path)}
     assert not any(stale.values()), stale
@@ -244,7 +244,8 @@ def test_figures_that_are_stated_again_are_those_of_the_tour() -> None:
 
 
 def test_figures_are_compared_to_the_last_digit_printed() -> None:
-    said = "49 frames in 4.3 s (transport 0.27, write 0.07): run\nPSNR 50.81 dB, lambda 8.03e+06; memory 0.5 GiB of at most\n1 predicted"
+    said = "49 frames in 4.3 s (transport 0.27, write 0.07): run\nPSNR 50.81 dB, lambda 8.03e+06; "
+    said += "memory 0.5 GiB of at most\n1 predicted"
     for now, found in (
         ("PSNR 50.82 dB, lambda 8.04e+06", []),
         ("PSNR 50.79 dB, lambda 8.03e+06", ["50.81 -> 50.79"]),

@@ -1,8 +1,8 @@
 """README's tour of the command line: its commands in, the figures that they print and those that README states out.
 
-``python -m tests.tour`` runs the commands in a new folder and writes their outputs into README, and the PSNR where it is
-stated again. Seconds and memory stay as they are there: they are an idle machine's. ``docs/images/make.py`` draws the
-picture that has it in its title.
+``python -m tests.tour`` runs the commands in a new folder and writes their outputs into README, and the PSNR where it
+is stated again. Seconds and memory stay as they are there: they are an idle machine's. ``docs/images/make.py`` draws
+the picture that has it in its title.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def outputs(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def differences(readme: str, now: str) -> list[str]:
-    """Figures of an output ``now`` that differ from ``readme``'s by more than one of the last digit printed there, or the
+    """Figures of an output ``now`` that differ from ``readme``'s by more than one of the last digit printed, or the
     sentences, where those differ."""
     texts = [" ".join(_MACHINE.sub("", " ".join(text.split())).split()) for text in (readme, now)]
     sentences = [_NUMBER.sub("#", text) for text in texts]

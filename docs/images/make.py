@@ -2,8 +2,8 @@
 
     python docs/images/make.py WORK [demo] [depth]
 
-Both, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call found there are used
-again.
+Both, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call found there are
+used again.
 """
 
 from __future__ import annotations

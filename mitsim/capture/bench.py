@@ -398,7 +398,7 @@ class Bench(Apparatus):
         estimator
             ``reference``: the scene's own integrator, path by path; ``factored``: what all captures are made with.
         spp
-            samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 where it has none.
+            samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 without.
         accuracy, effects
             of the factored estimator: relative error, and effects switched on or off by name.
         seed

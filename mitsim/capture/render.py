@@ -147,7 +147,7 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
                 cause = cause.__cause__
             raise MitsimError(
                 f"{loaded.path}: Mitsuba cannot render this scene in {mi.variant()}: {one_line(cause)}; change what it "
-                "names, or try --variant llvm_ad_rgb or llvm_ad_spectral"
+                "names, or try another --variant"
             ) from None
         finally:
             loaded.camera.stratify(None)

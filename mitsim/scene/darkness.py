@@ -77,8 +77,8 @@ def why_dark(loaded: LoadedScene) -> str:
     if part is not window:
         extents = [(own[1] - own[0]) / (whole[1] - whole[0]) for own, whole in zip(part, window, strict=True)]
         return (
-            f"what is lit spans {min(extents):.1e} of the window only, {min(extents) * grid.n:.1e} projector pixels: too "
-            "few rays meet it; give the projector a narrower fov, or a larger target"
+            f"what is lit spans {min(extents):.1e} of the window only, {min(extents) * grid.n:.1e} projector pixels: "
+            "too few rays meet it; give the projector a narrower fov, or a larger target"
         )
     return "what is lit lies edge-on, is hidden or reflects nothing; turn it, move it or check its material"
 

@@ -73,11 +73,11 @@ run samples until it knows the light; else neither may."""
 _FAINT = 1e-3
 """Part of the mean light on the sensor below which its centre sees nothing but rounding."""
 _MOST_RAYS = 2**26
-"""Rays that look for what a scene shows while few have met it, some 0.5 s: they meet what is 2e-4 of the window wide."""
+"""Rays that look for what a scene shows while few have met it, some 0.5 s: they meet 2e-4 of the window's width."""
 _MORE = 4
 """Times as many rays as before: a power of two keeps the places of each pixel's rays even."""
 _FEWEST_IN_LOOK = 8.0
-"""Hits that a look at a small target must count on: the looks then tell its light to a fifth, and its noise to a half."""
+"""Hits that a look at a small target must count on: the looks then tell its light to a fifth."""
 _ALIGNED = 1e-6
 """Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
 

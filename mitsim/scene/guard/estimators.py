@@ -92,11 +92,11 @@ def _blurred(outline: Outline, tree: _References) -> MitsimError | None:
         picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None
         if picture is None or picture.props.plugin_name() != "bitmap":
             continue
-        kind = picture.props["filter_type"] if "filter_type" in picture.props else "bilinear"  # Mitsuba's default
+        kind = picture.props.get("filter_type", "bilinear")  # Mitsuba's default
         if kind != "nearest":
             rule = (
-                "the projector's pixels would run into each other, where patterns need them even; give its bitmap <string "
-                'name="filter_type" value="nearest"/>, and blur_pixels of the projector\'s TOML file for a blur'
+                "the projector's pixels would run into each other, where patterns need them even; give its bitmap "
+                '<string name="filter_type" value="nearest"/>, and blur_pixels of the projector\'s TOML file for a blur'
             )
             return outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)
     return None

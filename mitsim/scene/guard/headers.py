@@ -217,8 +217,8 @@ def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
                 parts[[*parts][-1]].properties.append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
             case _:
                 raise ValueError(
-                    f"has a header line that is not understood ({' '.join(words)[:40]!r}); remove it, or export the mesh "
-                    "again"
+                    f"has a header line that is not understood ({' '.join(words)[:40]!r}); remove it, or export "
+                    "the mesh again"
                 )
     if order == "" or not {"vertex", "face"} <= parts.keys():
         raise ValueError("has no format, or no elements vertex and face; export vertices and triangles")

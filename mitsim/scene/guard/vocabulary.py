@@ -31,15 +31,15 @@ PLUGINS = {
     "volume": "constvolume",
 }
 """Plugins by tag, beside ``<scene>``."""
-_SPECTRAL_ALONE = "only spectral variants have it; use --variant llvm_ad_spectral, or --colour lines or mosaic"
+_SPECTRAL_ALONE = "only spectral variants have it; use --variant {spectral}, or --colour lines or mosaic"
 _LACKED = {
     "blackbody": _SPECTRAL_ALONE,
     "irregular": f'{_SPECTRAL_ALONE}, or write the table as value="400:0.2, 700:0.5"',
     "regular": f'{_SPECTRAL_ALONE}, or write the table as value="400:0.2, 700:0.5"',
     "specfilm": "only spectral variants have it; use hdrfilm",
 }
-"""Plugins of Mitsuba 3.9.1 that its variants without wavelengths lack, and what to do. Textures are loaded there, and end
-the run when light meets them."""
+"""Plugins of Mitsuba 3.9.1 that its variants without wavelengths lack, and what to do. Textures are loaded there, and
+end the run when light meets them."""
 
 
 def check_plugin(tag: Tag, plugin: str) -> None:
@@ -63,8 +63,10 @@ def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) ->
     variant
         of Mitsuba.
     """
-    if plugin in _LACKED and not variant.endswith("_spectral"):
-        raise tag.refusal("type", repr(plugin), f"{variant} lacks it: {_LACKED[plugin]}")
-    if plugin == "hair" and variant.endswith("_mono") and "sigma_a" not in given:
-        rule = f"{variant} has no colours for its pigments; give sigma_a in their place, or use --variant llvm_ad_rgb"
+    backend, _, kind = variant.rpartition("_")
+    if plugin in _LACKED and kind != "spectral":
+        rule = f"{variant} lacks it: {_LACKED[plugin].format(spectral=f'{backend}_spectral')}"
+        raise tag.refusal("type", repr(plugin), rule)
+    if plugin == "hair" and kind == "mono" and "sigma_a" not in given:
+        rule = f"{variant} has no colours for its pigments; give sigma_a in their place, or use --variant {backend}_rgb"
         raise tag.refusal("type", repr(plugin), rule)
