@@ -315,18 +315,20 @@ def render(
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
     from mitsim.capture.request import check_samples
-    from mitsim.core.output import check_apart, output_file
+    from mitsim.core.output import check_apart, check_output, output_file
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
     request = request_of(accuracy=accuracy, seed=seed, effects=effects)
     check_samples(estimator, spp)
+    check_output(output, overwrite=True, kind="file")
     method: Any = estimator
-    with job_of(quiet or as_json, max_seconds, max_memory) as job, output_file(output, overwrite=True) as place:
+    with job_of(quiet or as_json, max_seconds, max_memory) as job:
         bench = bench_of(scene, variant, None, projector, define, outside, for_render=True)
-        check_apart(place, bench.loaded.files)
-        frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
-        payload = {**frame.summary(), "output": str(frame.save(place))}
+        check_apart(output, bench.loaded.files)
+        with output_file(output, overwrite=True) as place:
+            frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
+            payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
         f"{payload['seconds']:.2f} s: {payload['output']}"
