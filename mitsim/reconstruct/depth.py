@@ -39,14 +39,13 @@ _LEAST_RISE = 2e-5
 Uniform light stays below it (5e-8 to 2e-5), and there print within pixels moves depth by up to 12 standard errors."""
 _SIMILAR = 2.0
 """A valley's depth below the step next to it is at most so many times that of the lowest valley; chosen, as valleys of
-one scene have one shape (measured: within 30 %)."""
+one scene are alike in shape."""
 _OPPOSED = 4.0
 """Times the unexplained energy S by which two depths must differ: r being what the wrong one does not explain of the
 light of the right one, less is left of it than of the right one only if 2 r.d > |r|^2 for the misfit d of energy S; so
 |r|^2 < 4 S."""
 _LAMBDA = 1e-3
-"""Of the image by which the factors' noise is weighed, over the largest sigma^2: 1e-2 and 1e-4 change that by less than
-a tenth."""
+"""Of the image by which the factors' noise is weighed, over the largest sigma^2: chosen, as noise hangs on it little."""
 
 
 @dataclass(frozen=True)

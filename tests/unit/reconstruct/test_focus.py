@@ -77,7 +77,7 @@ def psnr(image: Reconstruction) -> float:
 @pytest.mark.parametrize(("n", "limit"), [(FINE, 3e-4), (N, 1.6e-3)])
 def test_moved_columns_are_those_of_the_depth(depth: float, axis: int, n: int, limit: float) -> None:
     """Within 0.03 % of columns of 5 um, and 0.16 % of 15: each row is given its neighbours' places between its own.
-    Unmoved ones are 2 to 100 % off. (Planted: neighbours' numbers at the other side; the own row alone.)"""
+    Unmoved ones are 2 to 100 % off."""
     factor, truth = shadow(400.0, axis, n), shadow(depth, axis, n)
     found, known = FactorOfDepths(factor, PARALLAX, axis).at(1 / depth - 1 / 400)
 
@@ -218,15 +218,14 @@ def fine() -> Factors:
 
 @pytest.mark.parametrize(("depth", "patterns"), [(480.0, "dots:4"), (450.0, "dots:7"), (353.0, "dots:5")])
 def test_a_depth_is_not_taken_for_one_a_period_away(fine: Factors, depth: float, patterns: str) -> None:
-    """Depths are tried a pixel of parallax apart, and the valley of another may lie nearer to one of them. (Planted:
-    the valley of the best of these alone.)"""
+    """Depths are tried a pixel of parallax apart, and the valley of another may lie nearer to one of them."""
     found = best_depth(beside(depth, patterns), fine)
     print(depth, patterns, found)
     assert not found.doubt and not found.alternatives and abs(found.mm - depth) < 2 * found.error_mm < 0.5
 
 
 def test_two_depths_that_explain_as_much_are_named(fine: Factors) -> None:
-    """In dim light and without an edge in view, until a range excludes one. (Planted: no chance.)"""
+    """In dim light and without an edge in view, until a range excludes one."""
     dim, other = beside(480.0, "dots:4", DIM, dark=8), 1 / (1 / 480 + 4 * WINDOW / COARSE / 60)
     image = reconstruct(dim, fine, focus="auto")
     depth = image.focus
@@ -245,8 +244,7 @@ def test_two_depths_that_explain_as_much_are_named(fine: Factors) -> None:
 
 @pytest.mark.parametrize("depth", [308.0, 556.0])
 def test_a_depth_beyond_the_range_is_not_taken_for_one_within(fine: Factors, depth: float) -> None:
-    """A period of the dots away is a depth within. (Planted: depths within the range alone: 324.8 and 511 mm, without
-    a word.)"""
+    """A period of the dots away is a depth within."""
     found = best_depth(beside(depth, "dots:4"), fine)
     print(found)
     assert found.at_end and "End of range" in found.doubt and abs(found.mm - depth) < 2 * found.error_mm
@@ -275,8 +273,7 @@ def test_a_range_that_is_none_is_refused(depth_range: object, focus: str | float
 
 def test_the_field_stop_cuts_what_moves_beyond_it() -> None:
     """A stop at 0.16: at 330 mm light of the window's edge, 0.15 as calibrated, comes from 0.18. Columns are as bright
-    in the mean as a board there would be, with their light on the part of the sensor that sees them. (Planted: places
-    on the sensor the other way round.)"""
+    in the mean as a board there would be, with their light on the part of the sensor that sees them."""
     stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
     factor, shift = np.ones((PIXELS, FINE)), 1 / 330 - 1 / 400
     side = FactorOfDepths(factor, stopped, 1)
@@ -303,8 +300,7 @@ def test_light_that_the_field_stop_hides_is_told() -> None:
 
 
 def test_noise_of_moved_columns_is_stated() -> None:
-    """Less than that of the calibrated ones, since each number is fitted to many; measured with another draw, 5 %.
-    (Planted: the calibrated noise.)"""
+    """Less than that of the calibrated ones, since each number is fitted to many; measured with another draw, 5 %."""
     white = np.random.default_rng(7).standard_normal((PIXELS, N))
     side = FactorOfDepths(1000 + white, PARALLAX, 0)
     shift = 1 / 360 - 1 / 400
