@@ -45,7 +45,7 @@ _OPPOSED = 4.0
 light of the right one, less is left of it than of the right one only if 2 r.d > |r|^2 for the misfit d of energy S; so
 |r|^2 < 4 S."""
 _LAMBDA = 1e-3
-"""Of the image by which noise of factors is weighed, over the largest sigma^2: chosen, as that changes little with it."""
+"""Of the image by which the noise of factors is weighed, over the largest sigma^2: chosen, like that of pixeldepths."""
 
 
 @dataclass(frozen=True)
