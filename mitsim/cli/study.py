@@ -66,6 +66,9 @@ def study(
     recipe: Annotated[
         Path | None, typer.Option(help="of calibration and drift: session recipe", metavar="FILE.toml")
     ] = None,
+    experiment: Annotated[
+        str | None, typer.Option(help="of merge: the module, where the study is one of your own", metavar="MODULE")
+    ] = None,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -84,7 +87,7 @@ def study(
         if name == "merge":
             from mitsim.study.campaign import merge
 
-            result: Any = merge(scenes or (), output)
+            result: Any = merge(scenes or (), output, experiment)
         elif is_experiment(name):
             from mitsim.study.campaign import Where, run_experiment
             from mitsim.study.points import Shard

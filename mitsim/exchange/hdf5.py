@@ -18,9 +18,9 @@ from mitsim import __version__
 from mitsim.core.colours import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import Channels, Metadata, Value
+from mitsim.core.hdf5file import whole_hdf5
 from mitsim.core.jsonfile import parse_json
 from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.output import whole_file
 from mitsim.core.plainfile import MOST_SIDE, check_plain
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture
@@ -200,9 +200,7 @@ class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
 @contextmanager
 def _begun(path: Path) -> Iterator[h5py.File]:
     """A file of this layout that takes its place at ``path`` when all is written."""
-    import h5py
-
-    with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
+    with whole_hdf5(path) as file:
         file.attrs["mitsim_exchange"] = LAYOUT
         file.attrs["mitsim_version"] = __version__
         yield file
