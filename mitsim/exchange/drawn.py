@@ -15,7 +15,7 @@ from mitsim.core.configuration import load_model, locate, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.jsonfile import write_json
 from mitsim.core.manifests import Patterns
-from mitsim.core.output import whole_folder
+from mitsim.core.output import whole_file, whole_folder
 from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import FrameList
 from mitsim.rig.order import UNIFORM, taken
@@ -346,9 +346,5 @@ def write_png(path: Path, values: npt.NDArray[Any]) -> None:
     """Write ``values`` (rows, columns) of 8 or 16 bits to ``path``. MitsimError where that is not possible."""
     from PIL import Image
 
-    try:
-        Image.fromarray(values).save(path, format="png")
-    except OSError as error:
-        raise MitsimError(
-            f"file {path}: cannot be written ({error.strerror or error}); choose a folder with room"
-        ) from error
+    with whole_file(path) as part:
+        Image.fromarray(values).save(part, format="png")
