@@ -91,7 +91,9 @@ def write_pngs_lines(folder: Path, run: Coloured[RunManifest], projector: str | 
 def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, Any]:
     """Write a run's pictures to a folder that this process holds; returns the grid's place as :func:`draw` does."""
     manifest = run.manifest
-    where = draw(place, pictures_of(manifest.patterns, str(run.place)), raster, str(run.place))
+    sides = tuple(len(matrix) for matrix in manifest.patterns.matrices)
+    pictures = pictures_of(manifest.patterns, str(run.place))
+    where = draw(place, pictures, raster, (sides[0], sides[1]), str(run.place))
     (place / "frames").mkdir()
     names = []
     for index, (shot, channels, _) in enumerate(shots_of(run)):
