@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _OPTIONS = {"lam": "lambda"}
 """Options that are not called like the argument."""
+SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
+"""Options that are not called like their parameter."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
 
 Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
@@ -296,6 +298,22 @@ def is_given(context: typer.Context, name: str) -> bool:
     """Whether the command line of a ``context`` names the parameter ``name``."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
+
+
+def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> None:
+    """MitsimError where the command line of a ``context`` gives one of the parameters ``names``, which have no effect
+    ``where`` they are: an option that is passed over would be taken for obeyed."""
+    for name in names:
+        if is_given(context, name):
+            option = SPELLED.get(name, f"--{name.replace('_', '-')}")
+            raise MitsimError(f"{option}: has no effect {where}; leave it out")
+
+
+def refuse_both(context: typer.Context, first: str, second: str) -> None:
+    """MitsimError where the command line of a ``context`` gives both of two parameters, of which one decides."""
+    if is_given(context, first) and is_given(context, second):
+        told = " and ".join(f"--{name.replace('_', '-')}" for name in (first, second))
+        raise MitsimError(f"{told}: either decides; give one of them")
 
 
 @contextmanager
