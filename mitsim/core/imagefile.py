@@ -22,7 +22,7 @@ import numpy.typing as npt
 from mitsim.core.arrayfile import Npy
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
-from mitsim.core.plainfile import check_plain
+from mitsim.core.plainfile import check_plain, stderr_silenced
 from mitsim.core.resources import Cost, Limits
 
 if TYPE_CHECKING:
@@ -232,7 +232,8 @@ def _tiff(path: Path, wanted: Wanted) -> _Found:
                 picture.seek(page)
                 unsigned = _check_tags(path, picture, wanted)
                 _check_size(path, wanted, picture.height, picture.width)
-                values = np.array(picture)
+                with stderr_silenced():
+                    values = np.array(picture)
                 # Pillow holds 32 bits as if they had a sign.
                 yield values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
 
@@ -356,12 +357,17 @@ def _allowed(kind: str, bits: Any, wanted: Wanted) -> str:
 def _opened(path: Path, kind: str, whole: bool = False) -> Iterator[Image]:
     """A picture file of that ``kind``, its pixels not yet read; ``whole``: from a copy in memory, as the library for
     packed TIFF would map the file, or read all of it for each page."""
-    from PIL import Image  # most work reads no picture
+    from PIL import Image, UnidentifiedImageError  # most work reads no picture
 
     with open(path, "rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         source = io.BytesIO(file.read()) if whole else cast("IO[bytes]", _Copied(file))
-        with Image.open(source, formats=(kind,)) as picture:
+        try:
+            opened = Image.open(source, formats=(kind,))
+        except UnidentifiedImageError:
+            raise ValueError(f"its header is none of a {kind}") from None
+        with opened as picture:
             yield picture
 
 
