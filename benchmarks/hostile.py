@@ -17,7 +17,6 @@ import importlib
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import struct
@@ -36,11 +35,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import h5py
 import numpy as np
+import psutil
 import scipy.io
 from PIL import Image
 
 import mitsim.cli
 from mitsim.core.framefile import write_frame
+from mitsim.core.versions import versions
 from mitsim.exchange.export import export_run
 from mitsim.study.experiment import Found, Point, Scope, Setup
 from mitsim.study.points import Store
@@ -94,7 +95,7 @@ class Good:
         for point in self.points:
             Store(part / "points").save(point, Found(({"psnr": 1.0},), {"image": np.ones((4, 4))}))
         head = {"kind": "patterns", "study": "patterns", "scope": asdict(Scope(Setup("photograph"), (None,)))}
-        (part / "patterns.json").write_text(json.dumps({**head, "versions": {}}))
+        (part / "patterns.json").write_text(json.dumps({**head, "versions": versions()}))
         (folder / "camera.toml").write_text(
             (Path(__file__).parents[1] / "calibration" / "imx249.toml").read_text(encoding="utf-8")
         )
@@ -192,7 +193,7 @@ def pictures(good: Good) -> Make:
             (folder / "a.raw").write_bytes(bytes(chance.choice((0, 63, 64, 128, 129))))
             if chance.random() < 0.4:
                 os.truncate(folder / "a.raw", chance.choice((1 << 30, 1 << 40)))
-            shape, bits = (
+            pixels, bits = (
                 chance.choice(("8x8", "16384x16384", "0x4", "99999x1", "axb")),
                 chance.choice(("8", "16", "0")),
             )
@@ -547,7 +548,7 @@ def tried(kind: str, seed: int, make: Make) -> Outcome:
         work.mkdir()
         command = [*make(random.Random(seed), work)]
         before = listed(work)
-        started, held = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        started, held = time.perf_counter(), psutil.Process().memory_info().rss
         child = os.fork()
         if not child:
             serve(command, folder / "stdout", folder / "stderr")
@@ -562,7 +563,7 @@ def tried(kind: str, seed: int, make: Make) -> Outcome:
             status,
             len(lines),
             time.perf_counter() - started,
-            max(usage.ru_maxrss - held, 0) * 1024,
+            max(usage.ru_maxrss * 1024 - held, 0),
         )
         broken = outcome.broken
         if status not in (0, 1, 2):

@@ -164,7 +164,13 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
         return _all(
             scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder, experiment)
         )
+    if heads[0]["versions"] != versions():
+        raise MitsimError(
+            f"study merge: {parts[0]} was measured by other versions ({cut(str(heads[0]['versions']))}), by which it "
+            "can be merged"
+        )
     campaign = _Campaign.of(study, scope, output)
+    _ = campaign.points  # which a scope that is none refuses, before there is a folder
     with campaign.folder(output) as (folder, store):
         for part in parts:
             store.take(Store(Path(part) / POINTS))

@@ -206,6 +206,18 @@ def test_no_module_is_imported_because_a_file_names_it(
     assert not (tmp_path / "ran").exists() and not (tmp_path / "joined").exists()
 
 
+def test_parts_of_other_versions_are_not_signed_by_this_one(run: Run, tmp_path: Path, whole: Whole) -> None:
+    """Though all parts are of the same. (Planted: parts held against each other alone.)"""
+    parts = [tmp_path / "a", tmp_path / "b"]
+    for part in parts:
+        shutil.copytree(whole[1], part)
+        told = json.loads((part / "toy.json").read_text())
+        (part / "toy.json").write_text(json.dumps({**told, "versions": {"mitsim": "0.1"}}))
+    with pytest.raises(MitsimError, match="measured by other versions"):
+        merge(parts, tmp_path / "joined", TOY)
+    assert not (tmp_path / "joined").exists()
+
+
 def test_a_point_of_a_hostile_part_takes_no_memory(run: Run, tmp_path: Path, whole: Whole) -> None:
     """Half a terabyte claimed by a header, many arrays, objects of Python. (Planted: read by numpy, which allocates
     what a header claims.)"""
