@@ -173,7 +173,7 @@ def pictures(good: Good) -> Make:
             (folder / "a.tif").write_bytes(tiff(tags, order=order, following=following))
             return _read(folder / "a.tif")
         if which == 5:
-            stack = [Image.new("L", (8, 6 + chance.randrange(2))) for _ in range(chance.randrange(1, 5))]
+            stack = [Image.new("L", (8, 6)) for _ in range(chance.randrange(1, 5))]
             name = chance.choice(("a.png", "a.tif", "a.gif", "a.webp"))
             stack[0].save(folder / name, save_all=True, append_images=stack[1:])
             shutil.move(folder / name, folder / f"b{chance.choice((name[1:], '.png', '.tif'))}")

@@ -301,8 +301,22 @@ def is_given(context: typer.Context, name: str) -> bool:
 
 
 def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> None:
-    """MitsimError where the command line of a ``context`` gives one of the parameters ``names``, which have no effect
-    ``where`` they are: an option that is passed over would be taken for obeyed."""
+    """Refuse options that have no effect: one that is passed over would be taken for obeyed.
+
+    Parameters
+    ----------
+    context
+        of the command line.
+    names
+        parameters that have no effect.
+    where
+        they have none, for the message.
+
+    Raises
+    ------
+    MitsimError
+        when one of them is given.
+    """
     for name in names:
         if is_given(context, name):
             option = SPELLED.get(name, f"--{name.replace('_', '-')}")
@@ -310,7 +324,20 @@ def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> N
 
 
 def refuse_both(context: typer.Context, first: str, second: str) -> None:
-    """MitsimError where the command line of a ``context`` gives both of two parameters, of which one decides."""
+    """Refuse two options of which one decides.
+
+    Parameters
+    ----------
+    context
+        of the command line.
+    first, second
+        parameters.
+
+    Raises
+    ------
+    MitsimError
+        when both are given.
+    """
     if is_given(context, first) and is_given(context, second):
         told = " and ".join(f"--{name.replace('_', '-')}" for name in (first, second))
         raise MitsimError(f"{told}: either decides; give one of them")
