@@ -5,9 +5,9 @@
 Inputs are made from a seed: good files of every kind that mitsim reads with bytes changed, and files that lie in one
 place. Each goes through its verb in a process that is forked for it, as the command line runs there, without the parent
 that would watch it, so that a crash in native code is seen. Ends with 1, and names them, where an input gives a
-traceback or another status than 0, 1 or 2; a refusal of other than one printable line, or of which a file is left; or
-where one takes more than ``SECONDS`` of processor time or ``MEMORY``. FILE has a row for each kind and one for each
-input that broke a rule.
+traceback, a fault of mitsim's own, or another status than 0, 1 or 2; a refusal of other than one printable line, or of
+which a file is left; or where one takes more than ``SECONDS`` of processor time or ``MEMORY``. FILE has
+a row for each kind and one for each input that broke a rule.
 """
 
 from __future__ import annotations
@@ -568,7 +568,7 @@ def tried(kind: str, seed: int, make: Make) -> Outcome:
         broken = outcome.broken
         if status not in (0, 1, 2):
             broken.append(f"status {status}")
-        if "Traceback" in said:
+        if "Traceback" in said or "a fault of mitsim's own" in said:
             broken.append("traceback")
         if status == 2 and len(lines) != 1:
             broken.append(f"{len(lines)} lines of a refusal")

@@ -7,6 +7,7 @@ claims is bounded before pixels are read, and files are copied, not mapped: one 
 from __future__ import annotations
 
 import io
+import logging
 import math
 import os
 import warnings
@@ -359,6 +360,9 @@ def _opened(path: Path, kind: str, whole: bool = False) -> Iterator[Image]:
     packed TIFF would map the file, or read all of it for each page."""
     from PIL import Image, UnidentifiedImageError  # most work reads no picture
 
+    logs = logging.getLogger("PIL")
+    if not logs.handlers:  # where nobody listens, Python writes errors in a log to stderr
+        logs.addHandler(logging.NullHandler())
     with open(path, "rb") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
         warnings.simplefilter("error", Image.DecompressionBombWarning)
