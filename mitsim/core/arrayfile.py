@@ -45,7 +45,12 @@ class Npy:
         read = _HEADERS.get(np.lib.format.read_magic(file))
         if read is None:
             raise ValueError("it is no array of numbers")
-        shape, fortran, dtype = read(file)
+        try:
+            shape, fortran, dtype = read(file)
+        except ValueError:
+            raise
+        except Exception:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
+            raise ValueError("its header is damaged") from None
         found = cls(shape, dtype, fortran, file.tell())
         if dtype.hasobject:
             raise ValueError("it holds objects of Python, which are code")

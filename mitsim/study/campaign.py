@@ -161,6 +161,9 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
             )
     study, scope = _known(heads[0]["study"], parts[0], experiment), _scope(heads[0]["scope"], parts[0])
     if study == ALL:
+        for part in parts:
+            for name in PAPER:
+                _head(Path(part) / name)  # before there is a folder
         return _all(
             scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder, experiment)
         )
