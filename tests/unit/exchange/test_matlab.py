@@ -164,6 +164,9 @@ def test_files_that_are_none_are_refused_and_no_folder_is_left(tmp_path: Path) -
     changed("phi_left is no matrix", phi_left="none")
     changed("phi_right is missing", phi_right=None)
     changed("truth is no matrix", truth="none")
+    changed("truth_board_reflectance is .* numbers of shape", truth_board_reflectance=np.ones(3))
+    changed("truth_board_reflectance is .* numbers of shape", truth_board_reflectance="none")
+    changed("truth_standard_error is .* numbers of shape", truth_standard_error=np.ones((1, 1)))
     changed("not valid JSON", run_manifest="{")
     (tmp_path / "text.mat").write_text("phi_left")
     with pytest.raises(MitsimError, match="no MATLAB file"):
