@@ -58,6 +58,8 @@ from mitsim.cli.options import (
     check_work,
     job_of,
     number_of,
+    refuse_both,
+    refuse_unused,
     request_of,
     spoken,
 )
@@ -75,6 +77,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+_ONLY_OF = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
+"""Options of `mitsim render` that the other estimator has."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -169,6 +173,7 @@ def demo(
 
 @app.command()
 def plan(
+    context: typer.Context,
     scene: Scene,
     patterns: Patterns = "dots:7",
     accuracy: AccuracyOrSeconds = None,
@@ -187,6 +192,7 @@ def plan(
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.core.resources import running_seconds
 
+    refuse_both(context, "accuracy", "seconds")
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     check_colour(colour, variant, projector, seconds)
     check_shown([patterns], scene, define, outside)
@@ -200,6 +206,7 @@ def plan(
 
 @app.command()
 def capture(
+    context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
     patterns: Patterns,
@@ -234,6 +241,11 @@ def capture(
     from mitsim.core.manifests import MANIFEST
     from mitsim.core.resources import memory_from_here, memory_since
 
+    refuse_both(context, "accuracy", "seconds")
+    if exposure != "auto":
+        refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
+    if ambient_frame == "no":
+        refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
     request = request_of(
         patterns=patterns,
         accuracy=accuracy,
@@ -297,6 +309,7 @@ app.registered_commands += calibration.app.registered_commands + image.app.regis
 
 @app.command()
 def render(
+    context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
     estimator: Annotated[str, typer.Option(help="reference or factored")] = "reference",
@@ -324,6 +337,7 @@ def render(
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
     request = request_of(accuracy=accuracy, seed=seed, effects=effects)
     check_samples(estimator, spp)
+    refuse_unused(context, _ONLY_OF[estimator], f"on the {estimator} estimator")
     check_output(output, overwrite=True, kind="file")
     method: Any = estimator
     with job_of(quiet or as_json, max_seconds, max_memory) as job:

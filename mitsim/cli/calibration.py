@@ -15,6 +15,7 @@ from mitsim.cli.colour import MOSAIC, NO, Colour, check_colour, in_colour, of_ca
 from mitsim.cli.modelling import calibrate_model, modelling_of
 from mitsim.cli.options import (
     DAY,
+    SPELLED,
     Accuracy,
     Camera,
     Defines,
@@ -54,8 +55,6 @@ _MODELS = "geometric|wave"
 """What --model may be."""
 _OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
-_SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
-"""Options that are not called like their parameter."""
 
 
 @app.command()
@@ -221,7 +220,7 @@ def _calibrate_frames(
         when there are such, and for frames that cannot be used.
     """
     if others:
-        name = _SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
+        name = SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
         raise MitsimError(f"--frames {folder}: frames and their list decide; leave out {name}")
     from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.rig.framelist import load_frames

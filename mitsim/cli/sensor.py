@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Json, Quiet, Seed, Variant, job_of, number_of
+from mitsim.cli.options import Json, Quiet, Seed, Variant, job_of, number_of, refuse_unused
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
@@ -18,6 +18,7 @@ app = typer.Typer()
 
 @app.command()
 def characterise(
+    context: typer.Context,
     camera: Annotated[str, typer.Argument(help="camera electronics: name or TOML file", metavar="CAMERA")],
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of JSON and plots")] = Path(
         "characterise-output"
@@ -41,6 +42,8 @@ def characterise(
     procedure = Procedure(pixels, steps, frames, seed, wavelength)
     capacity_of(sensor)
     efficiency_of(sensor, procedure)
+    if sensor.quantum_efficiency_curve is None:
+        refuse_unused(context, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
     check_study_folder(output, "characterise")
     from mitsim.study.characterise import characterise as run_characterise
 
@@ -51,6 +54,7 @@ def characterise(
 
 @app.command()
 def sense(
+    context: typer.Context,
     image: Annotated[Path, typer.Argument(help="irradiance [W/m^2], OpenEXR or NPY", metavar="IMAGE.exr")],
     camera: Annotated[str, typer.Option("--camera", help="camera electronics: name or TOML file", metavar="NAME|FILE")],
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.png|exr|npy")],
@@ -77,6 +81,8 @@ def sense(
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
     seconds = number_of("exposure", exposure)
+    if seconds != "auto":
+        refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
     asked = Exposure(None if seconds == "auto" else seconds, exposure_fraction)
     if not 0 < scale < math.inf:
         raise MitsimError(f"--scale {scale:g}: give a finite number above 0")

@@ -48,6 +48,12 @@ def whole_file(path: Path | str) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def write_text(path: Path | str, text: str) -> None:
+    """Write ``text`` to ``path`` in UTF-8, all or nothing. MitsimError when it cannot be written."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 def sweep(folder: Path) -> None:
     """Remove what killed processes left half-written in a ``folder`` that this one holds."""
     for part in folder.glob(".*.part"):

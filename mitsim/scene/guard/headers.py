@@ -23,6 +23,8 @@ MOST_TEXELS = 1 << 25
 """An environment map of 8192 x 4096."""
 FARTHEST = 1e7
 """Largest coordinate [mm], 10 km: single precision resolves 1 mm there."""
+_ORIENTATION = 274
+"""Tag of Exif (JEITA CP-3451, 4.6.4): how a picture is turned when it is shown; 1 is as stored."""
 _HEADER = 1 << 16
 """Bytes in which a header must end; those of meshes and Radiance pictures have some 500."""
 _GREY = ("1", "L", "LA", "I", "I;16")
@@ -124,8 +126,20 @@ def _check_points(points: npt.NDArray[np.float64]) -> None:
 
 
 def _pillow_size(path: Path, start: bytes) -> tuple[int, int]:
-    """Width and height in the header of a PNG or JPEG file."""
+    """Width and height in the header of a PNG or JPEG file, of which what is stored is what is seen."""
+    from PIL.Image import Exif
+
     with _pillow(path, start) as image:
+        exif = Exif()  # not by getexif, which looks for it behind a PNG's pixels too, and decodes them
+        try:
+            exif.load(image.info.get("exif", b""))
+            turned = exif.get(_ORIENTATION, 1)
+        except Exception:  # of a damaged one, whatever its reader stumbles over
+            raise ValueError("has damaged Exif data; save it again") from None
+        if turned != 1:
+            raise ValueError(f"has the orientation {turned}, which Mitsuba passes over; save it turned as it is seen")
+        if getattr(image, "custom_mimetype", None) == "image/apng":
+            raise ValueError("is animated, and Mitsuba shows its first picture alone; save that")
         return image.size
 
 
