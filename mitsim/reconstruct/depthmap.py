@@ -232,7 +232,8 @@ class _Search:
         astray = max(
             float((np.abs(self._arrivals.most(*rival)[0] - shift)[told] > self.width / 2).mean()) for rival in rivals
         )
-        if self.width - span < _SPARE * self.pixel or astray > _ASTRAY:
+        spared = not self._arrivals.limited or self.width - span >= _SPARE * self.pixel
+        if not spared or astray > _ASTRAY:
             return (
                 f"Parallax seems to span {span / self.pixel:.1f} projector pixels, and these dots tell "
                 f"{self.width / self.pixel:.0f} apart: depths may be off by a whole period, so the image is that of "

@@ -257,7 +257,7 @@ def test_a_depth_beyond_the_range_is_not_taken_for_one_within(fine: Factors, dep
         ((-1.0, 350.0), "auto", "above 0"),
         ((350.0, np.inf), "auto", "two depths"),
         ((350.0,), "map", "two depths"),
-        ("ab", "auto", "two depths"),
+        ("ab", "auto", "a tuple or None"),
         ((350.0, np.nan), "auto", "two depths"),
         ((350.0, 450.0), None, "focus auto or map"),
         ((350.0, 450.0), 400.0, "focus auto or map"),
@@ -323,7 +323,7 @@ def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("focus", "fragment"), [(0.0, "above 0"), (-5.0, "above 0"), ("near", "auto or map"), (np.nan, "above 0")]
+    ("focus", "fragment"), [(0.0, "above 0"), (-5.0, "above 0"), ("near", "auto' or 'map"), (np.nan, "above 0")]
 )
 def test_a_focus_that_is_none_is_refused(focus: object, fragment: str) -> None:
     with pytest.raises(ArgumentError, match=fragment) as caught:
