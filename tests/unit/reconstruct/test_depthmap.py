@@ -14,11 +14,11 @@ import pytest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.alldepths import AllDepths
-from mitsim.reconstruct.depthmap import depth_map
+from mitsim.reconstruct.depthmap import _Search, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.pixeldepths import PixelDepths
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
-from tests.ideal_sessions import Bench, picture
+from tests.ideal_sessions import PEAK, Bench, picture
 from tests.unit.reconstruct.test_focus import BASELINE, PARALLAX, N, shadow
 
 BESIDE = (0.0, BASELINE[1])
@@ -119,6 +119,41 @@ def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: flo
     assert "off by a whole period" in str(image.status) and "longer period along the baseline" in str(image.status)
     assert not image.ok and image.depths is None and np.array_equal(image.image, before.image)
     assert image.summary()["depths"] is None and "no depths are told" in str(image.focus)
+
+
+def flat(depth: float, patterns: str, peak: float = PEAK, dark: int = 0) -> Capture:
+    """A sheet; the window's first and last ``dark`` columns show nothing."""
+    scene = PRINT.copy()
+    scene[:, :dark], scene[:, N - dark :] = 0.0, 0.0
+    surfaces = ((np.ones((N, N), bool), *sides(depth, BESIDE)),)
+    return Layers(*sides(400.0, BESIDE), surfaces=surfaces, peak=peak).run(patterns, scene, 0)
+
+
+@pytest.mark.parametrize(
+    ("peak", "depth_range", "named"),
+    [(PEAK, None, False), (PEAK / 400, None, True), (PEAK / 400, (380.0, 420.0), False)],
+)
+def test_depths_that_may_all_be_a_period_away(
+    peak: float, depth_range: tuple[float, float] | None, named: bool
+) -> None:
+    """The true ones and those a period away differ by less than chance where eight dim columns are seen, unless the
+    range has no others. (Planted: chance left out; the range ignored.)"""
+    search = _Search(flat(400.0, "dots:8x5", peak, 16), calibrated(), depth_range)
+    told = np.zeros((N, N), bool)
+    told[:, 16 : N - 16] = True
+    doubt = search._periods_away(np.zeros((N, N)), told)
+    assert ("with a median of 400 or" in doubt) == named
+
+
+@pytest.mark.parametrize("patterns", ["dots:4", "dots:8"])
+def test_a_range_may_be_narrower_than_the_period(patterns: str) -> None:
+    """Of 3 pixels of parallax; a sheet beside it is flagged. (Planted: two pixels spared as if the dots' period were
+    the limit.)"""
+    factors = calibrated()
+    inside = reconstruct(flat(380.0, patterns), factors, focus="map", depth_range=(360.0, 400.0))
+    assert inside.ok and inside.depths is not None and np.median(np.abs(inside.depths.mm - 380)) < 1
+    assert inside.summary()["focus_range_mm"] == pytest.approx((360, 400))
+    assert not reconstruct(flat(380.0, patterns), factors, focus="map", depth_range=(390.0, 440.0)).ok
 
 
 def test_dark_pixels_have_no_confidence() -> None:

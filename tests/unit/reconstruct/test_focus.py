@@ -218,14 +218,16 @@ def fine() -> Factors:
 
 @pytest.mark.parametrize(("depth", "patterns"), [(480.0, "dots:4"), (450.0, "dots:7"), (353.0, "dots:5")])
 def test_a_depth_is_not_taken_for_one_a_period_away(fine: Factors, depth: float, patterns: str) -> None:
-    """Depths are tried a pixel of parallax apart, and the valley of another may lie nearer to one of them."""
-    found = best_depth(beside(depth, patterns), fine)
+    """Without an edge in view. Depths are tried a pixel of parallax apart, and the valley of another may lie nearer to
+    one of them. (Planted: the valley of the best depth that was tried is followed alone.)"""
+    found = best_depth(beside(depth, patterns, dark=8), fine, (240.0, 900.0))
     print(depth, patterns, found)
     assert not found.doubt and not found.alternatives and abs(found.mm - depth) < 2 * found.error_mm < 0.5
 
 
 def test_two_depths_that_explain_as_much_are_named(fine: Factors) -> None:
-    """In dim light and without an edge in view, until a range excludes one."""
+    """In dim light and without an edge in view, until a range excludes one. (Planted: one valley followed; chance left
+    out; an error without the choice; the range ignored.)"""
     dim, other = beside(480.0, "dots:4", DIM, dark=8), 1 / (1 / 480 + 4 * WINDOW / COARSE / 60)
     image = reconstruct(dim, fine, focus="auto")
     depth = image.focus
@@ -273,7 +275,8 @@ def test_a_range_that_is_none_is_refused(depth_range: object, focus: str | float
 
 def test_the_field_stop_cuts_what_moves_beyond_it() -> None:
     """A stop at 0.16: at 330 mm light of the window's edge, 0.15 as calibrated, comes from 0.18. Columns are as bright
-    in the mean as a board there would be, with their light on the part of the sensor that sees them."""
+    in the mean as a board there would be, with their light on the part of the sensor that sees them. (Planted: no
+    stop.)"""
     stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
     factor, shift = np.ones((PIXELS, FINE)), 1 / 330 - 1 / 400
     side = FactorOfDepths(factor, stopped, 1)
@@ -291,6 +294,7 @@ def test_the_field_stop_cuts_what_moves_beyond_it() -> None:
 
 
 def test_light_that_the_field_stop_hides_is_told() -> None:
+    """(Planted: no stop; no flag.)"""
     factors = calibrated()
     stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
     factors = replace(factors, manifest=factors.manifest.model_copy(update={"parallax": stopped}))
@@ -300,7 +304,8 @@ def test_light_that_the_field_stop_hides_is_told() -> None:
 
 
 def test_noise_of_moved_columns_is_stated() -> None:
-    """Less than that of the calibrated ones, since each number is fitted to many; measured with another draw, 5 %."""
+    """Less than that of the calibrated ones, since each number is fitted to many; measured with another draw, 5 %.
+    (Planted: that of the calibrated ones stated.)"""
     white = np.random.default_rng(7).standard_normal((PIXELS, N))
     side = FactorOfDepths(1000 + white, PARALLAX, 0)
     shift = 1 / 360 - 1 / 400
