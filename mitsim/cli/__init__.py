@@ -93,7 +93,9 @@ def run() -> None:
         raise
     except MitsimError as error:
         _fail(spoken(error))
-    except (typer.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt) as error:
+        if isinstance(error.__cause__, EOFError):  # which click takes for Control-D
+            end_uncaught(error.__cause__)
         code = INTERRUPTED
     except MemoryError:
         _fail("out of memory; close other programs, or ask for fewer pixels, frames or less accuracy")
