@@ -40,6 +40,10 @@ _ALL = 0.3
 class Cause(Enum):
     """Why measurements do not fit; the value is its sentence and the remedy."""
 
+    FRAMES = (
+        "frames that are not what they say",
+        "capture these frames again",
+    )
     SATURATION = (
         "readings at the full well or the ADC's end",
         "expose for less",

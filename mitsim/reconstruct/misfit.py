@@ -20,6 +20,7 @@ from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.calibration import decibels
 from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
+from mitsim.reconstruct.faults import FrameCheck, FrameFault, FrameSums
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Status, Verdict
@@ -37,6 +38,8 @@ GROSS = 0.1
 the part has to be four times the energy of their shot noise, too."""
 _GROSS_CHI_SQUARE = 4.0
 """The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
+_SHOWN = 4
+"""Faults that a sentence holds; result.json has them all."""
 _TINY = 1e-300
 """Stands for 0 in a denominator."""
 _TILES = 8
@@ -69,6 +72,8 @@ class Misfit:
     foretold
         what the calibration foretells of ``unexplained``, print apart, from what its factors lack of the camera; None
         where it does not know.
+    faults
+        frames that are not what they say; with any the image is flagged.
     """
 
     chi_square: float
@@ -80,6 +85,7 @@ class Misfit:
     cause: Cause | None
     signatures: Signatures | None
     foretold: float | None = None
+    faults: tuple[FrameFault, ...] = ()
 
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
@@ -97,6 +103,7 @@ class Misfit:
             "cause": self.cause.name.lower() if self.cause else None,
             "signatures": asdict(self.signatures) if self.signatures else None,
             "foretold": self.foretold,
+            "faults": [fault.summary() for fault in self.faults],
             "map": self.tiles.tolist(),
         }
 
@@ -104,6 +111,8 @@ class Misfit:
         """The ``status`` of a solution with this misfit."""
         if not self.flagged or self.cause is None:
             return status
+        if self.faults:
+            return self._faulty(status)
         times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
         foretold = ""
         if self.foretold:
@@ -115,6 +124,15 @@ class Misfit:
         if not status.verdict.good:
             return replace(status, flags=(*status.flags, f"Misfit: {sentence}; {self.cause.value[1]}."))
         return replace(status, verdict=Verdict.MISFIT, sentence=f"Misfit: {sentence}", remedy=self.cause.value[1])
+
+
+    def _faulty(self, status: Status) -> Status:
+        """The ``status`` of a solution of faulty frames."""
+        more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
+        sentence = f"Faulty frames: {'; '.join(map(str, self.faults[:_SHOWN]))}{more}"
+        if not status.verdict.good:
+            return replace(status, flags=(*status.flags, f"{sentence}; {Cause.FRAMES.value[1]}."))
+        return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=Cause.FRAMES.value[1])
 
 
 def shown(chi_square: float) -> str:
@@ -142,6 +160,8 @@ class Residuals:
         (tiles, tiles) sums of the squares of residuals, of measurements and of shots, and of the noise's variance.
     pixels
         (tiles, tiles) pixels of each tile.
+    by_pattern
+        energies by pattern.
     """
 
     def __init__(self, prepared: Prepared, weights: FloatArray, noise: FrameNoise, evidence: Evidence) -> None:
@@ -152,6 +172,7 @@ class Residuals:
         self._starts = edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         self.residual, self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(4))
+        self.by_pattern = FrameSums((noise.variance.shape[0], noise.variance.shape[1]))
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
@@ -159,9 +180,11 @@ class Residuals:
         frame = centred(measurement.frame) if prepared.centre else measurement.frame
         left, right = prepared.left.slabs[measurement.row], prepared.right.slabs[measurement.column]
         residual = frame - (left.matrix @ self._weights[left.columns][:, right.columns]) @ right.matrix.T
-        self.residual += self._squares(residual)
+        left_over, power = self._squares(residual), self._sums(measurement.power)
+        self.residual += left_over
         self.energy += self._squares(frame)
-        self.power += self._sums(measurement.power)
+        self.power += power
+        self.by_pattern.add(measurement, float(left_over.sum()), float(power.sum()), self._noise.light)
         # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
         light = self._sums(measurement.light) / self.pixels
         variance = self._noise.of(light, measurement.shots) * self.pixels
@@ -193,6 +216,7 @@ def judge(
     factor_energy: float | None,
     print_energy: float,
     evidence: Evidence,
+    check: FrameCheck,
 ) -> Misfit | None:
     """Hold all measurements against the model; None where there are no more data than unknowns.
 
@@ -210,6 +234,8 @@ def judge(
         what print within a pixel may add: left to a fitting scene, but no part of the chi-square.
     evidence
         empty, of the same model.
+    check
+        of the same measurements.
     """
     if prepared.rank >= prepared.left.data_rows * prepared.right.data_rows:
         return None
@@ -221,6 +247,9 @@ def judge(
     found, excess = balance.misfit(noise, print_energy)
     if evidence.foretold is not None:
         found = replace(found, foretold=float(np.sqrt(evidence.foretold / max(float(sums.energy.sum()), _TINY))))
+    faults = check.faults(sums.by_pattern, noise.rendering + (factor_energy or 0.0) + print_energy)
+    if faults:
+        return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
     if not found.flagged:
         return found
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))

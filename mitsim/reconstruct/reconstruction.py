@@ -22,6 +22,7 @@ from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.faults import FrameCheck
 from mitsim.reconstruct.focus import focused
 from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.margin import Margin
@@ -32,6 +33,10 @@ from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Verdict
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
+
+_LAMBDA_OF_TV = 1e-3
+"""Lambda, over the largest sigma^2, by which frames are foretold beside an image of total variation, whose own weight
+says nothing of it: chosen, between those of bright and of dim runs."""
 
 
 @single_threaded_blas()
@@ -179,14 +184,19 @@ class Accumulated:
         lack = self.lack(factors, image)
         if isinstance(solution, DepthMap):
             return solution.misfit(self.noise, added, print_energy(self.model, image))
+        weights = np.where(problem.sigma > 0, problem.projected, 0.0)
+        lam = _LAMBDA_OF_TV * problem.scale if isinstance(solution, TVSolution) else solution.lam
         return judge(
             self.prepared,
-            np.where(problem.sigma > 0, problem.projected, 0.0),
+            weights,
             self.kept or shots.measured(),
             self.noise,
             added,
             print_energy(self.model, image),
             Evidence(factors, shots.patterns, lack.energy if lack else None),
+            FrameCheck(
+                self.prepared, weights, lam, shots.patterns, shots.manifest, self.noise, lambda: self.kept or shots.measured()
+            ),
         )
 
     def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
