@@ -405,7 +405,7 @@ class FrameCheck:
             for pattern, (left, right) in grams.items():
                 places = self._columns(*pattern)
                 now[places] += left @ weights[places] @ right
-            weights = now if self._exclusive else self._kept * now
+            weights = now
         return weights
 
     def _gathered(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
@@ -489,7 +489,7 @@ class _Namer:
             sure = [each for each in fits if each[1] in (Fault.BLACK, Fault.REPEATED)]
             if sure or fits:
                 named.append(min(sure or fits, key=lambda each: each[0] if not sure else 0.0))
-        return [check._fault(fault, numbers, words) for _, fault, numbers, words in self._pairs(self._halves(named))]
+        return [check._fault(fault, numbers, words) for _, fault, numbers, words in self._pairs(named)]
 
     # ---- what was read
 
@@ -507,7 +507,8 @@ class _Namer:
         return _Seen((number,), pattern, measurement.frame, frame, foretold, variance, off)
 
     def _signed(self) -> list[_Seen]:
-        """Halves of patterns whose sum is off, as the other half tells them; of others their difference."""
+        """Of patterns whose sum is off the half that its other half, and the model, tell to be wrong; of others the
+        difference."""
         check = self._check
         good = check._noise.variance.size - len(self._bad)
         total = self._total - sum(each.light for each in self._measured.values())
@@ -519,8 +520,15 @@ class _Namer:
             numbers = tuple(check._number[(*pattern, sign)] for sign in (1, -1))
             if off > CHANCE * variance * np.sqrt(2 * each.light.size) and off > _OFF**2 * _energy(mean):
                 halves = (each.light + each.frame) / 2, (each.light - each.frame) / 2
-                for number, half, other in zip(numbers, halves, halves[::-1], strict=True):
-                    found.append(_Seen((number,), pattern, half, half, mean - other, variance, off))
+                modelled = check._frame(self._weights, *pattern)
+                # Which half is wrong: the other one, as it is, makes a difference nearer to what the model tells.
+                by_model = [
+                    _energy(self._level(sign * (mean - 2 * other)) - modelled)
+                    for sign, other in ((1, halves[1]), (-1, halves[0]))
+                ]
+                wrong = int(np.argmin(by_model))
+                half, other = halves[wrong], halves[1 - wrong]
+                found.append(_Seen((numbers[wrong],), pattern, half, half, mean - other, variance, off))
             else:
                 foretold, frame = check._frame(self._weights, *pattern), check._centred(each.frame)
                 off = _energy(frame - foretold) - frame.size * variance
@@ -534,9 +542,10 @@ class _Namer:
             yield from self._exchanged(one)
             return
         if self._is_black(one):
-            yield 0.0, Fault.BLACK, one.numbers, "holds no light"
+            yield -np.inf, Fault.BLACK, one.numbers, "holds no light"
         if one.foretold is None and self._bad[one.pattern]:
             yield from self._by_neighbours(one)
+            return
         yield from self._part_lost(one)
         yield from self._clipped(one)
         yield from self._scaled(one)
@@ -545,17 +554,23 @@ class _Namer:
 
     def _is_black(self, one: _Seen) -> bool:
         """Whether a shot is as even, and as dark, as a sensor without light."""
-        light = one.foretold if one.foretold is not None else self._total / self._check._noise.variance.size
+        count = self._check._noise.variance.size
+        light = one.foretold if one.foretold is not None else self._total / count
+        if count == 1 and self._bad[one.pattern]:
+            return True
         dark = float(self._check._digital.variance(0.0))
         spread, expected = float(one.raw.var()) - dark, float(light.var())
         return bool(spread < _DARK**2 * expected + dark and one.raw.mean() < _DARK * abs(light.mean()) + np.sqrt(dark))
 
     def _by_neighbours(self, one: _Seen) -> Iterable[Named]:
         check = self._check
+        if not check._exclusive:
+            return
         told = self._weights[check._columns(*one.pattern)]
         ratio = float(np.vdot(check._own(one.frame, *one.pattern), told)) / max(_energy(told), 1e-300)
         fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
-        yield 0.0, fault, one.numbers, f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
+        words = f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
+        yield -np.inf, fault, one.numbers, words
 
     def _scaled(self, one: _Seen) -> Iterable[Named]:
         if one.foretold is None:
@@ -570,6 +585,8 @@ class _Namer:
         """Rows, or columns, without light side by side."""
         for axis, name in ((0, "rows"), (1, "columns")):
             lines, usual = one.raw.mean(axis=1 - axis), self._total.mean(axis=1 - axis)
+            if self._check._noise.variance.size == 1:
+                usual = np.full_like(usual, usual.mean())
             ratio = lines / np.where(usual > 0, usual, np.inf)
             lost = np.abs(ratio) < _DARK * max(float(np.percentile(ratio, 75)), 0.0)
             lost |= (lines < 0) & (usual > 0) & (ratio < 0)
@@ -742,19 +759,6 @@ class _Namer:
                         words = f"repeats frame {number} ({check._shots[number].file})"
                         found.setdefault(one.numbers, []).append((beyond, Fault.REPEATED, one.numbers, words))
         return found
-
-    def _halves(self, named: list[Named]) -> list[Named]:
-        """One name for a signed pattern's two halves: the one that explains more."""
-        best: dict[Any, Named] = {}
-        for each in named:
-            number = each[2][0]
-            shot = self._check._shots[number]
-            key = (shot.row, shot.column)
-            sure = each[1] in (Fault.BLACK, Fault.REPEATED)
-            rank = (not sure, each[0])
-            if key not in best or rank < (best[key][1] not in (Fault.BLACK, Fault.REPEATED), best[key][0]):
-                best[key] = each
-        return list(best.values())
 
     def _pairs(self, named: list[Named]) -> Iterable[Named]:
         """Frames that are of each other's pattern, as one fault."""
