@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,8 @@ class Measurement:
         their number.
     saturated
         readings of them at the full well or the ADC's end.
+    factor
+        largest whole number that divides all of their digital numbers; 1 where they are not whole.
     """
 
     frame: FloatArray
@@ -54,11 +57,13 @@ class Measurement:
     light: FloatArray
     shots: int
     saturated: int
+    factor: int = 1
 
     def __add__(self, other: Measurement) -> Measurement:
         """Both halves of a signed pattern as one measurement."""
         shots, saturated = self.shots + other.shots, self.saturated + other.saturated
-        return Measurement(self.frame + other.frame, self.row, self.column, self.light + other.light, shots, saturated)
+        light, factor = self.light + other.light, math.gcd(self.factor, other.factor)
+        return Measurement(self.frame + other.frame, self.row, self.column, light, shots, saturated, factor)
 
     @property
     def power(self) -> FloatArray:

@@ -22,6 +22,10 @@ from mitsim.core.recorders import TRUTH, Recorder, claimed, frame_name
 _SHOWN = 3
 """Frames that a notebook shows: with the truth they fill a line."""
 
+_SAMPLE = 1024
+"""Numbers of a frame that are looked at first for a factor of all of them: by chance that many are even once in
+2^1024."""
+
 
 class Capture:
     """All shots of one pattern family, in memory or in their folder.
@@ -142,7 +146,8 @@ class Capture:
                 )
             light = digital.rate(dn)
             full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
-            half = Measurement(light * shot.sign if shot.sign else self._lit(light), *index, light, 1, full)
+            own = light * shot.sign if shot.sign else self._lit(light)
+            half = Measurement(own, *index, light, 1, full, _common_factor(dn))
             if shot.sign and index not in waiting:
                 waiting[index] = half
                 continue
@@ -293,6 +298,17 @@ class Capture:
 def load_run(folder: Path | str) -> Capture:
     """The capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
     return Capture(read_manifest(Path(folder), RunManifest), Path(folder))
+
+
+def _common_factor(dn: FloatArray) -> int:
+    """Largest whole number that divides all numbers ``dn``; 1 where they are not whole."""
+    for part in (dn.ravel()[:_SAMPLE], dn.ravel()):  # nearly always the first few tell
+        if not np.array_equal(part, np.rint(part)):
+            return 1
+        factor = int(np.gcd.reduce(part.astype(np.int64)))
+        if factor == 1:
+            break
+    return factor
 
 
 def _size(shape: tuple[int, ...]) -> str:

@@ -1,4 +1,4 @@
-"""Measurements, the factorised model and its fit in; out come the frames that are not what they say, by number and fault.
+"""Measurements, the factorised model and its fit in; out come frames that are not what they say, by number and fault.
 
 Each frame is foretold from the others. Where patterns overlap the model does it: a pattern is left out of the sums W,
 and its own part is put in again as the rest tells it, until that stands still. Under shifting dots no pixel is in two
@@ -51,16 +51,21 @@ neighbours foretell; and the least such part that is named."""
 _FEW = 1.2
 """The least part times the number of frames: half of so few frames do not tell a spread."""
 _BRIGHT_ENOUGH = 0.2
-"""Of the mean foretold reflectance, from which a pixel counts when frames' pixels are compared with their neighbours."""
+"""Of the mean foretold reflectance, from which a pixel counts when it is compared with its neighbours."""
 _FEWEST_PIXELS = 6
 """Pixels of a frame that its neighbours foretell, below which their median is chance."""
 _DARK = 0.1
 """Of the light that is foretold, below which a frame or a row of it is black."""
 _LEAST_LOST = 0.02
 """Part of a frame's rows, or columns, that are lost before it is said; a dead line is less."""
+_NEGATIVE = 0.5
+"""Mean reflectance of pixels that are lit alike, over the largest such mean, below which less the image is negative:
+chosen, no noise of a picture that shows anything is as large."""
 _FLAT = 1e-4, 10, 4.0
 """Readings at a frame's largest number from which it is clipped: a part of all, at least so many, and so many times the
 readings of the upper half of what remains below it, a hundredth of its range wide."""
+_NEAR_TOP = 0.8
+"""Of the largest number, the light that clipped readings are foretold at least; hot pixels have less."""
 _REACH = 24
 """Sensor pixels that frames are moved by in search of a shift."""
 _QUIET, _AVERAGED = 0.5, 0.01
@@ -109,8 +114,8 @@ class FrameFault:
 class FrameSums:
     """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
 
-    ``residual``, ``power``: what is left of a pattern's measurement, and sum of the squares of its shots. ``light``: sum
-    of its light. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
+    ``residual``, ``power``: what is left of a pattern's measurement, and sum of the squares of its shots. ``light``:
+    sum of its light. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
     """
 
     counts: tuple[int, int]
@@ -173,7 +178,8 @@ class FrameCheck:
         noise: FrameNoise,
         measured: Callable[[], Iterable[Measurement]],
     ) -> None:
-        self._prepared, self._weights, self._noise, self._measured = prepared, weights, noise, measured
+        self._prepared, self._weights, self._noise = prepared, weights, noise
+        self.manifest, self.measured = manifest, measured
         self._patterns, self._digital = patterns, manifest.digital
         self._shots = manifest.patterns.captures
         self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
@@ -188,6 +194,13 @@ class FrameCheck:
         self._spare = 1 - prepared.rank / (prepared.left.data_rows * prepared.right.data_rows)
 
     # ---- suspicion
+
+    def all_off(self, sums: FrameSums, beside_noise: float) -> bool:
+        """Whether the typical frame is off, and not single ones; both arguments as :meth:`faults` takes them."""
+        noise = self._noise.variance * self._size * self._spare
+        share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
+        part = np.maximum(sums.residual - noise - share, 0.0) / np.maximum(sums.power, np.finfo(float).tiny)
+        return bool(np.median(part) > _OFF**2)
 
     def faults(self, sums: FrameSums, beside_noise: float) -> tuple[FrameFault, ...]:
         """The frames at fault.
@@ -215,6 +228,18 @@ class FrameCheck:
             others = self._without(tuple(bad))
             sums = self._gathered(others, bad)
         return (*found, *_Namer(self, bad, others).faults()) if bad else tuple(found)
+
+    def negative(self) -> str:
+        """Why signed patterns were taken the wrong way round, or nothing: pixels that are always lit alike then have a
+        negative reflectance in the mean, where noise is averaged."""
+        if not self._signed or max(self._periods) < 2:
+            return ""
+        image = self._image(self._weights)
+        rows, columns = (group_pixels(side, "block") for side in self._patterns)
+        means = np.array([[image[np.ix_(row.pixels, column.pixels)].mean() for column in columns] for row in rows])
+        if means.min() > -_NEGATIVE * np.abs(means).max():
+            return ""
+        return "the image is negative: the halves of signed pairs are exchanged, or their frames in another order"
 
     def _suspect(
         self, sums: FrameSums, weights: FloatArray, beside_noise: float, bad: dict[Pattern, bool]
@@ -374,7 +399,7 @@ class FrameCheck:
 
     def _measurements(self, patterns: Iterable[Pattern]) -> dict[Pattern, Measurement]:
         wanted = set(patterns)
-        return {key: each for each in self._measured() if (key := (each.row, each.column)) in wanted}
+        return {key: each for each in self.measured() if (key := (each.row, each.column)) in wanted}
 
     def _centred(self, frame: FloatArray) -> FloatArray:
         return centred(frame) if self._prepared.centre else frame
@@ -415,7 +440,7 @@ class FrameCheck:
         if self._signed:
             total = sum((each.light for each in self._measurements(self._good(bad)).values()), start=np.zeros(()))
         others = max(self._noise.variance.size - len(set(bad)), 2)
-        for each in self._measured():
+        for each in self.measured():
             residual = self._centred(each.frame) - self._frame(weights, each.row, each.column)
             pattern = each.row, each.column
             sums.residual[pattern], sums.power[pattern] = _energy(residual), float(each.power.sum())
@@ -497,8 +522,10 @@ class _Namer:
         check, measurement = self._check, self._measured[pattern]
         number, frame = check._number[(*pattern, 0)], check._centred(measurement.frame)
         variance = float(check._noise.variance[pattern])
-        foretold = None if check._exclusive or len(self._bad) == check._noise.variance.size else check._frame(
-            self._weights, *pattern
+        foretold = (
+            None
+            if check._exclusive or len(self._bad) == check._noise.variance.size
+            else check._frame(self._weights, *pattern)
         )
         if foretold is None:
             off = self._outside(frame, pattern, variance)
@@ -609,12 +636,16 @@ class _Namer:
         if count < max(part * flat.size, least) or count * times < below or count > 0.9 * flat.size:
             return
         if one.foretold is not None:
+            if float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
+                return
             left = _energy(one.frame - np.minimum(one.foretold, top)) - flat.size * one.variance
         else:
             filled = one.frame
             for _ in range(_STEPS):
                 fit = self._fit(filled, one.pattern)
                 filled = np.where(flat, np.maximum(fit, one.frame), one.frame)
+            if float(np.median(fit[flat])) < _NEAR_TOP * top:  # hot pixels, not light
+                return
             left = _energy((one.frame - fit)[~flat]) - float((~flat).sum()) * one.variance * self._check._spare
         yield left, Fault.CLIPPED, one.numbers, f"has {count} readings at its largest number"
 
@@ -744,7 +775,7 @@ class _Namer:
         """Shots that are equal to another, but for noise."""
         check = self._check
         found: dict[tuple[int, ...], list[Named]] = {}
-        for each in check._measured():
+        for each in check.measured():
             pattern = each.row, each.column
             signs = (1, -1) if each.shots == 2 else (0,)
             variance = float(check._noise.variance[pattern])

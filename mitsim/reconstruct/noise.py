@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,8 @@ class FrameNoise:
         sum of the squares of all shots [(electrons/s)^2], and (m, m') of all shots [electrons/s].
     shots, saturated, readings
         shots of a pattern; readings at the full well or the ADC's end, and all of them.
-
+    factor
+        largest whole number that divides all digital numbers; 1 where they are not whole.
     """
 
     def __init__(self, manifest: RunManifest, ambient: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -49,6 +51,7 @@ class FrameNoise:
         self.columns: FloatArray
         self.rows, self.columns = (np.zeros((*counts, 0)) for _ in range(2))
         self.power, self.shots, self.saturated, self.readings = 0.0, 1, 0, 0
+        self.factor = 0
         self.light: FloatArray = np.zeros((0, 0))
 
     @property
@@ -89,6 +92,7 @@ class FrameNoise:
         self.rows[pattern], self.columns[pattern] = (self._own(light.mean(axis=axis), shots) for axis in (1, 0))
         self.power += float(measurement.power.sum())
         self.shots = shots
+        self.factor = math.gcd(self.factor, measurement.factor)
         self.saturated += measurement.saturated
         self.readings += shots * measurement.frame.size
 

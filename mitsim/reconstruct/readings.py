@@ -1,0 +1,198 @@
+"""Measurements that fit no image in; out comes how else their frames may be read, where they fit that way.
+
+Each other reading is added up anew by the same factorised model: frames turned or mirrored, shots in another order,
+numbers that are a power of the light. U of the model is orthonormal, so that |Y|^2 - |W|^2 is what a reading leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.manifests import RunManifest
+from mitsim.core.measurement import Measurement
+from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.solver import Prepared
+
+_FITS = 0.05
+"""Part of the unexplained energy that a reading may leave: the others of a frame that is turned leave half or more."""
+_AT_MOST = 2e-2
+"""Part of the measurements, rms, that it may leave: one that is right leaves 1e-2 of a sheet 2 mm beside the calibrated
+distance."""
+_CUT = 1.5
+"""Part of the unexplained energy that another order may leave, times the number of patterns: of a cycle that was
+entered late one frame was taken before it."""
+_CUT_AT_MOST = 0.3
+"""The most of that: runs of a few frames do not tell an order."""
+_POWERS = 1.8, 2.2, 2.4
+"""Exponents that displays and files encode light by, beside the curve of sRGB (IEC 61966-2-1)."""
+
+_MULTIPLIED, _LEAST_MULTIPLIED = 0.5, 1.5
+"""Chi-square of multiplied numbers, over their factor, and at least: shot noise alone makes that of 1 times the factor,
+and what is rounded to it 1.1."""
+
+Frames = Iterator[tuple[FloatArray, int, int]]
+
+_TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "upside down, their rows reversed": lambda frame: frame[::-1],
+    "mirrored, their columns reversed": lambda frame: frame[:, ::-1],
+    "turned by 180 degrees": lambda frame: frame[::-1, ::-1],
+    "transposed, their rows and columns exchanged": lambda frame: frame.T,
+    "turned by 90 degrees counter-clockwise": lambda frame: np.rot90(frame, -1),
+    "turned by 90 degrees clockwise": lambda frame: np.rot90(frame),
+    "transposed about the other diagonal": lambda frame: frame[::-1, ::-1].T,
+}
+"""What frames may be, and what brings them back."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Another way to take the frames: the ``cause`` that it is, in ``words``; which leaves the part ``left`` of all
+    measurements, rms."""
+
+    cause: Cause
+    words: str
+    left: float
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Other readings of a run.
+
+    Attributes
+    ----------
+    prepared
+        the factorised model.
+    manifest
+        of the run.
+    measured
+        reads all measurements once more.
+    """
+
+    prepared: Prepared
+    manifest: RunManifest
+    measured: Callable[[], Iterable[Measurement]]
+
+    def fitting(self, unexplained: float, noise: float) -> Reading | None:
+        """The reading that fits best, where one does.
+
+        Parameters
+        ----------
+        unexplained
+            part of the measurements, rms, that is left of them as they are.
+        noise
+            part of their energy that is expected to be left.
+        """
+        fits: list[Reading] = []
+        for cause, words, frames, most, noisier in self._tried():
+            left = np.sqrt(max(self._left_over(frames) - noise * noisier, 0.0))
+            if left < np.sqrt(most) * unexplained and (left < _AT_MOST or most > _FITS):
+                fits.append(Reading(cause, words, float(left)))
+        return min(fits, key=lambda reading: reading.left, default=None)
+
+    def _left_over(self, frames: Frames) -> float:
+        """Part of the energy of ``frames`` that the model leaves."""
+        sums = self.prepared.accumulator()
+        for frame, row, column in frames:
+            sums.add(frame, row, column)
+        problem = self.prepared.problem(sums)
+        explained = float(np.square(problem.projected[problem.sigma > 0]).sum())
+        return 1 - explained / problem.energy if problem.energy > 0 else 1.0
+
+    def _tried(self) -> Iterator[tuple[Cause, str, Frames, float, float]]:
+        """Cause, words and frames of each reading, the part of the unexplained energy that it may leave, and how much
+        more of their energy is noise than before."""
+        shape = self.prepared.left.sensor_size, self.prepared.right.sensor_size
+        for words, turn in _TURNS.items():
+            if turn(np.zeros(shape)).shape == shape:
+                yield Cause.ORIENTATION, f"the frames are {words}", self._each(turn), _FITS, 1.0
+        shots = self.manifest.patterns.captures
+        size = self.prepared.left.pattern_count * self.prepared.right.pattern_count
+        if size > 1:
+            cut = min(max(_FITS, _CUT / size), _CUT_AT_MOST)
+            orders = {
+                "one step late: each shot shows the pattern of the shot before": lambda number: number - 1,
+                "one step early: each shot shows the pattern of the next": lambda number: number + 1,
+                "in the reverse order": lambda number: len(shots) - 1 - number,
+            }
+            if any(shot.sign for shot in shots):
+                orders["with the halves of each pair exchanged"] = lambda number: number ^ 1
+            for words, order in orders.items():
+                yield Cause.ORDER, f"the frames are {words}", self._ordered(order), cut, 1.0
+        yield Cause.GAMMA, "the numbers follow the curve of sRGB", self._linear(_of_srgb), _FITS, 5.0
+        for power in _POWERS:
+            words = f"the numbers are the light to the power of 1/{power:g}"
+            yield Cause.GAMMA, words, self._linear(lambda light, power=power: light**power), _FITS, power**2
+
+    def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
+        for each in self.measured():
+            yield np.ascontiguousarray(turn(each.frame)), each.row, each.column
+
+    def _shots(self) -> Iterator[tuple[int, FloatArray]]:
+        """Number and light of each shot."""
+        number = {(shot.row, shot.column, shot.sign): n for n, shot in enumerate(self.manifest.patterns.captures)}
+        for each in self.measured():
+            if each.shots == 1:
+                yield number[each.row, each.column, 0], each.frame
+                continue
+            for sign in (1, -1):
+                yield number[each.row, each.column, sign], (each.light + sign * each.frame) / 2
+
+    def _ordered(self, order: Callable[[int], int]) -> Frames:
+        """Measurements of the shots, each taken for that which ``order`` gives for its number."""
+        return self._paired((order(number), light) for number, light in self._shots())
+
+    def _linear(self, curve: Callable[[FloatArray], FloatArray]) -> Frames:
+        """Measurements of shots whose light, in units of the largest, a ``curve`` makes linear."""
+        digital = self.manifest.digital
+        top = digital.saturation_dn
+        peak = float(digital.rate(np.array(top))) if top else max(float(light.max()) for _, light in self._shots())
+        peak = max(peak, np.finfo(float).tiny)
+        return self._paired(
+            (number, peak * np.sign(light) * curve(np.abs(light) / peak)) for number, light in self._shots()
+        )
+
+    def _paired(self, shots: Iterable[tuple[int, FloatArray]]) -> Frames:
+        """Measurements of ``shots``, by their number: halves of signed patterns as their difference."""
+        captures = self.manifest.patterns.captures
+        waiting: dict[tuple[int, int], FloatArray] = {}
+        for number, light in shots:
+            shot = captures[number % len(captures)]
+            pattern = shot.row, shot.column
+            if not shot.sign:
+                yield light, *pattern
+            elif pattern in waiting:
+                yield waiting.pop(pattern) + shot.sign * light, *pattern
+            else:
+                waiting[pattern] = shot.sign * light
+
+
+def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
+    """That all numbers of a run are multiples of one, where its noise says that they were multiplied.
+
+    Multiplied numbers count too many electrons: their variance is that many times the shot noise of so many. A camera
+    whose file knows of the factor has the noise that it states.
+
+    Parameters
+    ----------
+    noise
+        of the run.
+    chi_square
+        of its misfit.
+    """
+    factor = noise.factor
+    if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
+        return None
+    words = f"all numbers are multiples of {factor}"
+    if factor & (factor - 1) == 0:
+        words += f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
+    return Reading(Cause.SCALE, words, 0.0)
+
+
+def _of_srgb(light: FloatArray) -> FloatArray:
+    """Linear light of numbers of sRGB, 0 to 1."""
+    return np.where(light <= 0.04045, light / 12.92, ((light + 0.055) / 1.055) ** 2.4)
