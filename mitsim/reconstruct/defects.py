@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Ambient, Measurement
@@ -26,6 +27,8 @@ _SPREADS = 7.0
 _AROUND = 3
 """Pixels to each side whose median energy is what a pixel's is compared with: 7 x 7, so that a dead row and column are
 less than a third of them."""
+_CROWD = 0.35
+"""Part of these 7 x 7 that are off at most: two dead lines side by side, or two that cross, are less than a third."""
 _MOST = 0.02
 """Part of the sensor that may be defective: where more is off, the scene does not fit."""
 _LEAST_VARIANCE = 1e-3
@@ -158,6 +161,9 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     around = np.array([np.median(padded[row : row + width, column : column + width]) for row, column in places])
     own = ratio[places[:, 0], places[:, 1]]
     kept = own > limit * np.maximum(around / typical, 1.0)
+    # A spot of light is off in pixels side by side, and so are its edges.
+    crowd = np.where(off, uniform_filter(off.astype(np.float64), width, mode="constant"), 0.0)
+    kept &= maximum_filter(crowd, width)[places[:, 0], places[:, 1]] < _CROWD
     for line in places.T:
         largest = np.zeros(max(ratio.shape))
         np.maximum.at(largest, line, own)

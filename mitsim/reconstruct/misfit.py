@@ -194,7 +194,7 @@ class Residuals:
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(3))
         self.squares: FloatArray = np.zeros(sizes)
-        self.by_pattern = FrameSums((noise.variance.shape[0], noise.variance.shape[1]))
+        self.by_pattern = FrameSums((prepared.left.pattern_count, prepared.right.pattern_count))
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""

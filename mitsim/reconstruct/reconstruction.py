@@ -103,10 +103,7 @@ def reconstruct(
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
     solution: DepthMap | Solution | TVSolution
-    if isinstance(depth, DepthMap) and not depth.doubt:
-        solution = depth
-    else:
-        solution = data.solution(lam, method)
+    solution = depth if isinstance(depth, DepthMap) and not depth.doubt else data.solution(lam, method)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution)
     if misfit and misfit.defects:
