@@ -49,6 +49,8 @@ class Measurement:
         readings of them at the full well or the ADC's end.
     factor
         largest whole number that divides all of their digital numbers; 1 where they are not whole.
+    digests
+        of each shot, which no two that were read apart share; 0 where all of its numbers are equal.
     """
 
     frame: FloatArray
@@ -58,12 +60,14 @@ class Measurement:
     shots: int
     saturated: int
     factor: int = 1
+    digests: tuple[int, ...] = ()
 
     def __add__(self, other: Measurement) -> Measurement:
         """Both halves of a signed pattern as one measurement."""
         shots, saturated = self.shots + other.shots, self.saturated + other.saturated
         light, factor = self.light + other.light, math.gcd(self.factor, other.factor)
-        return Measurement(self.frame + other.frame, self.row, self.column, light, shots, saturated, factor)
+        frame, digests = self.frame + other.frame, self.digests + other.digests
+        return Measurement(frame, self.row, self.column, light, shots, saturated, factor, digests)
 
     @property
     def power(self) -> FloatArray:

@@ -9,7 +9,7 @@ frames are set in rounds, each of which leaves the part h of the step before.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -85,6 +85,8 @@ class Defects:
             pattern: (centred(frame) if prepared.centre else frame)[self.rows, self.columns]
             for pattern, frame in readings.items()
         }
+        # Of a reading that is changed the means of its row and column take up their part.
+        gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
         first = {pattern: value.copy() for pattern, value in values.items()}
         weights = weights.copy()
         for _ in range(_ROUNDS):
@@ -94,8 +96,9 @@ class Defects:
                 own, other = left.matrix[self.rows], right.matrix[self.columns]
                 told = np.einsum("pc,cd,pd->p", own, weights[left.columns][:, right.columns], other, optimize=True)
                 leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
-                step = (told - value) / np.maximum(1 - leverage, 0.5)
+                step = (told - value) / np.maximum(1 - leverage / gain, 0.5)
                 value += step
+                step /= gain
                 places = np.ix_(
                     *(
                         np.arange(len(change.T if axis else change))[slab.columns]
@@ -104,7 +107,7 @@ class Defects:
                 )
                 change[places] += own.T @ (step[:, None] * other)
             weights += change
-        moved = {pattern: values[pattern] - first[pattern] for pattern in values}
+        moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
         return _LeftOut(shots, self, moved)
 
 
@@ -133,7 +136,7 @@ class _LeftOut(Capture):
             frame[places] += self._moved[each.row, each.column]
             # Of a pair's sum nothing is told but that it is no less than the difference.
             light[places] = np.abs(frame[places])
-            yield Measurement(frame, each.row, each.column, light, each.shots, each.saturated, each.factor)
+            yield replace(each, frame=frame, light=light)
 
 
 def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:

@@ -13,7 +13,7 @@ fit has all its frames off. It is named where one fault explains what it is off 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -68,6 +68,7 @@ _NEAR_TOP = 0.8
 """Of the largest number, the light that clipped readings are foretold at least; hot pixels have less."""
 _REACH = 24
 """Sensor pixels that frames are moved by in search of a shift."""
+_ALL = slice(None)
 _QUIET, _AVERAGED = 0.5, 0.01
 """Part of the sensor's noise, without rounding, that frames may have at least: half where numbers are digital, stated
 gains are that wrong; where they are not, means of up to 100 shots may have been given."""
@@ -115,7 +116,7 @@ class FrameSums:
     """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
 
     ``residual``, ``power``: what is left of a pattern's measurement, and sum of the squares of its shots. ``light``:
-    sum of its light. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
+    sum of its light. ``digests``: patterns, and which of their shots, by what frames that are the same share. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
     """
 
     counts: tuple[int, int]
@@ -126,6 +127,7 @@ class FrameSums:
 
     def __post_init__(self) -> None:
         self.residual, self.power, self.light, self.sums = (np.zeros(self.counts) for _ in range(4))
+        self.digests: dict[int, list[tuple[Pattern, int]]] = {}
 
     def add(self, measurement: Measurement, residual: float, power: float, total: FloatArray) -> None:
         """Count in one measurement.
@@ -141,6 +143,8 @@ class FrameSums:
         """
         pattern = measurement.row, measurement.column
         self.residual[pattern], self.power[pattern] = residual, power
+        for half, digest in enumerate(measurement.digests):
+            self.digests.setdefault(digest, []).append((pattern, half))
         self.light[pattern] = float(measurement.light.sum())
         others = self.residual.size - 1
         if measurement.shots == 2 and others:
@@ -212,7 +216,7 @@ class FrameCheck:
         beside_noise
             energy that rendering, the factors' noise and print put into all of them.
         """
-        found = list(self._noiseless(sums))
+        found = [*self._same(sums), *self._noiseless(sums)]
         bad: dict[Pattern, bool] = {}  # and whether its brightness alone is off
         others = self._weights
         count = self._noise.variance.size
@@ -227,7 +231,10 @@ class FrameCheck:
                 break
             others = self._without(tuple(bad))
             sums = self._gathered(others, bad)
-        return (*found, *_Namer(self, bad, others).faults()) if bad else tuple(found)
+        named = _Namer(self, bad, others).faults() if bad else []
+        # What is known without the model is said where that does not say more.
+        known = {number for fault in named for number in fault.numbers}
+        return (*(fault for fault in found if not known & set(fault.numbers)), *named)
 
     def negative(self) -> str:
         """Why signed patterns were taken the wrong way round, or nothing: pixels that are always lit alike then have a
@@ -323,13 +330,23 @@ class FrameCheck:
             centre = float(np.nanmedian(ratio))
             if not centre > 0:
                 return None
-            away = ratio / centre - 1
+            away = ratio / centre
+            away = np.where(away > 1, 1 - 1 / away, away - 1)
             spread = 1.4826 * float(np.nanmedian(np.abs(away)))
             off = np.fmin(off, np.abs(away) / max(least, _SCALE_SPREADS * spread))
             signs.append(np.sign(away))
         off = np.where((signs[0] == signs[1]) & np.isfinite(whole), off, 0.0)
         worst = np.unravel_index(int(np.argmax(off)), off.shape)
         return (int(worst[0]), int(worst[1])) if off[worst] > 1 else None
+
+    def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
+        """Shots that are one and the same frame, noise and all."""
+        if not self._noise.variance.any():
+            return
+        for digest, shots in sums.digests.items():
+            if digest and len(shots) > 1:
+                numbers = [self._number[(*pattern, (1 - 2 * half) if self._signed else 0)] for pattern, half in shots]
+                yield self._fault(Fault.REPEATED, numbers, "are one and the same")
 
     def _noiseless(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Frames with less noise than their sensor has: only where readings can show it."""
@@ -478,6 +495,8 @@ class _Seen:
         of a datum of ``frame``, and of what it is held against.
     off
         energy beyond noise that it is off by.
+    blind
+        (m, c) and (m', c') orthonormal: what pixels that no other pattern lights put there; None where there are none.
     """
 
     numbers: tuple[int, ...]
@@ -487,6 +506,16 @@ class _Seen:
     foretold: FloatArray | None
     variance: float
     off: float
+    blind: tuple[FloatArray, FloatArray] | None = None
+
+    def clear(self, frame: FloatArray, rows: Any = _ALL, columns: Any = _ALL) -> FloatArray:
+        """A ``frame``, of part of the sensor, without what these pixels may put there."""
+        if self.blind is None:
+            return frame
+        left, right = (side[part] for side, part in zip(self.blind, (rows, columns), strict=True))
+        if len(left) < len(self.blind[0]) or len(right) < len(self.blind[1]):
+            left, right = (np.linalg.qr(side)[0] for side in (left, right))
+        return frame - left @ (left.T @ frame @ right) @ right.T
 
 
 Named = tuple[float, Fault, tuple[int, ...], str]
@@ -529,9 +558,21 @@ class _Namer:
         )
         if foretold is None:
             off = self._outside(frame, pattern, variance)
-        else:
-            off = _energy(frame - foretold) - frame.size * variance
-        return _Seen((number,), pattern, measurement.frame, frame, foretold, variance, off)
+            return _Seen((number,), pattern, measurement.frame, frame, None, variance, off)
+        one = _Seen((number,), pattern, measurement.frame, frame, foretold, variance, 0.0, self._blind(pattern))
+        return replace(one, off=_energy(one.clear(frame - foretold)) - frame.size * variance)
+
+    def _blind(self, pattern: Pattern) -> tuple[FloatArray, FloatArray] | None:
+        """Ranges of the rows and of the columns of pixels that no pattern of another row, or column, lights."""
+        ranges = []
+        sides = self._check._prepared.left, self._check._prepared.right
+        for side, lit, index in zip(sides, self._check._patterns, pattern, strict=True):
+            alone = np.flatnonzero((lit[:, index] != 0) & ((lit != 0).sum(axis=1) == 1))
+            if not len(alone):
+                return None
+            slab = side.slabs[index]
+            ranges.append(np.linalg.qr(slab.matrix @ side.response[alone][:, slab.columns].T)[0])
+        return ranges[0], ranges[1]
 
     def _signed(self) -> list[_Seen]:
         """Of patterns whose sum is off the half that its other half, and the model, tell to be wrong; of others the
@@ -602,8 +643,9 @@ class _Namer:
     def _scaled(self, one: _Seen) -> Iterable[Named]:
         if one.foretold is None:
             return
-        ratio = float(np.vdot(one.frame, one.foretold)) / max(_energy(one.foretold), 1e-300)
-        left = _energy(one.frame - ratio * one.foretold) - one.frame.size * one.variance
+        frame, foretold = one.clear(one.frame), one.clear(one.foretold)
+        ratio = float(np.vdot(frame, foretold)) / max(_energy(foretold), 1e-300)
+        left = _energy(frame - ratio * foretold) - frame.size * one.variance
         if ratio > 0:
             fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
             yield left, fault, one.numbers, f"holds {ratio:.2f} of the light that the other frames tell"
@@ -638,7 +680,7 @@ class _Namer:
         if one.foretold is not None:
             if float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
                 return
-            left = _energy(one.frame - np.minimum(one.foretold, top)) - flat.size * one.variance
+            left = _energy(one.clear(one.frame - np.minimum(one.foretold, top))) - flat.size * one.variance
         else:
             filled = one.frame
             for _ in range(_STEPS):
@@ -664,7 +706,8 @@ class _Namer:
                 continue
             if not check._signed:
                 foretold = check._frame(self._weights, *other)
-                left = _energy(one.frame - foretold) - one.frame.size * one.variance
+                there = replace(one, blind=self._blind(other))
+                left = _energy(there.clear(one.frame - foretold)) - one.frame.size * one.variance
                 yield self._of_pattern(left, one, check._number[(*other, 0)])
                 continue
             each = self._measured[other]
@@ -740,7 +783,8 @@ class _Namer:
         window = (kept, slice(None)) if axis == 0 else (slice(None), kept)
         part = one.raw[window]
         if one.foretold is not None:
-            return _energy(self._level(part - one.foretold[window])) - part.size * one.variance
+            beyond = one.clear(self._level(part - one.foretold[window]), *window)
+            return _energy(beyond) - part.size * one.variance
         left, right = self._ranges(one.pattern, *window)
         return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
 
@@ -751,7 +795,8 @@ class _Namer:
         """Energy beyond noise of a ``window`` of the sensor, held against the ``still`` middle of it."""
         part = one.raw[window[0], window[1]]
         if one.foretold is not None:
-            return _energy(self._level(part - one.foretold[still[0], still[1]])) - part.size * one.variance
+            beyond = one.clear(self._level(part - one.foretold[still[0], still[1]]), *still)
+            return _energy(beyond) - part.size * one.variance
         left, right = self._ranges(one.pattern, *still)
         return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
 

@@ -289,9 +289,10 @@ def judge(
     scaled = multiple(noise, found.chi_square)
     if scaled:
         return replace(found, flagged=True, cause=scaled.cause, reading=scaled)
-    if found.flagged and check.all_off(sums.by_pattern, beside_noise):
-        left = float(expected.sum()) / max(float(sums.energy.sum()), _TINY)
-        reading = Readings(prepared, check.manifest, check.measured).fitting(found.unexplained, left)
+    if found.flagged:
+        beside = beside_noise / max(float(sums.energy.sum()), _TINY)
+        readings = Readings(prepared, check.manifest, noise, check.measured)
+        reading = readings.fitting(found.unexplained, beside, check.all_off(sums.by_pattern, beside_noise))
         if reading:
             return replace(found, cause=reading.cause, reading=reading)
     faults = check.faults(sums.by_pattern, beside_noise)

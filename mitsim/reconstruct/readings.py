@@ -23,6 +23,9 @@ _FITS = 0.05
 _AT_MOST = 2e-2
 """Part of the measurements, rms, that it may leave: one that is right leaves 1e-2 of a sheet 2 mm beside the calibrated
 distance."""
+_QUIETEST, _TOLD, _CURVED = 0.7, 0.25, 0.05
+"""Of curves: least of the expected noise that is left, most of that noise over the unexplained energy, and least of
+that, rms. Dim numbers of sRGB are a thirteenth of their light, and so mostly noise, in which any light fits."""
 _CUT = 1.5
 """Part of the unexplained energy that another order may leave, times the number of patterns: of a cycle that was
 entered late one frame was taken before it."""
@@ -35,7 +38,8 @@ _MULTIPLIED, _LEAST_MULTIPLIED = 0.5, 1.5
 """Chi-square of multiplied numbers, over their factor, and at least: shot noise alone makes that of 1 times the factor,
 and what is rounded to it 1.1."""
 
-Frames = Iterator[tuple[FloatArray, int, int]]
+Frames = Iterator[tuple[FloatArray, int, int, float]]
+"""Measurements, their patterns, and the energy that their noise is expected to have."""
 
 _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "upside down, their rows reversed": lambda frame: frame[::-1],
@@ -67,53 +71,65 @@ class Readings:
     ----------
     prepared
         the factorised model.
-    manifest
-        of the run.
+    manifest, noise
+        of the run, and of its measurements.
     measured
         reads all measurements once more.
     """
 
     prepared: Prepared
     manifest: RunManifest
+    noise: FrameNoise
     measured: Callable[[], Iterable[Measurement]]
 
-    def fitting(self, unexplained: float, noise: float) -> Reading | None:
+    def fitting(self, unexplained: float, beside_noise: float, cut: bool) -> Reading | None:
         """The reading that fits best, where one does.
 
         Parameters
         ----------
         unexplained
             part of the measurements, rms, that is left of them as they are.
-        noise
-            part of their energy that is expected to be left.
+        beside_noise
+            part of their energy that rendering, the factors' noise and print put there.
+        cut
+            whether an order counts that leaves one frame of a cycle.
         """
         fits: list[Reading] = []
-        for cause, words, frames, most, noisier in self._tried():
-            left = np.sqrt(max(self._left_over(frames) - noise * noisier, 0.0))
+        for cause, words, frames, most in self._tried(cut):
+            left_over, expected = self._left_over(frames)
+            if cause is Cause.GAMMA and not (
+                _QUIETEST * expected < left_over and expected < _TOLD * unexplained**2 and unexplained > _CURVED
+            ):
+                continue
+            left = np.sqrt(max(left_over - expected - beside_noise, 0.0))
             if left < np.sqrt(most) * unexplained and (left < _AT_MOST or most > _FITS):
                 fits.append(Reading(cause, words, float(left)))
-        return min(fits, key=lambda reading: reading.left, default=None)
+        exact = [reading for reading in fits if reading.cause is not Cause.GAMMA]
+        return min(exact or fits, key=lambda reading: reading.left, default=None)
 
-    def _left_over(self, frames: Frames) -> float:
-        """Part of the energy of ``frames`` that the model leaves."""
-        sums = self.prepared.accumulator()
-        for frame, row, column in frames:
+    def _left_over(self, frames: Frames) -> tuple[float, float]:
+        """Part of the energy of ``frames`` that the model leaves, and that noise is expected to leave."""
+        sums, noise = self.prepared.accumulator(), 0.0
+        for frame, row, column, own in frames:
             sums.add(frame, row, column)
+            noise += own
         problem = self.prepared.problem(sums)
         explained = float(np.square(problem.projected[problem.sigma > 0]).sum())
-        return 1 - explained / problem.energy if problem.energy > 0 else 1.0
+        spare = 1 - self.prepared.rank / (self.prepared.left.data_rows * self.prepared.right.data_rows)
+        energy = max(problem.energy, np.finfo(float).tiny)
+        return 1 - explained / energy, noise * spare / energy
 
-    def _tried(self) -> Iterator[tuple[Cause, str, Frames, float, float]]:
-        """Cause, words and frames of each reading, the part of the unexplained energy that it may leave, and how much
-        more of their energy is noise than before."""
+    def _tried(self, with_cut: bool) -> Iterator[tuple[Cause, str, Frames, float]]:
+        """Cause, words and frames of each reading, and the part of the unexplained energy that it may leave;
+        ``with_cut`` as :meth:`fitting` takes it."""
         shape = self.prepared.left.sensor_size, self.prepared.right.sensor_size
         for words, turn in _TURNS.items():
             if turn(np.zeros(shape)).shape == shape:
-                yield Cause.ORIENTATION, f"the frames are {words}", self._each(turn), _FITS, 1.0
+                yield Cause.ORIENTATION, f"the frames are {words}", self._each(turn), _FITS
         shots = self.manifest.patterns.captures
         size = self.prepared.left.pattern_count * self.prepared.right.pattern_count
         if size > 1:
-            cut = min(max(_FITS, _CUT / size), _CUT_AT_MOST)
+            cut = min(max(_FITS, _CUT / size), _CUT_AT_MOST) if with_cut else _FITS
             orders = {
                 "one step late: each shot shows the pattern of the shot before": lambda number: number - 1,
                 "one step early: each shot shows the pattern of the next": lambda number: number + 1,
@@ -122,15 +138,16 @@ class Readings:
             if any(shot.sign for shot in shots):
                 orders["with the halves of each pair exchanged"] = lambda number: number ^ 1
             for words, order in orders.items():
-                yield Cause.ORDER, f"the frames are {words}", self._ordered(order), cut, 1.0
-        yield Cause.GAMMA, "the numbers follow the curve of sRGB", self._linear(_of_srgb), _FITS, 5.0
+                yield Cause.ORDER, f"the frames are {words}", self._ordered(order), cut
+        yield Cause.GAMMA, "the numbers follow the curve of sRGB", self._linear(_of_srgb), _FITS
         for power in _POWERS:
             words = f"the numbers are the light to the power of 1/{power:g}"
-            yield Cause.GAMMA, words, self._linear(lambda light, power=power: light**power), _FITS, power**2
+            yield Cause.GAMMA, words, self._linear(lambda light, power=power: light**power), _FITS
 
     def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
         for each in self.measured():
-            yield np.ascontiguousarray(turn(each.frame)), each.row, each.column
+            noise = float(self.noise.variance[each.row, each.column]) * each.frame.size
+            yield np.ascontiguousarray(turn(each.frame)), each.row, each.column, noise
 
     def _shots(self) -> Iterator[tuple[int, FloatArray]]:
         """Number and light of each shot."""
@@ -159,16 +176,16 @@ class Readings:
     def _paired(self, shots: Iterable[tuple[int, FloatArray]]) -> Frames:
         """Measurements of ``shots``, by their number: halves of signed patterns as their difference."""
         captures = self.manifest.patterns.captures
-        waiting: dict[tuple[int, int], FloatArray] = {}
+        waiting: dict[tuple[int, int], tuple[FloatArray, float]] = {}
         for number, light in shots:
             shot = captures[number % len(captures)]
-            pattern = shot.row, shot.column
-            if not shot.sign:
-                yield light, *pattern
-            elif pattern in waiting:
-                yield waiting.pop(pattern) + shot.sign * light, *pattern
-            else:
-                waiting[pattern] = shot.sign * light
+            noise = float(np.maximum(self.manifest.digital.variance(light), 0.0).sum())
+            own = (shot.sign * light if shot.sign else light), noise
+            if shot.sign and (shot.row, shot.column) not in waiting:
+                waiting[shot.row, shot.column] = own
+                continue
+            other = waiting.pop((shot.row, shot.column)) if shot.sign else (np.zeros(()), 0.0)
+            yield own[0] + other[0], shot.row, shot.column, own[1] + other[1]
 
 
 def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
