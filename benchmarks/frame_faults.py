@@ -1,10 +1,10 @@
 """How often frames that are not what they say are named, and how often fitting runs are: by fault, family and light.
 
-    python benchmarks/frame_faults.py RESULT.json [--rounds 4] [--fitting 240] [--sizes 64 128] [--peaks ...] [--faults ...]
+    python benchmarks/frame_faults.py RESULT.json [--rounds 4] [--fitting 240] [--sizes 64 128] [--peaks ...]
 
 Runs are of the tests' ideal cameras (tests/ideal_sessions.py): frames of the paper's model with drawn noise, before
-masks of several kinds, of prints that are shipped and of some drawn here. Each round lays one fault of every kind into a
-run of every family, at every size and light level: its frame, place and strength are drawn. A fault counts as named
+masks of several kinds, of prints that are shipped and of some drawn here. Each round lays one fault of every kind into
+a run of every family, at every size and light level: its frame, place and strength are drawn. A fault counts as named
 where it alone is, with the right frames. Fitting runs are those without a fault, glossy scenes among them, whose misfit
 may be flagged, but no frame, order or orientation blamed. RESULT.json holds each run that went wrong, and rates with
 their 95 % intervals (Wilson). 4 rounds and 240 fitting runs take 25 minutes on a core.

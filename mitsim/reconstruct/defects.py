@@ -33,8 +33,9 @@ _MOST = 0.02
 """Part of the sensor that may be defective: where more is off, the scene does not fit."""
 _LEAST_VARIANCE = 1e-3
 """Part of the mean variance that a pixel's counts as at least: one that reads nothing has none of light."""
-_LEAKS = 0.05
-"""Part of a pixel's energy that those of its row and column may have by it: the square of its leverage, 1/16."""
+_LEAKS = 0.1
+"""Part of the largest energy of a pixel that others may have by it: the square of what the fit takes from one reading
+for the next, 0.03 where the scene has 0.4 of the sensor's pixels a side."""
 _ROUNDS = 8
 """Rounds in which defective readings are replaced: leverages are below 1/4 where the sensor has twice the scene's
 pixels a side, and 4^-8 of a reading is below noise."""
@@ -154,8 +155,8 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     limit = (1 - 2 / (9 * count) + _SPREADS * np.sqrt(2 / (9 * count))) ** 3
     typical = (1 - 2 / (9 * count)) ** 3
     off = ratio > limit * max(1.0, float(np.median(ratio)) / typical)
-    if off.sum() > _MOST * ratio.size:  # what bright ones are off by leaks into others: these first
-        off &= ratio > _LEAKS * float(ratio.max())
+    # What bright ones are off by leaks into others: these first.
+    off &= ratio > _LEAKS * float(ratio.max())
     places = np.argwhere(off)
     if not 0 < len(places) <= _MOST * ratio.size:
         return None
@@ -167,9 +168,5 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     # A spot of light is off in pixels side by side, and so are its edges.
     crowd = np.where(off, uniform_filter(off.astype(np.float64), width, mode="constant"), 0.0)
     kept &= maximum_filter(crowd, width)[places[:, 0], places[:, 1]] < _CROWD
-    for line in places.T:
-        largest = np.zeros(max(ratio.shape))
-        np.maximum.at(largest, line, own)
-        kept &= own > _LEAKS * largest[line]
     places = places[kept]
     return Defects(places[:, 0], places[:, 1]) if len(places) else None

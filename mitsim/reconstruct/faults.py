@@ -13,13 +13,15 @@ fit has all its frames off. It is named where one fault explains what it is off 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import fft
 from scipy.ndimage import uniform_filter
+from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import RunManifest
@@ -30,6 +32,7 @@ from mitsim.reconstruct.sides import group_pixels
 from mitsim.reconstruct.solver import Prepared
 
 Pattern = tuple[int, int]
+BoolArray = npt.NDArray[np.bool_]
 
 CHANCE = 6.0
 """Standard deviations of a frame's noise energy that are left to chance: 1e-9 for each of up to 65536 shots."""
@@ -68,7 +71,6 @@ _NEAR_TOP = 0.8
 """Of the largest number, the light that clipped readings are foretold at least; hot pixels have less."""
 _REACH = 24
 """Sensor pixels that frames are moved by in search of a shift."""
-_ALL = slice(None)
 _QUIET, _AVERAGED = 0.5, 0.01
 """Part of the sensor's noise, without rounding, that frames may have at least: half where numbers are digital, stated
 gains are that wrong; where they are not, means of up to 100 shots may have been given."""
@@ -116,7 +118,8 @@ class FrameSums:
     """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
 
     ``residual``, ``power``: what is left of a pattern's measurement, and sum of the squares of its shots. ``light``:
-    sum of its light. ``digests``: patterns, and which of their shots, by what frames that are the same share. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
+    sum of its light. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
+    ``digests``: patterns, and which of their shots, by a number that frames which are one and the same share.
     """
 
     counts: tuple[int, int]
@@ -301,7 +304,7 @@ class FrameCheck:
         """Whether the only frame has no more light than noise makes."""
         return bool(abs(sums.light[0, 0]) < CHANCE * float(np.sqrt(self._noise.variance[0, 0] * self._size)))
 
-    def _brightness(self, weights: FloatArray, good: np.ndarray) -> Pattern | None:
+    def _brightness(self, weights: FloatArray, good: BoolArray) -> Pattern | None:
         """The ``good`` pattern whose brightness differs most from what its pixels' neighbours foretell, if it does.
 
         Both its light as a whole and the median of its pixels must differ: a highlight moves the first alone, stripes
@@ -400,12 +403,12 @@ class FrameCheck:
         duals = [side.basis if side.dual is None else side.dual for side in (self._prepared.left, self._prepared.right)]
         return np.asarray(self._sigma * (duals[0].T @ image @ duals[1]))
 
-    def _lit(self, good: np.ndarray) -> np.ndarray:
+    def _lit(self, good: BoolArray) -> BoolArray:
         """(n, n') pixels that a ``good`` pattern lights."""
         left, right = ((side != 0).astype(np.float64) for side in self._patterns)
         return np.asarray(left @ good @ right.T > 0)
 
-    def _neighbours(self, image: FloatArray, good: np.ndarray) -> FloatArray:
+    def _neighbours(self, image: FloatArray, good: BoolArray) -> FloatArray:
         """(n, n') mean of each pixel's neighbours, along sides with several groups, that a ``good`` pattern lights."""
         size = [3 if period > 1 else 1 for period in self._periods]
         lit = self._lit(good).astype(np.float64)
@@ -495,8 +498,6 @@ class _Seen:
         of a datum of ``frame``, and of what it is held against.
     off
         energy beyond noise that it is off by.
-    blind
-        (m, c) and (m', c') orthonormal: what pixels that no other pattern lights put there; None where there are none.
     """
 
     numbers: tuple[int, ...]
@@ -506,16 +507,6 @@ class _Seen:
     foretold: FloatArray | None
     variance: float
     off: float
-    blind: tuple[FloatArray, FloatArray] | None = None
-
-    def clear(self, frame: FloatArray, rows: Any = _ALL, columns: Any = _ALL) -> FloatArray:
-        """A ``frame``, of part of the sensor, without what these pixels may put there."""
-        if self.blind is None:
-            return frame
-        left, right = (side[part] for side, part in zip(self.blind, (rows, columns), strict=True))
-        if len(left) < len(self.blind[0]) or len(right) < len(self.blind[1]):
-            left, right = (np.linalg.qr(side)[0] for side in (left, right))
-        return frame - left @ (left.T @ frame @ right) @ right.T
 
 
 Named = tuple[float, Fault, tuple[int, ...], str]
@@ -529,6 +520,11 @@ class _Namer:
         self._check, self._bad, self._weights = check, bad, weights
         self._measured = check._measurements(bad)
         self._total = check._noise.light
+        self._foretold = {pattern: check._frame(weights, *pattern) for pattern in bad}
+        self._rest = check._weights.copy()
+        for pattern, each in self._measured.items():
+            self._rest[check._columns(*pattern)] -= check._own(check._centred(each.frame), *pattern)
+        self._least = self._left({}, weights)
 
     def faults(self) -> list[FrameFault]:
         """One for each that is found."""
@@ -545,6 +541,38 @@ class _Namer:
                 named.append(min(sure or fits, key=lambda each: each[0] if not sure else 0.0))
         return [check._fault(fault, numbers, words) for _, fault, numbers, words in self._pairs(named)]
 
+    # ---- what frames leave
+
+    def _together(self, frames: dict[Pattern, FloatArray]) -> FloatArray:
+        """W of the patterns that are not suspected, and of these ``frames`` of others; of the rest as foretold."""
+        weights = self._rest.copy()
+        for pattern, foretold in self._foretold.items():
+            weights[self._check._columns(*pattern)] += self._check._own(frames.get(pattern, foretold), *pattern)
+        return np.where(self._check._sigma > 0, weights, 0.0)
+
+    def _left(self, frames: dict[Pattern, FloatArray], weights: FloatArray) -> float:
+        """Energy that ``frames`` of suspected patterns leave of all, but for a constant, their W being ``weights``."""
+        light = sum(_energy(frames.get(pattern, foretold)) for pattern, foretold in self._foretold.items())
+        return light - _energy(weights)
+
+    def _beyond(self, frames: dict[Pattern, FloatArray], variance: float) -> float:
+        """Energy beyond noise that all frames are off by with these, at a ``variance`` of a datum."""
+        left = self._left(frames, self._together(frames)) - self._least
+        return left - sum(frame.size for frame in frames.values()) * variance * self._check._spare
+
+    def _filled(self, one: _Seen, frame: FloatArray, known: BoolArray, least: float = -np.inf) -> float:
+        """Energy beyond noise that a ``frame`` in the place of ``one`` leaves where it is ``known``; elsewhere it may be
+        anything, or anything from ``least`` on."""
+        fit = self._foretold[one.pattern]
+        for _ in range(_STEPS):
+            fit = np.maximum(fit, least)
+            filled = np.where(known, frame, fit)
+            weights = self._together({one.pattern: filled})
+            fit = self._check._frame(weights, *one.pattern)
+        left = self._left({one.pattern: filled}, weights) - self._least
+        size = float(np.broadcast_to(known, frame.shape).sum())
+        return left - size * one.variance * self._check._spare
+
     # ---- what was read
 
     def _plain(self, pattern: Pattern) -> _Seen:
@@ -559,20 +587,8 @@ class _Namer:
         if foretold is None:
             off = self._outside(frame, pattern, variance)
             return _Seen((number,), pattern, measurement.frame, frame, None, variance, off)
-        one = _Seen((number,), pattern, measurement.frame, frame, foretold, variance, 0.0, self._blind(pattern))
-        return replace(one, off=_energy(one.clear(frame - foretold)) - frame.size * variance)
-
-    def _blind(self, pattern: Pattern) -> tuple[FloatArray, FloatArray] | None:
-        """Ranges of the rows and of the columns of pixels that no pattern of another row, or column, lights."""
-        ranges = []
-        sides = self._check._prepared.left, self._check._prepared.right
-        for side, lit, index in zip(sides, self._check._patterns, pattern, strict=True):
-            alone = np.flatnonzero((lit[:, index] != 0) & ((lit != 0).sum(axis=1) == 1))
-            if not len(alone):
-                return None
-            slab = side.slabs[index]
-            ranges.append(np.linalg.qr(slab.matrix @ side.response[alone][:, slab.columns].T)[0])
-        return ranges[0], ranges[1]
+        off = self._beyond({pattern: frame}, variance)
+        return _Seen((number,), pattern, measurement.frame, frame, foretold, variance, off)
 
     def _signed(self) -> list[_Seen]:
         """Of patterns whose sum is off the half that its other half, and the model, tell to be wrong; of others the
@@ -595,13 +611,20 @@ class _Namer:
                     for sign, other in ((1, halves[1]), (-1, halves[0]))
                 ]
                 wrong = int(np.argmin(by_model))
+                if not self._is_lit(pattern, 1 - 2 * wrong):
+                    continue
                 half, other = halves[wrong], halves[1 - wrong]
                 found.append(_Seen((numbers[wrong],), pattern, half, half, mean - other, variance, off))
             else:
                 foretold, frame = check._frame(self._weights, *pattern), check._centred(each.frame)
-                off = _energy(frame - foretold) - frame.size * variance
+                off = self._beyond({pattern: frame}, variance)
                 found.append(_Seen(numbers, pattern, each.frame, frame, foretold, variance, off))
         return found
+
+    def _is_lit(self, pattern: Pattern, sign: int) -> bool:
+        """Whether the half of that ``sign`` of a signed pattern lights any pixel."""
+        left, right = (side[:, index] for side, index in zip(self._check._patterns, pattern, strict=True))
+        return bool((1 + sign * np.outer(left, right)).any())
 
     # ---- what explains it
 
@@ -643,12 +666,22 @@ class _Namer:
     def _scaled(self, one: _Seen) -> Iterable[Named]:
         if one.foretold is None:
             return
-        frame, foretold = one.clear(one.frame), one.clear(one.foretold)
-        ratio = float(np.vdot(frame, foretold)) / max(_energy(foretold), 1e-300)
-        left = _energy(frame - ratio * foretold) - frame.size * one.variance
+        ratio = float(np.vdot(one.frame, one.foretold)) / max(_energy(one.foretold), 1e-300)
+        left = _energy(one.frame - ratio * one.foretold) - one.frame.size * one.variance
+        if ratio > 0 and not self._check._signed:
+            ratio, left = self._least_scale(one, ratio)
         if ratio > 0:
             fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
             yield left, fault, one.numbers, f"holds {ratio:.2f} of the light that the other frames tell"
+
+    def _least_scale(self, one: _Seen, start: float) -> tuple[float, float]:
+        """The part of its light that a frame has, and what it leaves divided by that."""
+
+        def left(ratio: float) -> float:
+            return self._beyond({one.pattern: one.frame / ratio}, one.variance / ratio**2) * ratio**2
+
+        found = minimize_scalar(left, bounds=(0.3 * start, min(3 * start, 10.0)), method="bounded")
+        return float(found.x), float(found.fun)
 
     def _part_lost(self, one: _Seen) -> Iterable[Named]:
         """Rows, or columns, without light side by side."""
@@ -664,7 +697,10 @@ class _Namer:
                 continue
             kept = np.ones(len(lines), dtype=np.bool_)
             kept[first:last] = False
-            left = self._outside_of_part(one, kept, axis)
+            if one.foretold is None or self._check._signed:
+                left = self._outside_of_part(one, kept, axis)
+            else:
+                left = self._filled(one, one.frame, kept[:, None] if axis == 0 else kept[None, :])
             yield left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}"
 
     def _clipped(self, one: _Seen) -> Iterable[Named]:
@@ -680,7 +716,9 @@ class _Namer:
         if one.foretold is not None:
             if float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
                 return
-            left = _energy(one.clear(one.frame - np.minimum(one.foretold, top))) - flat.size * one.variance
+            left = _energy(one.frame - np.minimum(one.foretold, top)) - flat.size * one.variance
+            if not self._check._signed and not self._check._prepared.centre:
+                left = self._filled(one, one.frame, ~flat, top)
         else:
             filled = one.frame
             for _ in range(_STEPS):
@@ -704,11 +742,9 @@ class _Namer:
         for other in self._bad:
             if other == one.pattern:
                 continue
-            if not check._signed:
-                foretold = check._frame(self._weights, *other)
-                there = replace(one, blind=self._blind(other))
-                left = _energy(there.clear(one.frame - foretold)) - one.frame.size * one.variance
-                yield self._of_pattern(left, one, check._number[(*other, 0)])
+            if not check._signed:  # of two that are suspected each may be the other's
+                there = check._centred(self._measured[other].frame)
+                yield self._of_pattern(self._crossed(one, other, there), one, check._number[(*other, 0)])
                 continue
             each = self._measured[other]
             for sign in (1, -1):  # the other half of that pattern tells this one
@@ -716,6 +752,14 @@ class _Namer:
                 mean = one.foretold + self._partner(one)
                 left = _energy(one.frame - (mean - partner)) - one.frame.size * one.variance
                 yield self._of_pattern(left, one, check._number[(*other, sign)])
+
+    def _crossed(self, one: _Seen, other: Pattern, there: FloatArray) -> float:
+        """Energy of :attr:`_Seen.off` that is left when a frame and that of an ``other`` pattern, ``there``, are
+        exchanged."""
+        variance = (one.variance + float(self._check._noise.variance[other])) / 2
+        own = self._beyond({one.pattern: one.frame, other: there}, variance)
+        left = self._beyond({one.pattern: there, other: one.frame}, variance)
+        return left / own * one.off if own > 0 else np.inf
 
     def _partner(self, one: _Seen) -> FloatArray:
         """The other half of a signed pattern's shot."""
@@ -728,12 +772,11 @@ class _Namer:
         """Both halves of signed patterns: the two exchanged, or those of another pattern."""
         if one.foretold is None:
             return
-        left = _energy(one.frame + one.foretold) - one.frame.size * one.variance
-        yield left, Fault.SWAPPED, one.numbers, "are exchanged"
+        yield self._beyond({one.pattern: -one.frame}, one.variance), Fault.SWAPPED, one.numbers, "are exchanged"
         for other in self._bad:
             if other != one.pattern:
-                foretold = self._check._frame(self._weights, *other)
-                left = _energy(one.frame - foretold) - one.frame.size * one.variance
+                there = self._check._centred(self._measured[other].frame)
+                left = self._crossed(one, other, there)
                 both = tuple(self._check._number[(*other, sign)] for sign in (1, -1))
                 yield left, Fault.MISPLACED, (*one.numbers, *both), ""
 
@@ -744,6 +787,16 @@ class _Namer:
             return
         shift = self._by_range(one, reach) if one.foretold is None else _correlated(one.frame, one.foretold, reach)
         if shift == (0, 0):
+            return
+        if one.foretold is not None and not self._check._signed:
+            back = np.roll(one.raw, (-shift[0], -shift[1]), (0, 1))
+            known = [np.zeros(size, dtype=np.bool_) for size in back.shape]
+            for line, step in zip(known, shift, strict=True):
+                line[max(-step, 0) : len(line) - max(step, 0)] = True
+            left = self._filled(one, self._level(back), np.outer(*known))
+            rows, columns = shift
+            words = f"is shifted by {rows} rows and {columns} columns of the sensor"
+            yield left, Fault.SHIFTED, one.numbers, words
             return
         ends = [slice(reach + step, size - reach + step) for step, size in zip(shift, one.raw.shape, strict=True)]
         still = [slice(reach, size - reach) for size in one.raw.shape]
@@ -778,13 +831,12 @@ class _Namer:
             bases.append(np.linalg.qr(part)[0])
         return bases[0], bases[1]
 
-    def _outside_of_part(self, one: _Seen, kept: np.ndarray, axis: int) -> float:
+    def _outside_of_part(self, one: _Seen, kept: BoolArray, axis: int) -> float:
         """Energy beyond noise that is off in the ``kept`` rows (``axis`` 0) or columns of the sensor."""
         window = (kept, slice(None)) if axis == 0 else (slice(None), kept)
         part = one.raw[window]
         if one.foretold is not None:
-            beyond = one.clear(self._level(part - one.foretold[window]), *window)
-            return _energy(beyond) - part.size * one.variance
+            return _energy(self._level(part - one.foretold[window])) - part.size * one.variance
         left, right = self._ranges(one.pattern, *window)
         return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
 
@@ -795,8 +847,7 @@ class _Namer:
         """Energy beyond noise of a ``window`` of the sensor, held against the ``still`` middle of it."""
         part = one.raw[window[0], window[1]]
         if one.foretold is not None:
-            beyond = one.clear(self._level(part - one.foretold[still[0], still[1]]), *still)
-            return _energy(beyond) - part.size * one.variance
+            return _energy(self._level(part - one.foretold[still[0], still[1]])) - part.size * one.variance
         left, right = self._ranges(one.pattern, *still)
         return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
 
@@ -865,7 +916,7 @@ def _correlated(frame: FloatArray, foretold: FloatArray, reach: int) -> tuple[in
     return int(steps[place[0]]), int(steps[place[1]])
 
 
-def _longest(lost: np.ndarray) -> tuple[int, int]:
+def _longest(lost: BoolArray) -> tuple[int, int]:
     """First of the longest run of ``lost`` lines, and the first after it."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(np.int8)))
     if not len(ends):

@@ -38,8 +38,9 @@ _LAMBDA_OF_TV = 1e-3
 """Lambda, over the largest sigma^2, by which frames are foretold beside an image of total variation, whose own weight
 says nothing of it: chosen, between those of bright and of dim runs."""
 
-_DEFECT_ROUNDS = 3
-"""Times that defective pixels are looked for: beside bright ones dim ones show when these are left out."""
+_DEFECT_ROUNDS = 6
+"""Times that defective pixels are looked for: beside bright ones dim ones show when these are left out, of a tenth of
+their energy each time."""
 _BETTER = 0.5
 """Part of what was unexplained, rms, that frames may leave without pixels that count as defective though the rest does
 not fit either."""
