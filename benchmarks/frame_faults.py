@@ -61,7 +61,7 @@ class FlatCam(Bench):
 
     def light(self, shown: np.ndarray) -> np.ndarray:
         outline = self.whole[0] @ shown @ self.whole[1].T
-        return (outline + self.left @ shown @ self.right.T) / 2
+        return np.asarray((outline + self.left @ shown @ self.right.T) / 2)
 
     def calibrated(self, seed: int, error: float = 2e-3) -> Factors:
         half = Bench(self.left / np.sqrt(2), self.right / np.sqrt(2)).calibrated(seed, error)
@@ -85,8 +85,8 @@ def camera(mask: str, n: int, other: bool = False) -> Bench:
     pair = side(code, 0.0), side(code, 7.0)
     if mask == "flatcam":
         outline = np.ones_like(code)
-        signed = tuple(2 * one - side(outline, shift) for one, shift in zip(pair, (0.0, 7.0), strict=True))
-        return FlatCam(*signed, whole=(side(outline, 0.0), side(outline, 7.0)))
+        whole = side(outline, 0.0), side(outline, 7.0)
+        return FlatCam(2 * pair[0] - whole[0], 2 * pair[1] - whole[1], whole=whole)
     return Bench(*pair)
 
 
@@ -97,8 +97,8 @@ def scene(name: str, n: int, seed: int) -> np.ndarray:
     if name in PRINTS:
         values = io.imread(ROOT / "scenes" / name / "reflectance.png").astype(np.float64)
         values = values if values.ndim == 2 else values[..., :3].mean(axis=2)
-        values = np.rot90(values, rng.integers(4)) / 255
-        return 0.05 + 0.9 * transform.resize(values, (n, n), anti_aliasing=True)
+        values = np.rot90(values, int(rng.integers(4))) / 255
+        return np.asarray(0.05 + 0.9 * transform.resize(values, (n, n), anti_aliasing=True))
     y, x = np.mgrid[:n, :n] / n
     if name == "text":  # words of strokes on white
         page = np.full((n, n), 0.85)
@@ -141,7 +141,7 @@ def _one(change: Callable[[Frames, np.ndarray, np.random.Generator], np.ndarray]
 
 def dark(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Numbers of a frame without light."""
-    return BLACK + GAIN * (rng.poisson(DARK, shape) + READ * rng.standard_normal(shape))
+    return np.asarray(BLACK + GAIN * (rng.poisson(DARK, shape) + READ * rng.standard_normal(shape)))
 
 
 def dim(frames: Frames, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -149,7 +149,7 @@ def dim(frames: Frames, frame: np.ndarray, rng: np.random.Generator) -> np.ndarr
     part = rng.uniform(0.4, 0.6)
     electrons = (frame - BLACK) / GAIN - DARK
     missing = np.sqrt(part * (1 - part) * np.maximum(electrons, 0) + (1 - part**2) * (READ**2 + DARK))
-    return BLACK + GAIN * (DARK + part * electrons + missing * rng.standard_normal(frame.shape))
+    return np.asarray(BLACK + GAIN * (DARK + part * electrons + missing * rng.standard_normal(frame.shape)))
 
 
 def half_lost(frames: Frames, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -228,7 +228,7 @@ def changed(shots: Capture, frames: Frames, codes: float = CODES) -> Capture:
     files = [shot.file for shot in shots.manifest.patterns.captures]
     numbers = [np.clip(np.rint(frame), 0, codes - 1).astype(np.uint32) for frame in frames]
     digital = shots.manifest.digital.model_copy(update={"saturation_dn": float(codes - 1)})
-    memory = {file: ({"DN": each}, {}) for file, each in zip(files, numbers, strict=True)}
+    memory: dict[str, Any] = {file: ({"DN": each}, {}) for file, each in zip(files, numbers, strict=True)}
     return Capture(shots.manifest.model_copy(update={"digital": digital}), memory=memory)
 
 
@@ -266,7 +266,9 @@ def is_named(fault: str, numbers: set[int], said: dict[str, Any]) -> bool:
     return bool(said["faults"] == [[fault, sorted(numbers)]])
 
 
-def faulty(fault: str, mask: str, name: str, family: str, n: int, peak: float, seed: int) -> tuple[bool | None, dict]:
+def faulty(
+    fault: str, mask: str, name: str, family: str, n: int, peak: float, seed: int
+) -> tuple[bool | None, dict[str, Any]]:
     """Whether a fault that was laid into a run is named, None where it changes nothing; and what is said of it."""
     shots, factors = run_of(mask, name, family, n, peak, seed)
     frames = [np.asarray(each, dtype=np.float64) for each in shots.dn]
@@ -334,7 +336,9 @@ def main() -> None:
         if alarm:
             wrong.append({"fault": None, "case": [mask, name, family, n, peak, 5000 + number], **said})
             print(json.dumps(wrong[-1]), flush=True)
-    rates = {key: {"named": right, "of": of, "rate": interval(right, of)} for key, (right, of) in counts.items()}
+    rates: dict[str, dict[str, Any]] = {
+        key: {"named": right, "of": of, "rate": interval(right, of)} for key, (right, of) in counts.items()
+    }
     if options.fitting:
         rates["false alarms"] = {
             "named": alarms,

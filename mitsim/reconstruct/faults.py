@@ -286,8 +286,8 @@ class FrameCheck:
             usual = float(np.median(part[good])) if good.sum() > 2 else 0.0
             off = good & (beyond > allowed) & (part > max(_OFF**2, _MORE * usual))
             if off.any():
-                pattern = np.unravel_index(int(np.argmax(np.where(off, part, 0.0))), part.shape)
-                place = int(pattern[0]), int(pattern[1])
+                row, column = divmod(int(np.argmax(np.where(off, part, 0.0))), part.shape[1])
+                place = row, column
                 if worst is None or part[place] > worst[0]:
                     worst = float(part[place]), place, False
         if worst is not None:
@@ -339,8 +339,8 @@ class FrameCheck:
             off = np.fmin(off, np.abs(away) / max(least, _SCALE_SPREADS * spread))
             signs.append(np.sign(away))
         off = np.where((signs[0] == signs[1]) & np.isfinite(whole), off, 0.0)
-        worst = np.unravel_index(int(np.argmax(off)), off.shape)
-        return (int(worst[0]), int(worst[1])) if off[worst] > 1 else None
+        worst = divmod(int(np.argmax(off)), off.shape[1])
+        return worst if off[worst] > 1 else None
 
     def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots that are one and the same frame, noise and all."""
@@ -470,7 +470,7 @@ class FrameCheck:
         return sums
 
     def _good(self, bad: Iterable[Pattern]) -> set[Pattern]:
-        return set(np.ndindex(self._noise.variance.shape)) - set(bad)  # type: ignore[arg-type]
+        return set(np.ndindex(self._noise.variance.shape)) - set(bad)
 
     # ---- names
 
@@ -561,8 +561,8 @@ class _Namer:
         return left - sum(frame.size for frame in frames.values()) * variance * self._check._spare
 
     def _filled(self, one: _Seen, frame: FloatArray, known: BoolArray, least: float = -np.inf) -> float:
-        """Energy beyond noise that a ``frame`` in the place of ``one`` leaves where it is ``known``; elsewhere it may be
-        anything, or anything from ``least`` on."""
+        """Energy beyond noise that a ``frame`` in the place of ``one`` leaves where it is ``known``; elsewhere it may
+        be anything, or anything from ``least`` on."""
         fit = self._foretold[one.pattern]
         for _ in range(_STEPS):
             fit = np.maximum(fit, least)

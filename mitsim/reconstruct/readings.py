@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -142,7 +143,7 @@ class Readings:
         yield Cause.GAMMA, "the numbers follow the curve of sRGB", self._linear(_of_srgb), _FITS
         for power in _POWERS:
             words = f"the numbers are the light to the power of 1/{power:g}"
-            yield Cause.GAMMA, words, self._linear(lambda light, power=power: light**power), _FITS
+            yield Cause.GAMMA, words, self._linear(partial(_to_the, power)), _FITS
 
     def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
         for each in self.measured():
@@ -208,6 +209,10 @@ def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
     if factor & (factor - 1) == 0:
         words += f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
     return Reading(Cause.SCALE, words, 0.0)
+
+
+def _to_the(power: float, light: FloatArray) -> FloatArray:
+    return np.asarray(light**power)
 
 
 def _of_srgb(light: FloatArray) -> FloatArray:
