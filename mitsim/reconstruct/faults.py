@@ -51,11 +51,11 @@ less of its distance."""
 _SCALE_SPREADS, _SCALE_LEAST = 6.0, 0.08
 """Standard deviations, as half of the frames tell them, by which a frame's brightness may differ from what its
 neighbours foretell; and the least such part that is named."""
-_FEW = 1.2
+_FEW = 2.5
 """The least part times the number of frames: half of so few frames do not tell a spread."""
 _BRIGHT_ENOUGH = 0.2
 """Of the mean foretold reflectance, from which a pixel counts when it is compared with its neighbours."""
-_FEWEST_PIXELS = 6
+_FEWEST_PIXELS = 8
 """Pixels of a frame that its neighbours foretell, below which their median is chance."""
 _DARK = 0.1
 """Of the light that is foretold, below which a frame or a row of it is black."""
@@ -64,6 +64,13 @@ _LEAST_LOST = 0.02
 _NEGATIVE = 0.5
 """Mean reflectance of pixels that are lit alike, over the largest such mean, below which less the image is negative:
 chosen, no noise of a picture that shows anything is as large."""
+_ODD = 0.1
+"""Of the light of a signed pair, by which that of another pair differs that is none: half of it or more."""
+STEPS = (
+    "one step late: each shot shows the pattern of the shot before",
+    "one step early: each shot shows the pattern of the next",
+)
+"""Ways in which shots are a step beside their patterns."""
 _FLAT = 1e-4, 10, 4.0
 """Readings at a frame's largest number from which it is clipped: a part of all, at least so many, and so many times the
 readings of the upper half of what remains below it, a hundredth of its range wide."""
@@ -71,6 +78,8 @@ _NEAR_TOP = 0.8
 """Of the largest number, the light that clipped readings are foretold at least; hot pixels have less."""
 _REACH = 24
 """Sensor pixels that frames are moved by in search of a shift."""
+_ROUNDING = 1e-20
+"""Of a frame's energy, by which the halves of two pairs differ that were the same numbers."""
 _QUIET, _AVERAGED = 0.5, 0.01
 """Part of the sensor's noise, without rounding, that frames may have at least: half where numbers are digital, stated
 gains are that wrong; where they are not, means of up to 100 shots may have been given."""
@@ -119,7 +128,7 @@ class FrameSums:
 
     ``residual``, ``power``: what is left of a pattern's measurement, and sum of the squares of its shots. ``light``:
     sum of its light. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
-    ``digests``: patterns, and which of their shots, by a number that frames which are one and the same share.
+    ``halves``: light of a signed pattern's shots. ``digests``: patterns, and which of their shots, by a number that frames which are one and the same share.
     """
 
     counts: tuple[int, int]
@@ -131,6 +140,7 @@ class FrameSums:
     def __post_init__(self) -> None:
         self.residual, self.power, self.light, self.sums = (np.zeros(self.counts) for _ in range(4))
         self.digests: dict[int, list[tuple[Pattern, int]]] = {}
+        self.halves: dict[Pattern, tuple[float, float]] = {}
 
     def add(self, measurement: Measurement, residual: float, power: float, total: FloatArray) -> None:
         """Count in one measurement.
@@ -148,7 +158,9 @@ class FrameSums:
         self.residual[pattern], self.power[pattern] = residual, power
         for half, digest in enumerate(measurement.digests):
             self.digests.setdefault(digest, []).append((pattern, half))
-        self.light[pattern] = float(measurement.light.sum())
+        self.light[pattern] = light = float(measurement.light.sum())
+        difference = float(measurement.frame.sum())
+        self.halves[pattern] = (light + difference) / 2, (light - difference) / 2
         others = self.residual.size - 1
         if measurement.shots == 2 and others:
             # light - (total - light) / others
@@ -238,6 +250,30 @@ class FrameCheck:
         # What is known without the model is said where that does not say more.
         known = {number for fault in named for number in fault.numbers}
         return (*(fault for fault in found if not known & set(fault.numbers)), *named)
+
+    def out_of_step(self, sums: FrameSums) -> str:
+        """How signed shots are a step beside their patterns, as their light tells, or nothing: that of two halves is the
+        same for all patterns, and of one half it is not where that lights all pixels, or none."""
+        if not self._signed or self._noise.variance.size < 4:
+            return ""
+        light = np.zeros(len(self._shots))
+        for pattern, halves in sums.halves.items():
+            for sign, half in zip((1, -1), halves, strict=True):
+                light[self._number[(*pattern, sign)]] = half
+
+        def odd(step: int) -> int:
+            pairs: dict[Pattern, float] = {}
+            for number, shot in enumerate(self._shots):
+                pattern = shot.row, shot.column
+                pairs[pattern] = pairs.get(pattern, 0.0) + light[(number + step) % len(light)]
+            totals = np.array(list(pairs.values()))
+            return int((np.abs(totals - np.median(totals)) > _ODD * abs(np.median(totals))).sum())
+
+        if odd(0) > 1:
+            for step, words in ((1, STEPS[0]), (-1, STEPS[1])):
+                if odd(step) == 0:
+                    return words
+        return ""
 
     def negative(self) -> str:
         """Why signed patterns were taken the wrong way round, or nothing: pixels that are always lit alike then have a
@@ -533,12 +569,9 @@ class _Namer:
         repeats = self._repeats(seen)
         named: list[Named] = []
         for one in seen:
-            tried = [*self._tried(one), *repeats.get(one.numbers, [])]
-            fits = [each for each in tried if each[0] <= _EXPLAINS * one.off]
-            # What holds without a word on the other frames comes first.
-            sure = [each for each in fits if each[1] in (Fault.BLACK, Fault.REPEATED)]
-            if sure or fits:
-                named.append(min(sure or fits, key=lambda each: each[0] if not sure else 0.0))
+            same = [each for each in repeats.get(one.numbers, []) if each[0] == -np.inf]
+            fits = [each for each in (*same, *self._tried(one)) if each[0] <= _EXPLAINS * one.off]
+            named += [min(fits, key=lambda each: each[0])] if fits else repeats.get(one.numbers, [])[:1]
         return [check._fault(fault, numbers, words) for _, fault, numbers, words in self._pairs(named)]
 
     # ---- what frames leave
@@ -881,7 +914,10 @@ class _Namer:
                 for one in seen:
                     if len(one.numbers) > 1 or number in one.numbers:
                         continue
-                    beyond = _energy(one.raw - shot) - shot.size * (one.variance + variance / len(signs))
+                    apart = _energy(one.raw - shot)
+                    beyond = apart - shot.size * (one.variance + variance / len(signs))
+                    if apart < _ROUNDING * _energy(shot):
+                        beyond = -np.inf
                     if beyond < 0.5 * _EXPLAINS * one.off and beyond < CHANCE * one.variance * np.sqrt(8 * shot.size):
                         words = f"repeats frame {number} ({check._shots[number].file})"
                         found.setdefault(one.numbers, []).append((beyond, Fault.REPEATED, one.numbers, words))

@@ -289,6 +289,11 @@ def judge(
     scaled = multiple(noise, found.chi_square)
     if scaled:
         return replace(found, flagged=True, cause=scaled.cause, reading=scaled)
+    step = check.out_of_step(sums.by_pattern)
+    if step:
+        return replace(
+            found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, f"the frames are {step}", 0.0)
+        )
     if found.flagged:
         beside = beside_noise / max(float(sums.energy.sum()), _TINY)
         readings = Readings(prepared, check.manifest, noise, check.measured)

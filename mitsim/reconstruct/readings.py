@@ -16,6 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import RunManifest
 from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.faults import STEPS
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solver import Prepared
 
@@ -24,7 +25,7 @@ _FITS = 0.05
 _AT_MOST = 2e-2
 """Part of the measurements, rms, that it may leave: one that is right leaves 1e-2 of a sheet 2 mm beside the calibrated
 distance."""
-_QUIETEST, _TOLD, _CURVED = 0.7, 0.25, 0.05
+_QUIETEST, _TOLD, _CURVED = 0.3, 0.25, 0.05
 """Of curves: least of the expected noise that is left, most of that noise over the unexplained energy, and least of
 that, rms. Dim numbers of sRGB are a thirteenth of their light, and so mostly noise, in which any light fits."""
 _CUT = 1.5
@@ -131,13 +132,11 @@ class Readings:
         size = self.prepared.left.pattern_count * self.prepared.right.pattern_count
         if size > 1:
             cut = min(max(_FITS, _CUT / size), _CUT_AT_MOST) if with_cut else _FITS
-            orders = {
-                "one step late: each shot shows the pattern of the shot before": lambda number: number - 1,
-                "one step early: each shot shows the pattern of the next": lambda number: number + 1,
-                "in the reverse order": lambda number: len(shots) - 1 - number,
-            }
-            if any(shot.sign for shot in shots):
+            orders = {"in the reverse order": lambda number: len(shots) - 1 - number}
+            if any(shot.sign for shot in shots):  # of a step their light tells, as FrameCheck.out_of_step has it
                 orders["with the halves of each pair exchanged"] = lambda number: number ^ 1
+            else:
+                orders |= {STEPS[0]: lambda number: number - 1, STEPS[1]: lambda number: number + 1}
             for words, order in orders.items():
                 yield Cause.ORDER, f"the frames are {words}", self._ordered(order), cut
         yield Cause.GAMMA, "the numbers follow the curve of sRGB", self._linear(_of_srgb), _FITS

@@ -52,7 +52,7 @@ def test_noise_alone_makes_no_defects() -> None:
     for count in (1, 4, 49):
         squares = np.square(rng.standard_normal((count, 512, 512))).sum(axis=0)
         assert defects_of(squares, np.full((512, 512), float(count)), count) is None
-        squares[100, 200] += 60.0 + 8 * np.sqrt(2 * count)
+        squares[100, 200] += 120.0 + 8 * np.sqrt(2 * count)
         found = defects_of(squares, np.full((512, 512), float(count)), count)
         assert found is not None and found.places == [(100, 200)]
 
