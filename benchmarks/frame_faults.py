@@ -96,7 +96,7 @@ def scene(name: str, n: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng([seed, n])
     if name in PRINTS:
         values = io.imread(ROOT / "scenes" / name / "reflectance.png").astype(np.float64)
-        values = values if values.ndim == 2 else values[..., :3].mean(axis=2)
+        values = np.asarray(values if values.ndim == 2 else values[..., :3].mean(axis=2))
         values = np.rot90(values, int(rng.integers(4))) / 255
         return np.asarray(0.05 + 0.9 * transform.resize(values, (n, n), anti_aliasing=True))
     y, x = np.mgrid[:n, :n] / n
@@ -115,7 +115,7 @@ def scene(name: str, n: int, seed: int) -> np.ndarray:
     if name == "highlight":  # a few pixels that are much brighter than white
         row, column = rng.integers(n // 4, 3 * n // 4, 2)
         shades[row : row + 2, column : column + 2] *= 12
-    return shades
+    return np.asarray(shades)
 
 
 def run_of(mask: str, name: str, family: str, n: int, peak: float, seed: int) -> tuple[Capture, Factors]:
@@ -156,7 +156,7 @@ def half_lost(frames: Frames, frame: np.ndarray, rng: np.random.Generator) -> np
     lines = np.arange(len(frame)) < rng.uniform(0.3, 0.7) * len(frame)
     lines = lines if rng.random() < 0.5 else ~lines
     lost = lines[:, None] if rng.random() < 0.7 else lines[None, :]
-    return np.where(lost, dark(frame.shape, rng) if rng.random() < 0.5 else 0.0, frame)
+    return np.asarray(np.where(lost, dark(frame.shape, rng) if rng.random() < 0.5 else 0.0, frame))
 
 
 def shifted(frames: Frames, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -276,6 +276,8 @@ def faulty(
     laid, numbers = FAULTS[fault](frames, np.random.default_rng([seed, 3]), means > 0.2 * means.max())
     if fault == "swapped" and _alike(*(frames[number] for number in sorted(numbers))):
         return None, {}
+    if fault == "dead" and "hadamard" in family and _is_still(frames, laid):
+        return None, {}
     if fault == "rig":
         factors = replace(camera(mask, n, other=True)).calibrated(seed)
     said = verdict(changed(shots, laid, CODES * 16 if fault == "scale" else CODES), factors)
@@ -287,6 +289,15 @@ def _alike(one: np.ndarray, other: np.ndarray) -> bool:
     electrons = np.maximum((one + other - 2 * BLACK) / GAIN, 0)
     noise = GAIN**2 * (electrons + 2 * READ**2) + 1 / 6
     return bool(np.square(one - other).sum() < noise.sum() * (1 + 30 * np.sqrt(2 / one.size)))
+
+
+def _is_still(frames: Frames, laid: Frames) -> bool:
+    """Whether differences of pairs show nothing at a pixel that is still: it is right as it is."""
+    row, column = np.argwhere(laid[0] != frames[0])[0] if (laid[0] != frames[0]).any() else (0, 0)
+    light = np.array([frame[row, column] for frame in frames]) - BLACK
+    noise = 2 * GAIN**2 * (max(light.mean() / GAIN, 0) + READ**2) + 1 / 6
+    differences = light[::2] - light[1::2]
+    return bool(np.square(differences).mean() < noise * (1 + 10 * np.sqrt(2 / len(differences))))
 
 
 def interval(right: int, of: int) -> list[float]:

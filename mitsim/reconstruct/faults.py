@@ -55,6 +55,8 @@ _FEW = 2.5
 """The least part times the number of frames: half of so few frames do not tell a spread."""
 _BRIGHT_ENOUGH = 0.2
 """Of the mean foretold reflectance, from which a pixel counts when it is compared with its neighbours."""
+_BLACK = 0.03
+"""Of the light that is foretold, below which a frame is black whatever the others are: half of the darkest ink."""
 _FEWEST_PIXELS = 8
 """Pixels of a frame that its neighbours foretell, below which their median is chance."""
 _DARK = 0.1
@@ -128,7 +130,8 @@ class FrameSums:
 
     ``residual``, ``power``: what is left of a pattern's measurement, and sum of the squares of its shots. ``light``:
     sum of its light. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
-    ``halves``: light of a signed pattern's shots. ``digests``: patterns, and which of their shots, by a number that frames which are one and the same share.
+    ``halves``: light of a signed pattern's shots. ``digests``: patterns, and which of their shots, by a number that
+    frames which are one and the same share.
     """
 
     counts: tuple[int, int]
@@ -252,9 +255,14 @@ class FrameCheck:
         return (*(fault for fault in found if not known & set(fault.numbers)), *named)
 
     def out_of_step(self, sums: FrameSums) -> str:
-        """How signed shots are a step beside their patterns, as their light tells, or nothing: that of two halves is the
-        same for all patterns, and of one half it is not where that lights all pixels, or none."""
-        if not self._signed or self._noise.variance.size < 4:
+        """How signed shots are a step beside their patterns, as their light tells, or nothing.
+
+        That of two halves is the same for all patterns; most is that of the half that lights all pixels.
+        """
+        left, right = self._patterns
+        whole = [n for n, shot in enumerate(self._shots) if (left[:, shot.row] > 0).all() and shot.sign == 1]
+        whole = [n for n in whole if (right[:, self._shots[n].column] > 0).all()]
+        if not self._signed or self._noise.variance.size < 4 or len(whole) != 1:
             return ""
         light = np.zeros(len(self._shots))
         for pattern, halves in sums.halves.items():
@@ -271,7 +279,7 @@ class FrameCheck:
 
         if odd(0) > 1:
             for step, words in ((1, STEPS[0]), (-1, STEPS[1])):
-                if odd(step) == 0:
+                if odd(step) == 0 and int(np.argmax(np.roll(light, -step))) == whole[0]:
                     return words
         return ""
 
@@ -348,6 +356,7 @@ class FrameCheck:
         """
         image = self._image(weights)
         near = self._neighbours(image, good)
+        amid = self._between(image, good)
         expected, kept = self._seen(near), self._sigma > 0
         bright = near > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
         whole, middle = np.full(good.shape, np.nan), np.full(good.shape, np.nan)
@@ -360,6 +369,10 @@ class FrameCheck:
             if chosen.sum() >= _FEWEST_PIXELS and (size := _energy(told)) > 0:
                 whole[row, column] = float(np.vdot(seen, told)) / size
                 middle[row, column] = float(np.median(image[lit][chosen] / near[lit][chosen]))
+                between = amid[lit] > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
+                if whole[row, column] < _BLACK and between.sum() >= _FEWEST_PIXELS:
+                    if float(np.median(image[lit][between] / amid[lit][between])) < _BLACK:
+                        return row, column
         if np.isfinite(whole).sum() < 3:
             return None
         least = max(_SCALE_LEAST, _FEW / good.size)
@@ -375,8 +388,8 @@ class FrameCheck:
             off = np.fmin(off, np.abs(away) / max(least, _SCALE_SPREADS * spread))
             signs.append(np.sign(away))
         off = np.where((signs[0] == signs[1]) & np.isfinite(whole), off, 0.0)
-        worst = divmod(int(np.argmax(off)), off.shape[1])
-        return worst if off[worst] > 1 else None
+        row, column = divmod(int(np.argmax(off)), off.shape[1])
+        return (row, column) if off[row, column] > 1 else None
 
     def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots that are one and the same frame, noise and all."""
@@ -452,6 +465,16 @@ class FrameCheck:
             uniform_filter(values, size, mode="constant") * np.prod(size) - values for values in (image * lit, lit)
         )
         return np.asarray(np.divide(light, count, out=np.zeros_like(light), where=count > 0.5))
+
+    def _between(self, image: FloatArray, good: BoolArray) -> FloatArray:
+        """(n, n') the lesser of each pixel's neighbours on either side, along the side where that is more: what lies
+        inside of a bright surface is no darker, whatever lies beside it."""
+        seen = np.pad(np.where(self._lit(good), image, 0.0), 1)
+        sides = [
+            np.minimum(seen[:-2, 1:-1], seen[2:, 1:-1]) * (self._periods[0] > 2),
+            np.minimum(seen[1:-1, :-2], seen[1:-1, 2:]) * (self._periods[1] > 2),
+        ]
+        return np.asarray(np.maximum(*sides))
 
     def _measurements(self, patterns: Iterable[Pattern]) -> dict[Pattern, Measurement]:
         wanted = set(patterns)
@@ -593,18 +616,22 @@ class _Namer:
         left = self._left(frames, self._together(frames)) - self._least
         return left - sum(frame.size for frame in frames.values()) * variance * self._check._spare
 
-    def _filled(self, one: _Seen, frame: FloatArray, known: BoolArray, least: float = -np.inf) -> float:
-        """Energy beyond noise that a ``frame`` in the place of ``one`` leaves where it is ``known``; elsewhere it may
+    def _filled(self, one: _Seen, raw: FloatArray, known: BoolArray, least: float = -np.inf) -> float:
+        """Energy beyond noise that ``raw`` light in the place of ``one`` leaves where it is ``known``; elsewhere it may
         be anything, or anything from ``least`` on."""
-        fit = self._foretold[one.pattern]
+        known = np.broadcast_to(known, raw.shape)
+        fit, means = self._foretold[one.pattern], np.zeros(())
+        if self._check._prepared.centre:
+            means = np.where(known, raw, np.median(raw[known]))
+            means = means - self._level(means)
         for _ in range(_STEPS):
-            fit = np.maximum(fit, least)
-            filled = np.where(known, frame, fit)
-            weights = self._together({one.pattern: filled})
+            filled = np.where(known, raw, np.maximum(fit + means, least))
+            frame = self._level(filled)
+            means = filled - frame
+            weights = self._together({one.pattern: frame})
             fit = self._check._frame(weights, *one.pattern)
-        left = self._left({one.pattern: filled}, weights) - self._least
-        size = float(np.broadcast_to(known, frame.shape).sum())
-        return left - size * one.variance * self._check._spare
+        left = self._left({one.pattern: frame}, weights) - self._least
+        return left - float(known.sum()) * one.variance * self._check._spare
 
     # ---- what was read
 
@@ -721,7 +748,7 @@ class _Namer:
         for axis, name in ((0, "rows"), (1, "columns")):
             lines, usual = one.raw.mean(axis=1 - axis), self._total.mean(axis=1 - axis)
             if self._check._noise.variance.size == 1:
-                usual = np.full_like(usual, usual.mean())
+                usual = np.full_like(usual, np.percentile(lines, 90))
             ratio = lines / np.where(usual > 0, usual, np.inf)
             lost = np.abs(ratio) < _DARK * max(float(np.percentile(ratio, 75)), 0.0)
             lost |= (lines < 0) & (usual > 0) & (ratio < 0)
@@ -733,7 +760,7 @@ class _Namer:
             if one.foretold is None or self._check._signed:
                 left = self._outside_of_part(one, kept, axis)
             else:
-                left = self._filled(one, one.frame, kept[:, None] if axis == 0 else kept[None, :])
+                left = self._filled(one, one.raw, kept[:, None] if axis == 0 else kept[None, :])
             yield left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}"
 
     def _clipped(self, one: _Seen) -> Iterable[Named]:
@@ -747,11 +774,11 @@ class _Namer:
         if count < max(part * flat.size, least) or count * times < below or count > 0.9 * flat.size:
             return
         if one.foretold is not None:
-            if float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
+            if not self._check._prepared.centre and float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
                 return
             left = _energy(one.frame - np.minimum(one.foretold, top)) - flat.size * one.variance
-            if not self._check._signed and not self._check._prepared.centre:
-                left = self._filled(one, one.frame, ~flat, top)
+            if not self._check._signed:
+                left = self._filled(one, one.raw, ~flat, top)
         else:
             filled = one.frame
             for _ in range(_STEPS):
@@ -826,7 +853,7 @@ class _Namer:
             known = [np.zeros(size, dtype=np.bool_) for size in back.shape]
             for line, step in zip(known, shift, strict=True):
                 line[max(-step, 0) : len(line) - max(step, 0)] = True
-            left = self._filled(one, self._level(back), np.outer(*known))
+            left = self._filled(one, back, np.outer(*known))
             rows, columns = shift
             words = f"is shifted by {rows} rows and {columns} columns of the sensor"
             yield left, Fault.SHIFTED, one.numbers, words

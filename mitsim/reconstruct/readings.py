@@ -36,9 +36,9 @@ _CUT_AT_MOST = 0.3
 _POWERS = 1.8, 2.2, 2.4
 """Exponents that displays and files encode light by, beside the curve of sRGB (IEC 61966-2-1)."""
 
-_MULTIPLIED, _LEAST_MULTIPLIED = 0.5, 1.5
-"""Chi-square of multiplied numbers, over their factor, and at least: shot noise alone makes that of 1 times the factor,
-and what is rounded to it 1.1."""
+_MULTIPLIED, _LEAST_MULTIPLIED = 0.15, 1.5
+"""Chi-square of multiplied numbers, over their factor, and at least: shot noise alone makes that the factor, and
+a black level that was multiplied too, which then counts as light, 0.3 of it; what is rounded to a factor has 1.1."""
 
 Frames = Iterator[tuple[FloatArray, int, int, float]]
 """Measurements, their patterns, and the energy that their noise is expected to have."""
