@@ -165,7 +165,7 @@ def shifted(frames: Frames, frame: np.ndarray, rng: np.random.Generator) -> np.n
 
 
 def clipped(frames: Frames, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return np.minimum(frame, np.rint(BLACK + rng.uniform(0.5, 0.75) * (frame.max() - BLACK)))
+    return np.asarray(np.minimum(frame, np.rint(BLACK + rng.uniform(0.5, 0.75) * (frame.max() - BLACK))))
 
 
 def repeated(frames: Frames, rng: np.random.Generator, lit: np.ndarray) -> tuple[Frames, set[int]]:

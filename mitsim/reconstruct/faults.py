@@ -370,9 +370,9 @@ class FrameCheck:
                 whole[row, column] = float(np.vdot(seen, told)) / size
                 middle[row, column] = float(np.median(image[lit][chosen] / near[lit][chosen]))
                 between = amid[lit] > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
-                if whole[row, column] < _BLACK and between.sum() >= _FEWEST_PIXELS:
-                    if float(np.median(image[lit][between] / amid[lit][between])) < _BLACK:
-                        return row, column
+                dark = whole[row, column] < _BLACK and between.sum() >= _FEWEST_PIXELS
+                if dark and float(np.median(image[lit][between] / amid[lit][between])) < _BLACK:
+                    return row, column
         if np.isfinite(whole).sum() < 3:
             return None
         least = max(_SCALE_LEAST, _FEW / good.size)
@@ -388,7 +388,7 @@ class FrameCheck:
             off = np.fmin(off, np.abs(away) / max(least, _SCALE_SPREADS * spread))
             signs.append(np.sign(away))
         off = np.where((signs[0] == signs[1]) & np.isfinite(whole), off, 0.0)
-        row, column = divmod(int(np.argmax(off)), off.shape[1])
+        row, column = divmod(int(np.argmax(off)), good.shape[1])
         return (row, column) if off[row, column] > 1 else None
 
     def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
