@@ -162,8 +162,9 @@ class FrameSums:
         for half, digest in enumerate(measurement.digests):
             self.digests.setdefault(digest, []).append((pattern, half))
         self.light[pattern] = light = float(measurement.light.sum())
-        difference = float(measurement.frame.sum())
-        self.halves[pattern] = (light + difference) / 2, (light - difference) / 2
+        if measurement.shots == 2:
+            difference = float(measurement.frame.sum())
+            self.halves[pattern] = (light + difference) / 2, (light - difference) / 2
         others = self.residual.size - 1
         if measurement.shots == 2 and others:
             # light - (total - light) / others

@@ -194,6 +194,7 @@ class Residuals:
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(3))
         self.squares: FloatArray = np.zeros(sizes)
+        self._own: FloatArray = np.zeros(sizes)  # of one frame: to make it anew takes longer than to fill it
         self.by_pattern = FrameSums((prepared.left.pattern_count, prepared.right.pattern_count))
 
     def add(self, measurement: Measurement) -> None:
@@ -203,7 +204,7 @@ class Residuals:
         left, right = prepared.left.slabs[measurement.row], prepared.right.slabs[measurement.column]
         residual = frame - (left.matrix @ self._weights[left.columns][:, right.columns]) @ right.matrix.T
         flat, power = residual.ravel(), self._sums(measurement.power)
-        self.squares += np.square(residual)
+        self.squares += np.multiply(residual, residual, out=self._own)
         self.energy += self._squares(frame)
         self.power += power
         self.by_pattern.add(measurement, float(np.dot(flat, flat)), float(power.sum()), self._noise.light)
