@@ -201,7 +201,7 @@ class FrameCheck:
         noise: FrameNoise,
         measured: Callable[[], Iterable[Measurement]],
     ) -> None:
-        self._prepared, self._weights, self._noise = prepared, weights, noise
+        self.prepared, self.weights, self.noise = prepared, weights, noise
         self.manifest, self.measured = manifest, measured
         self._patterns, self._digital = patterns, manifest.digital
         self._shots = manifest.patterns.captures
@@ -219,8 +219,9 @@ class FrameCheck:
     # ---- suspicion
 
     def all_off(self, sums: FrameSums, beside_noise: float) -> bool:
-        """Whether the typical frame is off, and not single ones; both arguments as :meth:`faults` takes them."""
-        noise = self._noise.variance * self._size * self._spare
+        """Whether the typical frame is off, and not single ones; ``sums`` and ``beside_noise`` as :meth:`faults` takes
+        them."""
+        noise = self.noise.variance * self._size * self._spare
         share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
         part = np.maximum(sums.residual - noise - share, 0.0) / np.maximum(sums.power, np.finfo(float).tiny)
         return bool(np.median(part) > _OFF**2)
@@ -237,8 +238,8 @@ class FrameCheck:
         """
         found = [*self._same(sums), *self._noiseless(sums)]
         bad: dict[Pattern, bool] = {}  # and whether its brightness alone is off
-        others = self._weights
-        count = self._noise.variance.size
+        others = self.weights
+        count = self.noise.variance.size
         while True:
             suspect = self._suspect(sums, others, beside_noise, bad)
             if suspect is None:
@@ -256,14 +257,14 @@ class FrameCheck:
         return (*(fault for fault in found if not known & set(fault.numbers)), *named)
 
     def out_of_step(self, sums: FrameSums) -> str:
-        """How signed shots are a step beside their patterns, as their light tells, or nothing.
+        """How signed shots are a step beside their patterns, as ``sums`` of their light tell, or nothing.
 
         That of two halves is the same for all patterns; most is that of the half that lights all pixels.
         """
         left, right = self._patterns
         whole = [n for n, shot in enumerate(self._shots) if (left[:, shot.row] > 0).all() and shot.sign == 1]
         whole = [n for n in whole if (right[:, self._shots[n].column] > 0).all()]
-        if not self._signed or self._noise.variance.size < 4 or len(whole) != 1:
+        if not self._signed or self.noise.variance.size < 4 or len(whole) != 1:
             return ""
         light = np.zeros(len(self._shots))
         for pattern, halves in sums.halves.items():
@@ -289,7 +290,7 @@ class FrameCheck:
         negative reflectance in the mean, where noise is averaged."""
         if not self._signed or max(self._periods) < 2:
             return ""
-        image = self._image(self._weights)
+        image = self._image(self.weights)
         rows, columns = (group_pixels(side, "block") for side in self._patterns)
         means = np.array([[image[np.ix_(row.pixels, column.pixels)].mean() for column in columns] for row in rows])
         if means.min() > -_NEGATIVE * np.abs(means).max():
@@ -310,13 +311,13 @@ class FrameCheck:
         bad
             patterns that are suspected already.
         """
-        good = np.ones(self._noise.variance.shape, dtype=np.bool_)
+        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
         for pattern in bad:
             good[pattern] = False
         if not good.any():
             return None
-        noise = self._noise.variance * self._size
-        chance = CHANCE * self._noise.variance * np.sqrt(2 * self._size)
+        noise = self.noise.variance * self._size
+        chance = CHANCE * self.noise.variance * np.sqrt(2 * self._size)
         share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
         power = np.maximum(sums.power, np.median(sums.power[good]))
         others = max(good.sum() - 1, 1)
@@ -347,7 +348,7 @@ class FrameCheck:
 
     def _is_dark(self, sums: FrameSums) -> bool:
         """Whether the only frame has no more light than noise makes."""
-        return bool(abs(sums.light[0, 0]) < CHANCE * float(np.sqrt(self._noise.variance[0, 0] * self._size)))
+        return bool(abs(sums.light[0, 0]) < CHANCE * float(np.sqrt(self.noise.variance[0, 0] * self._size)))
 
     def _brightness(self, weights: FloatArray, good: BoolArray) -> Pattern | None:
         """The ``good`` pattern whose brightness differs most from what its pixels' neighbours foretell, if it does.
@@ -394,7 +395,7 @@ class FrameCheck:
 
     def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots that are one and the same frame, noise and all."""
-        if not self._noise.variance.any():
+        if not self.noise.variance.any():
             return
         for digest, shots in sums.digests.items():
             if digest and len(shots) > 1:
@@ -407,13 +408,13 @@ class FrameCheck:
         if not digital.noise_is_stated:
             return
         light = sums.light / self._size
-        rounding = ((digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s) ** 2 / 12 * self._noise.shots
-        own = self._noise.variance - rounding
+        rounding = ((digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s) ** 2 / 12 * self.noise.shots
+        own = self.noise.variance - rounding
         # Digital numbers of one reading: its noise, and how far it is above the end of its range.
-        deviation = np.sqrt(np.maximum(own, 0) / self._noise.shots) * digital.exposure_s * digital.gain_dn_per_e
-        above = (light / self._noise.shots) * digital.exposure_s * digital.gain_dn_per_e + digital.black_level_dn
+        deviation = np.sqrt(np.maximum(own, 0) / self.noise.shots) * digital.exposure_s * digital.gain_dn_per_e
+        above = (light / self.noise.shots) * digital.exposure_s * digital.gain_dn_per_e + digital.black_level_dn
         shows = (deviation > 0.5 * (digital.step_dn or 0.0)) & (above > 3 * deviation) & (own > 0)
-        shows &= self._noise.saturated < 1e-3 * max(self._noise.readings, 1)
+        shows &= self.noise.saturated < 1e-3 * max(self.noise.readings, 1)
         expected = np.where(shows, own * self._size * self._spare, 1.0)
         least = _QUIET if digital.step_dn else _AVERAGED
         quiet = shows & (sums.residual / expected < least * (1 - CHANCE * np.sqrt(2 / (self._size * self._spare))))
@@ -429,28 +430,28 @@ class FrameCheck:
         """Where the coefficients of a pattern are in W."""
         places = [
             np.arange(side.accumulated_size)[side.slabs[index].columns]
-            for side, index in ((self._prepared.left, row), (self._prepared.right, column))
+            for side, index in ((self.prepared.left, row), (self.prepared.right, column))
         ]
         return np.ix_(*places)
 
     def _frame(self, weights: FloatArray, row: int, column: int) -> FloatArray:
         """(m, m') the frame of a pattern by ``weights``."""
-        left, right = self._prepared.left.slabs[row], self._prepared.right.slabs[column]
+        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
         return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
 
     def _own(self, frame: FloatArray, row: int, column: int) -> FloatArray:
         """What a ``frame`` of a pattern adds to W at its columns."""
-        left, right = self._prepared.left.slabs[row], self._prepared.right.slabs[column]
+        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
         return np.asarray(left.matrix.T @ frame @ right.matrix)
 
     def _image(self, weights: FloatArray) -> FloatArray:
         """(n, n') image of W at the image's lambda."""
         filtered = np.divide(self._kept * weights, self._sigma, out=np.zeros_like(weights), where=self._sigma > 0)
-        return self._prepared.image(filtered)
+        return self.prepared.image(filtered)
 
     def _seen(self, image: FloatArray) -> FloatArray:
         """W of an ``image`` without noise."""
-        duals = [side.basis if side.dual is None else side.dual for side in (self._prepared.left, self._prepared.right)]
+        duals = [side.basis if side.dual is None else side.dual for side in (self.prepared.left, self.prepared.right)]
         return np.asarray(self._sigma * (duals[0].T @ image @ duals[1]))
 
     def _lit(self, good: BoolArray) -> BoolArray:
@@ -482,17 +483,17 @@ class FrameCheck:
         return {key: each for each in self.measured() if (key := (each.row, each.column)) in wanted}
 
     def _centred(self, frame: FloatArray) -> FloatArray:
-        return centred(frame) if self._prepared.centre else frame
+        return centred(frame) if self.prepared.centre else frame
 
     def _without(self, bad: tuple[Pattern, ...]) -> FloatArray:
         """W of all patterns, the ``bad`` ones as the others foretell them."""
-        rest = self._weights.copy()
+        rest = self.weights.copy()
         for pattern, measurement in self._measurements(bad).items():
             rest[self._columns(*pattern)] -= self._own(self._centred(measurement.frame), *pattern)
-        good = np.ones(self._noise.variance.shape, dtype=np.bool_)
+        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
         for pattern in bad:
             good[pattern] = False
-        image = self._image(self._weights)
+        image = self._image(self.weights)
         if not self._exclusive and max(self._periods) > 1:
             # One pattern of +-1 that is wrong is a comb of the dots' period, without a mean.
             image = uniform_filter(image, self._periods, mode="nearest")
@@ -500,8 +501,8 @@ class FrameCheck:
         weights = self._seen(image)
         grams = {
             pattern: (
-                self._prepared.left.slabs[pattern[0]].matrix.T @ self._prepared.left.slabs[pattern[0]].matrix,
-                self._prepared.right.slabs[pattern[1]].matrix.T @ self._prepared.right.slabs[pattern[1]].matrix,
+                self.prepared.left.slabs[pattern[0]].matrix.T @ self.prepared.left.slabs[pattern[0]].matrix,
+                self.prepared.right.slabs[pattern[1]].matrix.T @ self.prepared.right.slabs[pattern[1]].matrix,
             )
             for pattern in bad
         }
@@ -515,11 +516,11 @@ class FrameCheck:
 
     def _gathered(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
         """Sums of all measurements against other ``weights``; the light of all is that of those not ``bad``."""
-        sums = FrameSums((self._noise.variance.shape[0], self._noise.variance.shape[1]))
+        sums = FrameSums((self.noise.variance.shape[0], self.noise.variance.shape[1]))
         total = np.zeros(0)
         if self._signed:
             total = sum((each.light for each in self._measurements(self._good(bad)).values()), start=np.zeros(()))
-        others = max(self._noise.variance.size - len(set(bad)), 2)
+        others = max(self.noise.variance.size - len(set(bad)), 2)
         for each in self.measured():
             residual = self._centred(each.frame) - self._frame(weights, each.row, each.column)
             pattern = each.row, each.column
@@ -530,7 +531,7 @@ class FrameCheck:
         return sums
 
     def _good(self, bad: Iterable[Pattern]) -> set[Pattern]:
-        return set(np.ndindex(self._noise.variance.shape)) - set(bad)
+        return set(np.ndindex(self.noise.variance.shape)) - set(bad)
 
     # ---- names
 
@@ -579,9 +580,9 @@ class _Namer:
     def __init__(self, check: FrameCheck, bad: dict[Pattern, bool], weights: FloatArray) -> None:
         self._check, self._bad, self._weights = check, bad, weights
         self._measured = check._measurements(bad)
-        self._total = check._noise.light
+        self._total = check.noise.light
         self._foretold = {pattern: check._frame(weights, *pattern) for pattern in bad}
-        self._rest = check._weights.copy()
+        self._rest = check.weights.copy()
         for pattern, each in self._measured.items():
             self._rest[check._columns(*pattern)] -= check._own(check._centred(each.frame), *pattern)
         self._least = self._left({}, weights)
@@ -622,7 +623,7 @@ class _Namer:
         be anything, or anything from ``least`` on."""
         known = np.broadcast_to(known, raw.shape)
         fit, means = self._foretold[one.pattern], np.zeros(())
-        if self._check._prepared.centre:
+        if self._check.prepared.centre:
             means = np.where(known, raw, np.median(raw[known]))
             means = means - self._level(means)
         for _ in range(_STEPS):
@@ -639,10 +640,10 @@ class _Namer:
     def _plain(self, pattern: Pattern) -> _Seen:
         check, measurement = self._check, self._measured[pattern]
         number, frame = check._number[(*pattern, 0)], check._centred(measurement.frame)
-        variance = float(check._noise.variance[pattern])
+        variance = float(check.noise.variance[pattern])
         foretold = (
             None
-            if check._exclusive or len(self._bad) == check._noise.variance.size
+            if check._exclusive or len(self._bad) == check.noise.variance.size
             else check._frame(self._weights, *pattern)
         )
         if foretold is None:
@@ -655,12 +656,12 @@ class _Namer:
         """Of patterns whose sum is off the half that its other half, and the model, tell to be wrong; of others the
         difference."""
         check = self._check
-        good = check._noise.variance.size - len(self._bad)
+        good = check.noise.variance.size - len(self._bad)
         total = self._total - sum(each.light for each in self._measured.values())
         mean = total / max(good, 1)
         found = []
         for pattern, each in self._measured.items():
-            variance = float(check._noise.variance[pattern]) * (1 + 1 / max(good, 1))
+            variance = float(check.noise.variance[pattern]) * (1 + 1 / max(good, 1))
             off = _energy(each.light - mean) - each.light.size * variance
             numbers = tuple(check._number[(*pattern, sign)] for sign in (1, -1))
             if off > CHANCE * variance * np.sqrt(2 * each.light.size) and off > _OFF**2 * _energy(mean):
@@ -706,7 +707,7 @@ class _Namer:
 
     def _is_black(self, one: _Seen) -> bool:
         """Whether a shot is as even, and as dark, as a sensor without light."""
-        count = self._check._noise.variance.size
+        count = self._check.noise.variance.size
         light = one.foretold if one.foretold is not None else self._total / count
         if count == 1 and self._bad[one.pattern]:
             return True
@@ -748,7 +749,7 @@ class _Namer:
         """Rows, or columns, without light side by side."""
         for axis, name in ((0, "rows"), (1, "columns")):
             lines, usual = one.raw.mean(axis=1 - axis), self._total.mean(axis=1 - axis)
-            if self._check._noise.variance.size == 1:
+            if self._check.noise.variance.size == 1:
                 usual = np.full_like(usual, np.percentile(lines, 90))
             ratio = lines / np.where(usual > 0, usual, np.inf)
             lost = np.abs(ratio) < _DARK * max(float(np.percentile(ratio, 75)), 0.0)
@@ -775,7 +776,7 @@ class _Namer:
         if count < max(part * flat.size, least) or count * times < below or count > 0.9 * flat.size:
             return
         if one.foretold is not None:
-            if not self._check._prepared.centre and float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
+            if not self._check.prepared.centre and float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
                 return
             left = _energy(one.frame - np.minimum(one.foretold, top)) - flat.size * one.variance
             if not self._check._signed:
@@ -794,7 +795,7 @@ class _Namer:
         """Another pattern than that of its place: of all patterns under dots, else of those that are suspected."""
         check = self._check
         if one.foretold is None:
-            others = [other for other in np.ndindex(check._noise.variance.shape) if other != one.pattern]
+            others = [other for other in np.ndindex(check.noise.variance.shape) if other != one.pattern]
             if not others:
                 return
             left, best = min((self._outside(one.frame, other, one.variance), other) for other in others)
@@ -817,7 +818,7 @@ class _Namer:
     def _crossed(self, one: _Seen, other: Pattern, there: FloatArray) -> float:
         """Energy of :attr:`_Seen.off` that is left when a frame and that of an ``other`` pattern, ``there``, are
         exchanged."""
-        variance = (one.variance + float(self._check._noise.variance[other])) / 2
+        variance = (one.variance + float(self._check.noise.variance[other])) / 2
         own = self._beyond({one.pattern: one.frame, other: there}, variance)
         left = self._beyond({one.pattern: there, other: one.frame}, variance)
         return left / own * one.off if own > 0 else np.inf
@@ -875,7 +876,7 @@ class _Namer:
         return np.asarray(left @ (left.T @ frame @ right) @ right.T)
 
     def _slabs(self, pattern: Pattern) -> tuple[Any, Any]:
-        prepared = self._check._prepared
+        prepared = self._check.prepared
         return prepared.left.slabs[pattern[0]], prepared.right.slabs[pattern[1]]
 
     def _outside(self, frame: FloatArray, pattern: Pattern, variance: float) -> float:
@@ -887,7 +888,7 @@ class _Namer:
         bases = []
         for slab, kept in zip(self._slabs(pattern), (rows, columns), strict=True):
             part = slab.matrix[kept]
-            if self._check._prepared.centre:
+            if self._check.prepared.centre:
                 part = np.concatenate([part, np.ones((len(part), 1))], axis=1)
             bases.append(np.linalg.qr(part)[0])
         return bases[0], bases[1]
@@ -902,7 +903,7 @@ class _Namer:
         return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
 
     def _level(self, part: FloatArray) -> FloatArray:
-        return centred(part) if self._check._prepared.centre else part
+        return centred(part) if self._check.prepared.centre else part
 
     def _inside(self, one: _Seen, window: list[slice], still: list[slice]) -> float:
         """Energy beyond noise of a ``window`` of the sensor, held against the ``still`` middle of it."""
@@ -935,7 +936,7 @@ class _Namer:
         for each in check.measured():
             pattern = each.row, each.column
             signs = (1, -1) if each.shots == 2 else (0,)
-            variance = float(check._noise.variance[pattern])
+            variance = float(check.noise.variance[pattern])
             for sign in signs:
                 shot = (each.light + sign * each.frame) / 2 if sign else each.frame
                 number = check._number[(*pattern, sign)]

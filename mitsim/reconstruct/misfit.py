@@ -8,7 +8,6 @@ distance sends.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -245,41 +244,32 @@ class Residuals:
 
 
 def judge(
-    prepared: Prepared,
-    weights: FloatArray,
-    measured: Iterable[Measurement],
-    noise: FrameNoise,
+    check: FrameCheck,
     factor_energy: float | None,
     print_energy: float,
     evidence: Evidence,
-    check: FrameCheck,
     with_defects: bool = True,
 ) -> Misfit | None:
     """Hold all measurements against the model; None where there are no more data than unknowns.
 
     Parameters
     ----------
-    prepared, weights
-        the factorised model, and W of all measurements.
-    measured
-        all of them once more.
-    noise
-        of them, summed up already.
+    check
+        of the factorised model and of all measurements, which are read once more.
     factor_energy
         what noisy factors add to the frames; None: not stated.
     print_energy
         what print within a pixel may add: left to a fitting scene, but no part of the chi-square.
     evidence
         empty, of the same model.
-    check
-        of the same measurements.
     with_defects
         whether defective pixels are looked for, and no cause where there are some.
     """
+    prepared, noise = check.prepared, check.noise
     if prepared.rank >= prepared.left.data_rows * prepared.right.data_rows:
         return None
-    sums = Residuals(prepared, weights, noise, evidence)
-    for measurement in measured:
+    sums = Residuals(prepared, check.weights, noise, evidence)
+    for measurement in check.measured():
         sums.add(measurement)
     expected = sums.expected(factor_energy or 0.0)
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)

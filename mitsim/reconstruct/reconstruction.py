@@ -213,13 +213,6 @@ class Accumulated:
             return solution.misfit(self.noise, added, print_energy(self.model, image))
         lam = _LAMBDA_OF_TV * problem.scale if isinstance(solution, TVSolution) else solution.lam
         return judge(
-            self.prepared,
-            self.weights,
-            self.kept or shots.measured(),
-            self.noise,
-            added,
-            print_energy(self.model, image),
-            Evidence(factors, shots.patterns, lack.energy if lack else None),
             FrameCheck(
                 self.prepared,
                 self.weights,
@@ -229,6 +222,9 @@ class Accumulated:
                 self.noise,
                 lambda: self.kept or shots.measured(),
             ),
+            added,
+            print_energy(self.model, image),
+            Evidence(factors, shots.patterns, lack.energy if lack else None),
             with_defects,
         )
 
