@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Measurement
 from mitsim.core.parallel import single_threaded_blas
@@ -47,6 +48,7 @@ not fit either."""
 
 
 @single_threaded_blas()
+@checked
 def reconstruct(
     shots: Capture,
     factors: Factors,
