@@ -21,7 +21,7 @@ from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solver import Prepared
 
 _FITS = 0.05
-"""Part of the unexplained energy that a reading may leave: the others of a frame that is turned leave half or more."""
+"""Part of the unexplained energy that a reading may leave: chosen, so that it explains nearly all of it."""
 _AT_MOST = 2e-2
 """Part of the measurements, rms, that it may leave: one that is right leaves 1e-2 of a sheet 2 mm beside the calibrated
 distance."""

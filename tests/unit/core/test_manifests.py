@@ -90,7 +90,7 @@ def test_a_folder_without_a_format_is_read_as_version_0_3_0_did(tmp_path: Path, 
 
 
 def test_captures_of_one_file_are_refused(tmp_path: Path) -> None:
-    """Two shots cannot be one frame, nor a shot the ambient frame. (Planted: neither looked at.)"""
+    """Two shots cannot be one frame, nor a shot the ambient frame."""
     captures = [{"file": "a.exr", "row": row, "column": 0, "sign": 0} for row in range(2)]
     patterns = {"P_L": [[1.0, 0.0], [0.0, 1.0]], "P_R": [[1.0], [1.0]], "captures": captures}
     with pytest.raises(MitsimError, match=r"captures.1: names 'a.exr', as captures.0 does"):

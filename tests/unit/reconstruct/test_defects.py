@@ -21,7 +21,7 @@ def broken(frames: Frames) -> Frames:
 
 @pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
 def test_single_pixels(patterns: str) -> None:
-    """(Planted: readings set to the model's at once, without 1 - h; readings of the first round kept.)"""
+    """As what they are; a good run says nothing."""
     shots, factors = bench().run(patterns, picture(1), 1), bench().calibrated(1)
     good, mended = reconstruct(shots, factors), reconstruct(with_frames(shots, broken), factors)
     assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None

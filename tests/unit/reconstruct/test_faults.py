@@ -68,8 +68,7 @@ FAULTS: dict[str, tuple[Callable[[Frames], np.ndarray], str]] = {
 @pytest.mark.parametrize("patterns", FAMILIES)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_frame_at_fault_is_named(patterns: str, fault: str) -> None:
-    """By its number, its file and what is wrong. (Planted, each fails several of these: brightness compared with the
-    frame's own pixels; W without the pattern left out; the halves' sum held against all others with this one in it.)"""
+    """By its number, its file and what is wrong."""
     if fault == "dim" and patterns == "dots:1x8":
         pytest.skip("two columns of a print with edges do not foretell the brightness of two others")
     change, words = FAULTS[fault]
@@ -119,7 +118,7 @@ def test_no_frame_of_a_fitting_run_is_named(patterns: str, print_: str) -> None:
 
 
 def test_the_only_frame_black_or_free_of_noise() -> None:
-    """(Planted: chi-square judged above 1 alone: the noiseless frame is fine.)"""
+    """As what they are; a good run says nothing."""
     black = image("uniform", lambda frames: [dark(frames[0])])
     assert not black.ok and "frame 0 (frame_00000.exr) holds no light" in str(black.status)
     shots = bench().run("uniform", picture(1), 1)

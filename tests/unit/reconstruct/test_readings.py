@@ -36,7 +36,7 @@ def said(patterns: str, change: Callable[[Frames], Frames]) -> tuple[Cause | Non
 @pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
 @pytest.mark.parametrize("turn", TURNS)
 def test_turned_frames(patterns: str, turn: str) -> None:
-    """(Planted: frames turned once more instead of back.)"""
+    """As what they are; a good run says nothing."""
     cause, words = said(patterns, lambda frames: [TURNS[turn](frame) for frame in frames])
     assert cause is Cause.ORIENTATION and turn in words
 
