@@ -39,8 +39,8 @@ CHANCE = 6.0
 _OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
 _MORE = 4.0
-"""Times the median frame's unexplained energy from which a frame is suspected: chosen, as one that is wrong puts part of
-its energy into the others where patterns overlap."""
+"""Times the median frame's unexplained energy from which a frame is suspected: chosen, as one that is wrong puts part
+of its energy into the others where patterns overlap."""
 _EXPLAINS = 0.2
 """Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""
 _MOST_BAD = 0.25
