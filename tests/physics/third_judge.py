@@ -1,27 +1,32 @@
-"""Light of simple scenes in float64, apart from Mitsuba and mitsim: shapes, a projector and a camera in, irradiance out.
+"""Light of simple scenes in float64, apart from Mitsuba and mitsim: shapes, projector and camera in, irradiance out.
 
 Both estimators trace rays by Mitsuba in float32, so they can lose the same light. This module knows rectangles with
-holes, spheres, cylinders, panes of glass, matt surfaces and mirrors, and gives by quadrature what a pinhole projector
-brings to points of the sensor: over one matt surface (*direct*), through panes, with shadows; and over one mirror or by
-a pane's faces (*glint*). Light over two matt surfaces is left out: the estimators are compared without
-``interreflection``. Lengths are mm in the camera's frame (sensor at z = 0, +z to the scene), irradiance is W/m^2.
+holes, spheres, cylinders, one pane of glass, matt surfaces and mirrors, and gives by quadrature what a pinhole
+projector brings to points of the sensor over one matt surface at most, with shadows: directly, over mirrors before it
+or behind it, through the pane and after reflections inside of it; and over mirrors or the pane's faces alone. Light
+over two matt surfaces is left out: the estimators are compared without ``interreflection``. Lengths are mm in the
+camera's frame (sensor at z = 0, +z to the scene), irradiance is W/m^2.
 
-Direct light: each projector pixel is cut into k x k rays. A ray of flux phi that meets a matt surface of reflectance rho
-at P brings a sensor point X
+*Over one matt surface:* each projector pixel is cut into k x k rays. A ray of flux phi that meets a surface of
+reflectance rho at P brings a sensor point X
 
     E = rho / pi  phi  cos_P T  |dw / dA|,      dw / dA = cos_X / r^2 in free space
 
-where a pane of thickness t and index n lies between, with a and b the angles outside and inside of it and D the distance
-along its normal, rho_lateral(a) = (D - t) tan a + t tan b is solved for a, and dA = rho_lateral rho_lateral' / sin a dw
-on planes parallel to the pane. Glints: the ray that lands at X is found by Newton's method on the projector's plane, and
-E = phi |dp / dX| R, the derivative by central differences. Fresnel's factors are those of unpolarised light at each
-face. The error is the difference of two quadratures, k and k + 1 rays a side.
+Through a pane of thickness t and index n, with a and b the angles outside and inside, D the distance along its normal
+and m pairs of reflections inside, light moves sideways by s(a) = (D - t) tan a + (2 m + 1) t tan b. This is solved for
+a, and dA = s s' / sin a dw on planes parallel to the pane. What a mirror shows is summed over the mirror's surface.
+
+*Over mirrors alone:* the ray that lands at X is found by Newton's method on the projector's plane, and E = phi |dp /
+dX| R, the derivative by central differences.
+
+Fresnel's factors are those of unpolarised light at each face. The error is the difference of two quadratures, of k and
+k + 1 rays a side.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +36,10 @@ Print = Callable[[Array, Array], Array]
 """Of coordinates (u, v) of -1 to 1 over a rectangle."""
 NEAR = 1e-9
 """Distance [mm] below which a ray is still at the surface that it left: float64 leaves 1e-13 of a metre."""
+MOST_MIRRORS, MOST_ORDER = 4, 3
+"""Turns in mirrors one after the other, and pairs of reflections inside of a pane: at 60 degrees R^8 is 4e-9."""
+SHOWN = 100
+"""Parts a side of a mirror, for what it shows."""
 STEP = 1e-7
 """Step of tan-angles for derivatives of landings: 1e-9 by rounding, 1e-5 by curvature of a ball of 0.02 mm at 400."""
 
@@ -45,6 +54,10 @@ def unit(a: Array) -> Array:
 
 def vector(*numbers: float) -> Array:
     return np.array(numbers, dtype=np.float64)
+
+
+def reflect(d: Array, n: Array) -> Array:
+    return d - 2 * dot(d, n)[..., None] * n
 
 
 def fresnel(cosine: Array, ratio: float) -> tuple[Array, Array]:
@@ -95,6 +108,14 @@ class Rectangle:
         del o, width
         return np.zeros(len(d), dtype=bool)
 
+    def parts(self, x: Array, k: int) -> tuple[Array, Array, Array]:
+        """Middles, normals and areas of k x k parts of what ``x`` sees of it."""
+        del x
+        even = (2 * np.arange(k) + 1) / k - 1
+        u, v = (part.ravel()[:, None] for part in np.meshgrid(even, even))
+        p = self.centre + u * self.half_u + v * self.half_v
+        return p, self.normal(p), np.full(k * k, np.linalg.norm(np.cross(self.half_u, self.half_v)) * 4 / k**2)
+
     def guess(self, a: Array, b: Array) -> Array:
         """Where light from ``a`` to ``b`` is reflected, or nearly."""
         n = unit(np.cross(self.half_u, self.half_v))
@@ -128,6 +149,14 @@ class Sphere:
         along = dot(away, d)
         beside = away - along[..., None] * d
         return np.sqrt(dot(beside, beside)) < self.radius + width * along
+
+    def parts(self, x: Array, k: int) -> tuple[Array, Array, Array]:
+        axis = unit(x - self.centre)
+        side = unit(np.cross(axis, vector(0.6, 0.8, 0.1)))
+        height, angle = np.meshgrid((np.arange(k) + 0.5) / k, 2 * np.pi * (np.arange(k) + 0.5) / k)
+        h, w = height.ravel()[:, None], angle.ravel()[:, None]
+        n = h * axis + np.sqrt(1 - h**2) * (np.cos(w) * side + np.sin(w) * np.cross(axis, side))
+        return self.centre + self.radius * n, n, np.full(k * k, 2 * np.pi * self.radius**2 / k**2)
 
     def guess(self, a: Array, b: Array) -> Array:
         n = unit(unit(a - self.centre) + unit(b - self.centre))
@@ -180,6 +209,15 @@ class Cylinder:
         reach, length = self.radius + width * t, float(np.linalg.norm(self.p1 - self.p0))
         return (np.sqrt(dot(beside, beside)) < reach) & (height > -reach) & (height < length + reach)
 
+    def parts(self, x: Array, k: int) -> tuple[Array, Array, Array]:
+        axis, (_, off) = unit(self.p1 - self.p0), self._across(x - self.p0)
+        along, angle = np.meshgrid((np.arange(k) + 0.5) / k, np.pi * ((np.arange(k) + 0.5) / k - 0.5))
+        w = angle.ravel()[:, None]
+        n = np.cos(w) * unit(off) + np.sin(w) * np.cross(axis, unit(off))
+        length = float(np.linalg.norm(self.p1 - self.p0))
+        p = self.p0 + along.ravel()[:, None] * length * axis + self.radius * n
+        return p, n, np.full(k * k, np.pi * self.radius * length / k**2)
+
     def guess(self, a: Array, b: Array) -> Array:
         axis = unit(self.p1 - self.p0)
         (from_a, off_a), (from_b, off_b) = self._across(a - self.p0), self._across(b - self.p0)
@@ -197,7 +235,7 @@ Shape = Rectangle | Sphere | Cylinder
 
 @dataclass(frozen=True)
 class Slab:
-    """A pane of glass wider than all light, about a ``centre``; all panes of a scene have one ``normal``."""
+    """A pane of glass, wider than all light, about a ``centre``."""
 
     centre: Array
     normal: Array
@@ -277,7 +315,7 @@ class Camera:
         return (np.interp(high, edges, total) - np.interp(low, edges, total)) / (high - low)
 
     def transmission(self, x: Array, t: Array, depth: Array, width: float = 1.0) -> Array:
-        """Of the mask, mean over ``width`` pixels about the point ``x``, for light that seems to come from ``depth``."""
+        """Of the mask, mean over ``width`` pixels about the point ``x``, for light that seems to be from ``depth``."""
         if self.code is None:
             return np.ones(len(t))
         total = np.ones(len(t))
@@ -293,14 +331,7 @@ class Scene:
     projector: Projector
     camera: Camera
     shapes: Sequence[Shape]
-    slabs: Sequence[Slab] = field(default_factory=tuple)
-
-    def _panes(self, o: Array, d: Array) -> list[Slab]:
-        """Panes before a bundle of rays, nearest first."""
-        if not self.slabs:
-            return []
-        along = [float(dot(slab.centre - o, slab.normal) / dot(d, slab.normal)) for slab in self.slabs]
-        return [self.slabs[i] for i in np.argsort(along) if along[i] > 0]
+    pane: Slab | None = None
 
     def nearest(self, o: Array, d: Array) -> tuple[Array, npt.NDArray[np.int64]]:
         """Distance to the first shape, inf where there is none, and its number."""
@@ -333,29 +364,38 @@ class Lit:
     pixel: npt.NDArray[np.int64]
 
 
-def lit(scene: Scene, pixel: npt.NDArray[np.int64], k: int) -> tuple[Lit, npt.NDArray[np.bool_]]:
-    """What k x k rays of each projector ``pixel`` light; and whether the rays of one meet several shapes."""
+def lit(scene: Scene, pixel: npt.NDArray[np.int64], k: int, order: int = 0) -> tuple[Lit, npt.NDArray[np.bool_]]:
+    """What k x k rays of each projector ``pixel`` light; and whether the rays of one meet several shapes.
+
+    ``order`` pairs of reflections happen inside of the pane; without one there is light of order 0 alone.
+    """
     projector = scene.projector
     d, of = projector.rays(pixel, k)
     o = np.broadcast_to(projector.place, d.shape).copy()
-    part, done = np.ones(len(d)), np.zeros(len(d), dtype=bool)
-    p, number = np.zeros_like(d), np.full(len(d), -1)
-    for slab in [*scene._panes(projector.place, d.mean(axis=0)), None]:
-        t, met = scene.nearest(o, d)
-        if slab is None:
-            to_face = np.full(len(d), np.inf)
-        else:
-            n = slab.normal * np.sign(dot(d.mean(axis=0), slab.normal))
-            to_face = (dot(slab.centre - o, n) - slab.thickness / 2) / dot(d, n)
-        hits = ~done & (t < to_face)
-        p[hits], number[hits] = o[hits] + t[hits, None] * d[hits], met[hits]
-        done |= hits
-        if slab is not None:
-            cosine = dot(d, n)
-            reflected, inside = fresnel(cosine, slab.index)
-            across = d - cosine[:, None] * n
-            o = o + to_face[:, None] * d + slab.thickness * (n + across / slab.index / inside[:, None])
-            part = part * np.where(done, 1, (1 - reflected) ** 2)
+    t, number = scene.nearest(o, d)
+    part = np.ones(len(d))
+    if scene.pane:
+        n = scene.pane.normal * np.sign(dot(d.mean(axis=0), scene.pane.normal))
+        cosine = dot(d, n)
+        to_face = (dot(scene.pane.centre - o, n) - scene.pane.thickness / 2) / cosine
+        before = t < to_face
+        reflected, inside = fresnel(cosine, scene.pane.index)
+        sideways = (d - cosine[:, None] * n) * ((2 * order + 1) / (scene.pane.index * inside))[:, None]
+        beyond = o + to_face[:, None] * d + scene.pane.thickness * (n + sideways)
+        o = np.where(before[:, None], o, beyond)
+        part = np.where(before, order == 0, (1 - reflected) ** 2 * reflected ** (2 * order))
+        t, number = scene.nearest(o, d)
+    first = number.reshape(len(pixel), -1)
+    mixed = (first != first[:, :1]).any(axis=1)
+    for _ in range(MOST_MIRRORS):
+        for i, shape in enumerate(scene.shapes):
+            here = np.flatnonzero(number == i)
+            if shape.mirror and len(here):
+                o[here] += t[here, None] * d[here]
+                d[here] = reflect(d[here], shape.normal(o[here]))
+                part[here] *= shape.mirror
+                t[here], number[here] = scene.nearest(o[here], d[here])
+    p = o + np.where(np.isfinite(t), t, 0)[:, None] * d
     phi = np.pi * projector.scale * projector.area / k**2
     normal, intensity = np.zeros_like(p), np.zeros(len(p))
     for i, shape in enumerate(scene.shapes):
@@ -364,8 +404,6 @@ def lit(scene: Scene, pixel: npt.NDArray[np.int64], k: int) -> tuple[Lit, npt.ND
             n = shape.normal(p[here])
             normal[here] = n * -np.sign(dot(n, d[here]))[:, None]
             intensity[here] = phi / np.pi * part[here] * shape.reflectance(p[here])
-    several = number.reshape(len(pixel), -1)
-    mixed = (several != several[:, :1]).any(axis=1)
     seen = intensity > 0
     return Lit(p[seen], normal[seen], intensity[seen], of[seen]), mixed
 
@@ -379,80 +417,115 @@ def lamp(rectangle: Rectangle, radiance: float, k: int) -> Lit:
     return Lit(p, rectangle.normal(p), radiance * area * np.outer(weight, weight).ravel(), np.zeros(k * k, np.int64))
 
 
-def received(scene: Scene, lights: Lit, x: Array, width: float = 1.0) -> Array:
-    """Irradiance at a sensor point ``x`` by each of lit places, mean over ``width`` pixels of a mask."""
+def received(scene: Scene, lights: Lit, x: Array, width: float = 1.0, order: int = 0) -> Array:
+    """Irradiance at a sensor point ``x`` by each of lit places, mean over ``width`` pixels of a mask.
+
+    ``order`` pairs of reflections happen inside of the pane.
+    """
     camera, p = scene.camera, lights.p
-    if not scene.slabs:
+    if scene.pane is None:
         away = x - p
         r = np.sqrt(dot(away, away))
         direction, apparent, part, dw = away / r[:, None], p, np.ones(len(p)), -away[:, 2] / r**3
-        hidden = None
+        legs = [(p, np.broadcast_to(x, p.shape))]
     else:
-        direction, apparent, part, dw, hidden = _through(scene, p, x)
+        direction, apparent, part, dw, legs = through(scene.pane, p, x, order)
     t = (apparent - x)[:, :2] / (apparent - x)[:, 2:]
     light = lights.intensity * part * np.maximum(dot(lights.n, direction), 0) * np.maximum(dw, 0)
     light = light * camera.within(t) * camera.transmission(x, t, apparent[:, 2], width)
-    seen = np.flatnonzero(light > 0)
-    free = scene.free(p[seen], x) if hidden is None else hidden[seen]
-    light[seen[~free]] = 0
+    for a, b in legs:
+        seen = np.flatnonzero(light > 0)
+        light[seen[~scene.free(a[seen], b[seen])]] = 0
     return light
 
 
-def _through(scene: Scene, p: Array, x: Array) -> tuple[Array, ...]:
-    """Direction that light leaves ``p`` in to arrive at ``x``, apparent place, part, dw / dA, and whether it is free."""
-    n = scene.slabs[0].normal * np.sign(-scene.slabs[0].normal[2])  # towards the sensor
-    between = [(dot(slab.centre - p, n) > 0) & (dot(x - slab.centre, n) > 0) for slab in scene.slabs]
+def through(
+    pane: Slab, p: Array, x: Array, order: int = 0
+) -> tuple[Array, Array, Array, Array, list[tuple[Array, Array]]]:
+    """Direction that light leaves ``p`` in to arrive at ``x``, apparent place, part of it, dw / dA, and legs in air."""
+    n = pane.normal * np.sign(-pane.normal[2])  # towards the sensor
+    between = (dot(pane.centre - p, n) > 0) & (dot(x - pane.centre, n) > 0)
     height = dot(x - p, n)
     lateral = (x - p) - height[:, None] * n
     length = np.sqrt(dot(lateral, lateral))
     side = lateral / np.maximum(length, 1e-300)[:, None]
-    air = height - sum(slab.thickness * here for slab, here in zip(scene.slabs, between, strict=True))
+    air, glass = height - pane.thickness * between, (2 * order + 1) * pane.thickness * between
     low, high = np.zeros(len(p)), np.ones(len(p))
-
-    def reach(sine: Array) -> Array:
-        total = air * sine / np.sqrt(1 - sine**2)
-        for slab, here in zip(scene.slabs, between, strict=True):
-            total = total + here * slab.thickness * sine / np.sqrt(slab.index**2 - sine**2)
-        return total
-
     with np.errstate(divide="ignore"):
         for _ in range(60):  # of sin a, by halving: sure, and to the last digit
             middle = (low + high) / 2
-            short = reach(middle) < length
-            low, high = np.where(short, middle, low), np.where(short, high, middle)
+            reach = air * middle / np.sqrt(1 - middle**2) + glass * middle / np.sqrt(pane.index**2 - middle**2)
+            low, high = np.where(reach < length, middle, low), np.where(reach < length, high, middle)
     sine = (low + high) / 2
-    cosine = np.sqrt(1 - sine**2)
-    grows = air / cosine**2  # d reach / d a, and reach / sin a, which has a limit at 0
-    per_sine = air / cosine
-    part = np.ones(len(p))
-    for slab, here in zip(scene.slabs, between, strict=True):
-        inside = np.sqrt(slab.index**2 - sine**2)
-        grows = grows + here * slab.thickness * cosine * slab.index**2 / inside**3
-        per_sine = per_sine + here * slab.thickness / inside
-        part = part * np.where(here, (1 - fresnel(cosine, slab.index)[0]) ** 2, 1)
+    cosine, inside = np.sqrt(1 - sine**2), np.sqrt(pane.index**2 - sine**2)
+    grows = air / cosine**2 + glass * cosine * pane.index**2 / inside**3
+    reflected = fresnel(cosine, pane.index)[0]
+    part = np.where(between, (1 - reflected) ** 2 * reflected ** (2 * order), float(order == 0))
     direction = cosine[:, None] * n + sine[:, None] * side
-    # On planes parallel to the pane dA = reach reach' / sin a dw; across the light, times cos a; on the sensor, / cos_x.
-    across = per_sine * grows * cosine
+    # On planes parallel to the pane dA = s s' / sin a dw, s / sin a with a limit at 0; across the light, times cos a.
+    across = (air / cosine + glass / inside) * grows * cosine
     apparent = x - direction * np.sqrt(across)[:, None]
-    free, done, at = np.ones(len(p), dtype=bool), np.zeros(len(p), dtype=bool), np.broadcast_to(x, p.shape).copy()
-    for slab in sorted(scene.slabs, key=lambda one: float(dot(x - one.centre, n))):
-        here = between[list(scene.slabs).index(slab)]
-        to_face = (dot(at - slab.centre, n) - slab.thickness / 2) / cosine
-        face = at - to_face[:, None] * direction
-        free &= done | scene.free(at, np.where(here[:, None], face, p))
-        inside = np.sqrt(slab.index**2 - sine**2)
-        beyond = face - slab.thickness * (n + (sine / inside)[:, None] * side)
-        done |= ~here
-        at = np.where(done[:, None], at, beyond)
-    free &= done | scene.free(p, at)
-    return direction, apparent, part, -direction[:, 2] / across, free
+    to_face = (dot(x - pane.centre, n) - pane.thickness / 2) / cosine
+    face = x - to_face[:, None] * direction
+    beyond = face - pane.thickness * n - (glass * sine / inside)[:, None] * side
+    legs = [
+        (np.where(between[:, None], beyond, x), p),
+        (np.where(between[:, None], face, x), np.broadcast_to(x, p.shape)),
+    ]
+    return direction, apparent, part, -direction[:, 2] / across, legs
+
+
+def mirrored(scene: Scene, x: Array, k: int) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Irradiance at a sensor point ``x`` of lit matt surfaces that mirrors show, by k x k parts of each, and pixels."""
+    projector, lights, pixels = scene.projector, [], []
+    for shape in scene.shapes:
+        if not shape.mirror:
+            continue
+        p, n, area = shape.parts(x, k)
+        away = p - x
+        r = np.sqrt(dot(away, away))
+        d = away / r[:, None]
+        facing = np.abs(dot(n, d)) if isinstance(shape, Rectangle) else np.maximum(-dot(n, d), 0)
+        light = area * facing * d[:, 2] / r**2 * shape.mirror
+        t = d[:, :2] / d[:, 2:]
+        light = light * scene.camera.within(t) * scene.camera.transmission(x, t, np.full(len(t), np.inf))
+        light[~scene.free(np.broadcast_to(x, p.shape), p)] = 0
+        o, d = p, reflect(d, n)
+        far, number = scene.nearest(o, d)
+        for _ in range(MOST_MIRRORS - 1):
+            for i, other in enumerate(scene.shapes):
+                here = np.flatnonzero(number == i)
+                if other.mirror and len(here):
+                    o[here] += far[here, None] * d[here]
+                    d[here] = reflect(d[here], other.normal(o[here]))
+                    light[here] *= other.mirror
+                    far[here], number[here] = scene.nearest(o[here], d[here])
+        q = o + np.where(np.isfinite(far), far, 0)[:, None] * d
+        radiance = np.zeros(len(q))
+        from_projector = q - projector.place
+        distance = np.sqrt(dot(from_projector, from_projector))
+        ray = from_projector / np.maximum(distance, 1e-300)[:, None]
+        for i, other in enumerate(scene.shapes):
+            here = np.flatnonzero((number == i) & (ray[:, 2] > 0))
+            if len(here) and not other.mirror:
+                normal = other.normal(q[here])
+                sides = dot(normal, ray[here]) * dot(normal, d[here])
+                cosine = np.where(sides > 0, np.abs(dot(normal, ray[here])), 0)
+                intensity = np.pi * projector.scale / ray[here, 2] ** 3
+                radiance[here] = other.reflectance(q[here]) / np.pi * intensity * cosine / distance[here] ** 2
+        with np.errstate(all="ignore"):
+            pixel = np.where(ray[:, 2] > 0, projector.pixel(ray[:, :2] / ray[:, 2:]), -1)
+        light = light * radiance * (pixel >= 0)
+        seen = np.flatnonzero(light > 0)
+        light[seen[~scene.free(np.broadcast_to(projector.place, q.shape)[seen], q[seen])]] = 0
+        lights.append(light)
+        pixels.append(pixel)
+    if not lights:
+        return np.zeros(0), np.zeros(0, np.int64)
+    return np.concatenate(lights), np.concatenate(pixels)
 
 
 # ---- light over mirrors
-
-
-def _reflect(d: Array, n: Array) -> Array:
-    return d - 2 * dot(d, n)[..., None] * n
 
 
 def glint(scene: Scene, x: Array) -> list[tuple[Array, Array, Array]]:
@@ -464,13 +537,12 @@ def glint(scene: Scene, x: Array) -> list[tuple[Array, Array, Array]]:
     found = []
     for shape in scene.shapes:
         if shape.mirror:
-            assert not scene.slabs, "mirrors beside panes are not known"
+            assert scene.pane is None, "mirrors beside panes are not known"
             found.append(_by_way(scene, x, shape.guess(scene.projector.place, x), _Mirror(scene, shape)))
-    for slab in scene.slabs:
-        assert len(scene.slabs) == 1, "glints of several panes are not known"
-        n = slab.normal * np.sign(-slab.normal[2])
-        for order in range(4):  # reflections: the front, then one, three, five inside
-            depth = -slab.thickness / 2 if order == 0 else slab.thickness * (order - 1 + 1 / slab.index - 0.5)
+    if scene.pane:
+        slab, n = scene.pane, scene.pane.normal * np.sign(-scene.pane.normal[2])
+        for order in range(MOST_ORDER + 1):  # reflections: the front, then one, three, five inside
+            depth = -slab.thickness / 2 if order == 0 else slab.thickness * ((2 * order - 1) / slab.index - 0.5)
             plane = slab.centre - n * depth
             image = scene.projector.place - 2 * dot(scene.projector.place - plane, n) * n
             start = image + (x - image) * (dot(plane - image, n) / dot(x - image, n))[:, None]
@@ -487,7 +559,7 @@ class _Mirror:
         """Direction at the sensor's plane, place there, part of the light left, and places on the way."""
         t = np.minimum.reduce([np.where(t > NEAR, t, np.inf) for t in self.shape.crossings(o, d)])
         p = o + t[:, None] * d
-        out = _reflect(d, self.shape.normal(p))
+        out = reflect(d, self.shape.normal(p))
         return out, p - (p[:, 2] / out[:, 2])[:, None] * out, np.full(len(d), self.shape.mirror), [p, p]
 
 
@@ -503,7 +575,7 @@ class _Faces:
         cosine = -dot(d, n)
         t = (dot(o - slab.centre, n) - slab.thickness / 2) / cosine
         first = o + t[:, None] * d
-        out, (reflected, inside) = _reflect(d, n), fresnel(cosine, slab.index)
+        out, (reflected, inside) = reflect(d, n), fresnel(cosine, slab.index)
         last, part = first, reflected
         if self.order:
             across = d + cosine[:, None] * n
@@ -601,10 +673,16 @@ def _quadrature(
     for pixels, count in ((every[~crowded], k), (every[crowded], fine)):
         for some in np.array_split(pixels, max(1, len(pixels) * count**2 // 2**19)):
             if len(some):
-                lights, _ = lit(scene, some, count)
-                for j, (row, column) in enumerate(points):
-                    light = received(scene, lights, scene.camera.point(row, column))
-                    total[:, j] += np.bincount(labels[lights.pixel], light, minlength=classes)
+                for order in range(MOST_ORDER + 1 if scene.pane else 1):
+                    lights, _ = lit(scene, some, count, order)
+                    for j, (row, column) in enumerate(points):
+                        for further in range(MOST_ORDER + 1 - order if scene.pane else 1):
+                            light = received(scene, lights, scene.camera.point(row, column), order=further)
+                            total[:, j] += np.bincount(labels[lights.pixel], light, minlength=classes)
+    for j, (row, column) in enumerate(points):
+        light, pixel = mirrored(scene, scene.camera.point(row, column), SHOWN + 7 * parts)
+        shown = light > 0
+        total[:, j] += np.bincount(labels[pixel[shown]], light[shown], minlength=classes)
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
     x = np.array([[scene.camera.point(*point, (a, b)) for a in offsets for b in offsets] for point in points])
     flat = x.reshape(-1, 3)
@@ -612,7 +690,8 @@ def _quadrature(
         masked = light / parts**2
         if scene.camera.code is not None:
             depth = np.full(len(t), np.inf)
-            masked = masked * [float(scene.camera.transmission(u, t[i : i + 1], depth[:1], 1 / parts)[0]) for i, u in enumerate(flat)]  # fmt: skip
+            coded = [scene.camera.transmission(u, t[[i]], depth[[i]], 1 / parts)[0] for i, u in enumerate(flat)]
+            masked = masked * np.array(coded)
         pixel = projector.pixel(p)
         seen = np.flatnonzero((pixel >= 0) & (masked > 0))
         np.add.at(total, (labels[pixel[seen]], seen // parts**2), masked[seen])
