@@ -13,6 +13,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.outline import Tag
+from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 
@@ -82,9 +83,11 @@ def load_scene(
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
+    moved = move_to_camera(checked.outline, checked.state)
     with looking_beside(checked.outline):
         scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
+    check_meshes(moved, scene)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')

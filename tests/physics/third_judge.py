@@ -38,6 +38,8 @@ NEAR = 1e-9
 """Distance [mm] below which a ray is still at the surface that it left: float64 leaves 1e-13 of a metre."""
 MOST_MIRRORS, MOST_ORDER = 4, 3
 """Turns in mirrors one after the other, and pairs of reflections inside of a pane: at 60 degrees R^8 is 4e-9."""
+LEAST = 1e-5
+"""Part of the light below which more reflections inside of a pane are left out."""
 SHOWN = 100
 """Parts a side of a mirror, for what it shows."""
 STEP = 1e-7
@@ -450,14 +452,15 @@ def through(
     length = np.sqrt(dot(lateral, lateral))
     side = lateral / np.maximum(length, 1e-300)[:, None]
     air, glass = height - pane.thickness * between, (2 * order + 1) * pane.thickness * between
-    low, high = np.zeros(len(p)), np.ones(len(p))
-    with np.errstate(divide="ignore"):
-        for _ in range(60):  # of sin a, by halving: sure, and to the last digit
-            middle = (low + high) / 2
-            reach = air * middle / np.sqrt(1 - middle**2) + glass * middle / np.sqrt(pane.index**2 - middle**2)
-            low, high = np.where(reach < length, middle, low), np.where(reach < length, high, middle)
-    sine = (low + high) / 2
-    cosine, inside = np.sqrt(1 - sine**2), np.sqrt(pane.index**2 - sine**2)
+    # g(tan a) = air tan a + glass tan b rises and is concave: Newton's steps from below stay below the root.
+    tangent = length / (air + glass / pane.index)
+    for _ in range(8):
+        root = np.sqrt(pane.index**2 + (pane.index**2 - 1) * tangent**2)
+        slope = air + glass * pane.index**2 / root**3
+        tangent = tangent + (length - air * tangent - glass * tangent / root) / slope
+    cosine = 1 / np.sqrt(1 + tangent**2)
+    sine = tangent * cosine
+    inside = np.sqrt(pane.index**2 - sine**2)
     grows = air / cosine**2 + glass * cosine * pane.index**2 / inside**3
     reflected = fresnel(cosine, pane.index)[0]
     part = np.where(between, (1 - reflected) ** 2 * reflected ** (2 * order), float(order == 0))
@@ -673,12 +676,17 @@ def _quadrature(
     for pixels, count in ((every[~crowded], k), (every[crowded], fine)):
         for some in np.array_split(pixels, max(1, len(pixels) * count**2 // 2**19)):
             if len(some):
+                found: list[float] = []
                 for order in range(MOST_ORDER + 1 if scene.pane else 1):
-                    lights, _ = lit(scene, some, count, order)
-                    for j, (row, column) in enumerate(points):
-                        for further in range(MOST_ORDER + 1 - order if scene.pane else 1):
-                            light = received(scene, lights, scene.camera.point(row, column), order=further)
+                    found.append(0.0)
+                    for before in range(order + 1):
+                        lights, _ = lit(scene, some, count, before)
+                        for j, (row, column) in enumerate(points):
+                            light = received(scene, lights, scene.camera.point(row, column), order=order - before)
                             total[:, j] += np.bincount(labels[lights.pixel], light, minlength=classes)
+                            found[-1] += float(light.sum())
+                    if order and found[-1] ** 2 < LEAST * found[0] * found[-2]:
+                        break
     for j, (row, column) in enumerate(points):
         light, pixel = mirrored(scene, scene.camera.point(row, column), SHOWN + 7 * parts)
         shown = light > 0
