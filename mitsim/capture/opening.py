@@ -168,10 +168,18 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
     from mitsim.transport import plugins
+    from mitsim.transport.contact import contacts
 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     plugins.register()
-    return load_scene(path, defines, **options)
+    loaded = load_scene(path, defines, **options)
+    factored, reference = contacts(loaded.scene, loaded.shapes)
+    if factored is not None and options.get("needs_projector", True):
+        raise factored
+    unfit = replace(
+        loaded.unfit, factored=loaded.unfit.factored or factored, reference=loaded.unfit.reference or reference
+    )
+    return replace(loaded, unfit=unfit)
 
 
 def _text(value: object) -> str:
