@@ -56,9 +56,9 @@ def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tupl
     cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
     away, reach = np.eye(4), _ALIGNED
     if cameras:
-        away[:3, 3] = -_placed(cameras[0].props)[:3, 3]
+        away[:3, 3] = -placed(cameras[0].props)[:3, 3]
         reach = float(cameras[0].props.get("scene_distance", reach))
-    places = {index: away @ _placed(nodes[index].props) for index in _standing(nodes)}
+    places = {index: away @ placed(nodes[index].props) for index in standing(nodes)}
     for index, place in places.items():
         props, distance = nodes[index].props, float(np.linalg.norm(place[:3, 3]))
         if props.plugin_name() == "projector" and distance * _ROUNDING > _COARSEST * reach:
@@ -71,9 +71,9 @@ def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tupl
         if away[:3, 3].any():
             _place(props, place)
     moved = []
-    for index in filter(lambda index: _is(nodes[index], "shape"), _standing(nodes, merged=False)):
+    for index in filter(lambda index: _is(nodes[index], "shape"), standing(nodes, merged=False)):
         name = "filename" if "filename" in nodes[index].props else "to_world"
-        parts = _standing(nodes, index) if nodes[index].props.plugin_name() == "merge" else (index,)
+        parts = standing(nodes, index) if nodes[index].props.plugin_name() == "merge" else (index,)
         single = [part for part in parts if nodes[part].props.plugin_name() in ("obj", "ply", "instance")]
         distance = max((float(np.linalg.norm(places[part][:3, 3])) for part in single), default=0.0)
         moved.append((outline.tag(mi.parser.SceneNode(nodes[index]), name), distance))
@@ -109,7 +109,7 @@ def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
             raise tag.refusal("mesh", f"vertices that are moved by {distance:.0f} mm to stand before the camera", rule)
 
 
-def _standing(nodes: list[mi.parser.SceneNode], at: int = 0, merged: bool = True) -> Iterator[int]:
+def standing(nodes: Sequence[mi.parser.SceneNode], at: int = 0, merged: bool = True) -> Iterator[int]:
     """Numbers of the nodes below ``at`` that stand in the world: of what is ``merged`` into one shape, each part."""
     props = nodes[at].props
     for name in props.keys():  # noqa: SIM118 - Properties is no dict
@@ -118,7 +118,7 @@ def _standing(nodes: list[mi.parser.SceneNode], at: int = 0, merged: bool = True
         index = props[name].index()
         node = nodes[index]
         if node.props.plugin_name() == "merge" and merged:
-            yield from _standing(nodes, index)
+            yield from standing(nodes, index)
         elif _is(node, "shape") or _is(node, "sensor") or node.props.plugin_name() in _PLACED:
             yield index
 
@@ -128,11 +128,11 @@ def _is(node: mi.parser.SceneNode, kind: str) -> bool:
     return plugin in PLUGINS[kind].split() and plugin != "shapegroup"
 
 
-def _placed(props: mi.Properties) -> FloatArray:
-    """(4, 4) to the world, from a centre where it has one."""
+def placed(props: mi.Properties, centred: bool = True) -> FloatArray:
+    """(4, 4) to the world, from its centre where it has one and is ``centred``."""
     name = _CENTRES.get(props.plugin_name(), "position")
     matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
-    return matrix @ _shift(props[name]) if name in props else matrix
+    return matrix @ _shift(props[name]) if centred and name in props else matrix
 
 
 def _place(props: mi.Properties, matrix: FloatArray) -> None:

@@ -55,7 +55,7 @@ def contacts(scene: mi.Scene, tags: Sequence[Tag]) -> tuple[MitsimError | None, 
 
 
 def _gaps(shape: mi.Shape, scene: mi.Scene, others: mi.Scene) -> tuple[FloatArray, FloatArray]:
-    """Distances [mm] of points of a ``shape`` to the next parallel surface of its ``scene``, inf where none is near, and
+    """Distances [mm] of points of a ``shape`` to the next parallel surface of its ``scene``, inf where none is, and
     the points' coordinates; ``others`` is the scene without it, where surfaces that coincide with it are found."""
     rng = generator(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
     sample = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))

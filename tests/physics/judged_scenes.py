@@ -26,8 +26,8 @@ N, SCALE = 64, 151250.0
 PROJECTOR = Projector(vector(60, 0, 0), N, SCALE, -0.3, 0.0, -0.15, 0.15)
 OPEN = Camera(128, 0.04688, feature=0.12)
 CODED = replace(OPEN, code=np.asarray(max_len_seq(8)[0], dtype=np.float64))
-POINTS = [(i, j) for i in range(4, 128, 24) for j in range(7, 128, 24)]
-"""36 sensor pixels, spread evenly."""
+POINTS = [(i, j) for i in range(6, 128, 38) for j in range(8, 128, 37)]
+"""16 sensor pixels, spread evenly."""
 CAMERA_FILE = """name = "128 pixels of 46.88 um"
 pixel_pitch_um = 11.72
 binning = 4
@@ -247,7 +247,7 @@ def drawn(seed: int) -> Judged:
             shapes.append(Sphere(place, radius, 0.5, mirror=float(rng.uniform(0.5, 1))))
     pane = Slab(vector(0, 0, 120), tilted(*rng.uniform(-35, 35, 2)), rng.uniform(1, 8)) if paned else None
     camera = CODED if rng.random() < 0.5 else OPEN
-    return Judged(Scene(PROJECTOR, camera, shapes, pane), k=5, fine=24)
+    return Judged(Scene(PROJECTOR, camera, shapes, pane), k=5, fine=20)
 
 
 def _by_hand() -> dict[str, Judged]:
@@ -260,9 +260,9 @@ def _by_hand() -> dict[str, Judged]:
     return {
         "wires of 0.15 mm": of(*wires(1, 25, 0.15, 90, 420), fine=40),
         "wires, coded": of(*wires(2, 25, 0.15, 90, 420), camera=CODED, fine=40),
-        "hairs of 0.02 mm": of(*wires(3, 25, 0.02, 200, 420), k=1, fine=160),
+        "hairs of 0.02 mm": of(*wires(3, 25, 0.02, 200, 420), k=1, fine=100),
         "wires before a wall": of(sheet(440, 0.1), *wires(4, 12, 0.1, 150, 420), k=8, fine=60),
-        "balls of 0.05 mm at 1 m": of(*balls(5, 30, 0.05, 950, 1050), k=1, fine=160),
+        "balls of 0.05 mm at 1 m": of(*balls(5, 30, 0.05, 950, 1050), k=1, fine=100),
         "mirror balls of 0.4 mm": of(sheet(460, 0.03, 110), *balls(6, 30, 0.4, 360, 400, mirror=0.85)),
         "print 0.03 mm behind glass": of(sheet(400.03, print_, 85), pane=glass),
         "print 0.005 mm behind glass": of(sheet(400.005, print_, 85), pane=glass),

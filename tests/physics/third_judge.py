@@ -25,7 +25,7 @@ k + 1 rays a side.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -299,7 +299,7 @@ class Camera:
     code: Array | None = None
     feature: float = 0.06
 
-    def point(self, row: int, column: int, offset: tuple[float, float] = (0, 0)) -> Array:
+    def point(self, row: float, column: float, offset: tuple[float, float] = (0, 0)) -> Array:
         """The middle of a pixel, or ``offset`` from it in pixels down the rows and along the columns."""
         half = (self.pixels - 1) / 2
         return vector((half - column - offset[1]) * self.pitch, (half - row - offset[0]) * self.pitch, 0)
@@ -662,31 +662,41 @@ def answer(
     return Answer(both[1], error)
 
 
+def direct(scene: Scene, point: tuple[float, float], k: int = 4, fine: int = 16) -> float:
+    """All light over one matt surface alone at a place (row, column) of the sensor, without its mask's shadow."""
+    x = scene.camera.point(*point)
+    return sum(float(received(scene, lit(scene, some, count)[0], x).sum()) for some, count in _pixels(scene, k, fine))
+
+
+def _pixels(scene: Scene, k: int, fine: int) -> Iterator[tuple[npt.NDArray[np.int64], int]]:
+    """Portions of the projector's pixels, and rays a side of each: ``fine`` where a pixel has several shapes in it."""
+    every = np.arange(scene.projector.n**2)
+    middle, _ = scene.projector.rays(every, 1)
+    crowded = lit(scene, every, max(k, 4))[1]
+    for shape in scene.shapes:
+        crowded |= shape.near(scene.projector.place, middle, float(np.sqrt(scene.projector.area)))
+    for pixels, count in ((every[~crowded], k), (every[crowded], fine)):
+        portions = np.array_split(pixels, max(1, len(pixels) * count**2 // 2**19))
+        yield from ((some, count) for some in portions if len(some))
+
+
 def _quadrature(
     scene: Scene, points: Sequence[tuple[int, int]], labels: npt.NDArray[np.int64], k: int, fine: int, parts: int
 ) -> Array:
     projector, classes = scene.projector, int(labels.max()) + 1
-    every = np.arange(projector.n**2)
-    middle, _ = projector.rays(every, 1)
-    width = float(np.sqrt(projector.area))
-    crowded = lit(scene, every, max(k, 4))[1]
-    for shape in scene.shapes:
-        crowded |= shape.near(projector.place, middle, width)
     total = np.zeros((classes, len(points)))
-    for pixels, count in ((every[~crowded], k), (every[crowded], fine)):
-        for some in np.array_split(pixels, max(1, len(pixels) * count**2 // 2**19)):
-            if len(some):
-                found: list[float] = []
-                for order in range(MOST_ORDER + 1 if scene.pane else 1):
-                    found.append(0.0)
-                    for before in range(order + 1):
-                        lights, _ = lit(scene, some, count, before)
-                        for j, (row, column) in enumerate(points):
-                            light = received(scene, lights, scene.camera.point(row, column), order=order - before)
-                            total[:, j] += np.bincount(labels[lights.pixel], light, minlength=classes)
-                            found[-1] += float(light.sum())
-                    if order and found[-1] ** 2 < LEAST * found[0] * found[-2]:
-                        break
+    for some, count in _pixels(scene, k, fine):
+        found: list[float] = []
+        for order in range(MOST_ORDER + 1 if scene.pane else 1):
+            found.append(0.0)
+            for before in range(order + 1):
+                lights, _ = lit(scene, some, count, before)
+                for j, (row, column) in enumerate(points):
+                    light = received(scene, lights, scene.camera.point(row, column), order=order - before)
+                    total[:, j] += np.bincount(labels[lights.pixel], light, minlength=classes)
+                    found[-1] += float(light.sum())
+            if order and found[-1] ** 2 < LEAST * found[0] * found[-2]:
+                break
     for j, (row, column) in enumerate(points):
         light, pixel = mirrored(scene, scene.camera.point(row, column), SHOWN + 7 * parts)
         shown = light > 0
