@@ -5,9 +5,9 @@
 Thirty scenes of rectangles, balls, wires, holes, a pane and mirrors (`tests/physics/judged_scenes.py`), twelve by hand
 and the rest drawn by a seeded generator. A row each: relative difference over all shots of dots:3 and 16 sensor pixels
 between the factored estimator and the judge (`tests/physics/third_judge.py`), that of their sums, what both state as
-their errors, whether the difference is within them, and why the run is flagged; and the reference's sum in uniform light
-over the judge's with its standard error, where the reference finds all light. FILE is written after each scene, and what
-it holds is not done again.
+their errors, whether the difference is within them, and why the run is flagged; and the reference's sum in uniform
+light over the judge's with its standard error, where the reference finds all light. FILE is written after each scene,
+and what it holds is not done again.
 """
 
 from __future__ import annotations
