@@ -87,7 +87,7 @@ def _thin(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[in
             rule = held.format(distance / _FINEST, "take a larger radius, or a flat strip")
             raise tag.refusal("radius", got, rule)
         if materials & set(_MIXED):
-            rule = held.format(distance / _SLENDER[kind], "of smooth plastic; take roughplastic")
+            rule = held.format(distance / _SLENDER[kind], "take roughplastic in place of the smooth one")
             raise tag.refusal("radius", got, rule)
         yield index
 
@@ -156,6 +156,7 @@ def _mesh(props: mi.Properties, kind: str) -> tuple[FloatArray, FloatArray, Floa
         points = _point(props, "center", (0, 0, 0)) + grown * normal
     points = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
     normal = normal.reshape(-1, 3) @ np.linalg.inv(matrix[:3, :3])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     if np.linalg.det(matrix[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
     return points, normal, np.stack([u.ravel(), v.ravel()], axis=1), triangles
@@ -171,7 +172,6 @@ def _beside(n: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _write(path: Path, points: FloatArray, normals: FloatArray, uv: FloatArray, triangles: FloatArray) -> None:
     """A binary PLY."""
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     header += [f"property float {name}" for name in names]
