@@ -26,20 +26,19 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the judge lives with the tests
 
 import mitsim as ms
-from tests.physics import judged_scenes, third_judge
+from tests.physics import judged_scenes
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
 
 
-def of_reference(judged: judged_scenes.Judged, bench: Bench, spp: int) -> dict[str, Any]:
-    """Sum of the reference over that of the judge less 1, and its standard error; empty where light is lost."""
+def of_reference(judged: judged_scenes.Judged, bench: Bench, right: float, spp: int) -> dict[str, Any]:
+    """Sum of the reference over the judge's, ``right``, less 1, and its standard error; empty where light is lost."""
     shapes = judged.scene.shapes
     if judged.scene.pane or any(shape.mirror for shape in shapes) or bench.loaded.unfit.reference is not None:
         return {}
     rows, columns = np.array(judged_scenes.POINTS).T
     frame = bench.render("reference", spp=spp)
-    right = third_judge.answer(judged.scene, judged_scenes.POINTS, None, judged.k, judged.fine).light.sum()
     error = float(np.sqrt(np.square(frame.error[rows, columns]).sum()) / right)
     return {"reference": float(frame.mean[rows, columns].sum() / right - 1), "reference_error": error}
 
@@ -54,7 +53,7 @@ def row(name: str, accuracy: float, spp: int) -> dict[str, Any]:
         except ms.MitsimError as error:
             return {"scene": name, "refused": str(error).replace(folder, "")}
         found = judged_scenes.verdict(judged, bench, accuracy=accuracy)
-        reference = of_reference(judged, bench, spp) if spp else {}
+        reference = of_reference(judged, bench, found.right, spp) if spp else {}
     seconds = time.perf_counter() - started
     return {"scene": name, **asdict(found), "agrees": found.agrees, **reference, "seconds": round(seconds, 1)}
 

@@ -258,11 +258,11 @@ def _by_hand() -> dict[str, Judged]:
     glass = Slab(vector(0, 0, 398), vector(0, 0, 1), 4.0)
     print_ = picture(5, 30)
     return {
-        "wires of 0.15 mm": of(*wires(1, 25, 0.15, 90, 420), fine=40),
-        "wires, coded": of(*wires(2, 25, 0.15, 90, 420), camera=CODED, fine=40),
-        "hairs of 0.02 mm": of(*wires(3, 25, 0.02, 200, 420), k=1, fine=100),
-        "wires before a wall": of(sheet(440, 0.1), *wires(4, 12, 0.1, 150, 420), k=8, fine=60),
-        "balls of 0.05 mm at 1 m": of(*balls(5, 30, 0.05, 950, 1050), k=1, fine=100),
+        "wires of 0.15 mm": of(*wires(1, 25, 0.15, 90, 420), fine=24),
+        "wires, coded": of(*wires(2, 25, 0.15, 90, 420), camera=CODED, fine=24),
+        "hairs of 0.02 mm": of(*wires(3, 25, 0.02, 200, 420), k=1, fine=60),
+        "wires before a wall": of(sheet(440, 0.1), *wires(4, 12, 0.1, 150, 420), k=6, fine=30),
+        "balls of 0.05 mm at 1 m": of(*balls(5, 30, 0.05, 950, 1050), k=1, fine=60),
         "mirror balls of 0.4 mm": of(sheet(460, 0.03, 110), *balls(6, 30, 0.4, 360, 400, mirror=0.85)),
         "print 0.03 mm behind glass": of(sheet(400.03, print_, 85), pane=glass),
         "print 0.005 mm behind glass": of(sheet(400.005, print_, 85), pane=glass),
@@ -271,12 +271,12 @@ def _by_hand() -> dict[str, Judged]:
         ),
         "leaf behind leaf": of(
             sheet(430, print_), card(vector(5, 3, 380), 40, tilted(10), 0.4, leaf),
-            card(vector(-10, -5, 300), 30, tilted(-20, 15), 0.8, leaf), k=8, fine=24,
+            card(vector(-10, -5, 300), 30, tilted(-20, 15), 0.8, leaf), k=6, fine=20,
         ),
         "rig 300 m away": of(
             sheet(440, print_), Sphere(vector(15, 5, 375), 20.0, 0.6), camera=CODED, fine=16, moved=(3e5, -3e5, 3e5)
         ),
-        "wires 1 km away": of(*wires(7, 25, 0.15, 90, 420), fine=40, moved=(-1e6, 2e5, 1e6)),
+        "wires 1 km away": of(*wires(7, 25, 0.15, 90, 420), fine=24, moved=(-1e6, 2e5, 1e6)),
     }  # fmt: skip
 
 
@@ -294,7 +294,8 @@ def scenes() -> dict[str, Judged]:
 class Verdict:
     """Relative difference (rms over shots and points) between mitsim and the judge, of their sums, and what both state.
 
-    ``bound`` is mitsim's own, ``uncertain`` the judge's error, ``warnings`` why mitsim's run is flagged.
+    ``bound`` is mitsim's own, ``uncertain`` the judge's error, ``warnings`` why mitsim's run is flagged, ``right`` the
+    judge's sum [W m^-2] over all points in uniform light.
     """
 
     difference: float
@@ -302,6 +303,7 @@ class Verdict:
     bound: float
     uncertain: float
     warnings: tuple[str, ...]
+    right: float
 
     @property
     def agrees(self) -> bool:
@@ -324,4 +326,5 @@ def verdict(judged: Judged, bench: Bench, patterns: str = "dots:3", accuracy: fl
     frames = lighting.weights @ right.light
     difference = float(np.linalg.norm(ours - frames) / np.linalg.norm(frames))
     warnings = (*light.warnings, *light.unreached)
-    return Verdict(difference, float(ours.sum() / frames.sum() - 1), error_bound(light), right.error, warnings)
+    total = float(ours.sum() / frames.sum() - 1)
+    return Verdict(difference, total, error_bound(light), right.error, warnings, float(right.light.sum()))
