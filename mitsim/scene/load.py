@@ -16,7 +16,7 @@ from mitsim.scene.guard.outline import Tag
 from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
-from mitsim.scene.thin import holding_thin_shapes
+from mitsim.scene.thin import holding_thin_cylinders
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
@@ -85,7 +85,7 @@ def load_scene(
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
     moved = move_to_camera(checked.outline, checked.state)
-    with holding_thin_shapes(checked.outline, checked.state), looking_beside(checked.outline):
+    with holding_thin_cylinders(checked.outline, checked.state), looking_beside(checked.outline):
         scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
     check_meshes(moved, scene)

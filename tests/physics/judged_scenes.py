@@ -262,7 +262,7 @@ def _by_hand() -> dict[str, Judged]:
         "wires, coded": of(*wires(2, 25, 0.15, 90, 420), camera=CODED, fine=24),
         "hairs of 0.02 mm": of(*wires(3, 25, 0.02, 200, 420), k=1, fine=60),
         "wires before a wall": of(sheet(440, 0.1), *wires(4, 12, 0.1, 150, 420), k=6, fine=30),
-        "balls of 0.05 mm at 1 m": of(*balls(5, 30, 0.05, 950, 1050), k=1, fine=60),
+        "balls of 0.05 mm at 1 m": of(sheet(1060, 0.1, 400), *balls(5, 20, 0.05, 950, 1050), fine=40),
         "mirror balls of 0.4 mm": of(sheet(460, 0.03, 110), *balls(6, 30, 0.4, 360, 400, mirror=0.85)),
         "print 0.03 mm behind glass": of(sheet(400.03, print_, 85), pane=glass),
         "print 0.005 mm behind glass": of(sheet(400.005, print_, 85), pane=glass),
