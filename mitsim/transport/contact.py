@@ -44,8 +44,7 @@ def contacts(scene: mi.Scene, tags: Sequence[Tag]) -> tuple[MitsimError | None, 
     clear = [shape for shape in shapes if lets_through(shape.bsdf())]
     found: list[MitsimError | None] = [None, None]
     for shape in clear[:_MOST]:
-        others = {f"shape{i}": other for i, other in enumerate(shapes) if other is not shape}
-        gap, size = _gaps(shape, scene, mi.load_dict({"type": "scene", **others}))
+        gap, size = _gaps(shape, [other for other in shapes if other is not shape and _close(shape, other)])
         at = np.argsort(gap / size)[_FEWEST - 1]
         for which, limit in enumerate((_OWN, _MITSUBA)):
             if found[which] is None and gap[at] < limit * size[at]:
@@ -54,16 +53,28 @@ def contacts(scene: mi.Scene, tags: Sequence[Tag]) -> tuple[MitsimError | None, 
     return found[0], found[1]
 
 
-def _gaps(shape: mi.Shape, scene: mi.Scene, others: mi.Scene) -> tuple[FloatArray, FloatArray]:
-    """Distances [mm] of points of a ``shape`` to the next parallel surface of its ``scene``, inf where none is, and
-    the points' coordinates; ``others`` is the scene without it, where surfaces that coincide with it are found."""
+def _close(shape: mi.Shape, other: mi.Shape) -> bool:
+    """Whether the boxes of two shapes meet, but for a gap that is looked for."""
+    (low, high), (first, last) = ([np.array(box.min), np.array(box.max)] for box in (shape.bbox(), other.bbox()))
+    reach = _MITSUBA * (1 + max(np.abs(low).max(), np.abs(high).max()))
+    return bool((first - reach <= high).all() and (low - reach <= last).all())
+
+
+def _gaps(shape: mi.Shape, others: Sequence[mi.Shape]) -> tuple[FloatArray, FloatArray]:
+    """Distances [mm] of points of a ``shape`` to the next parallel surface of its own or of ``others``, inf where none
+    is close, and the points' coordinates."""
+    named = {f"shape{i}": other for i, other in enumerate(others)}
+    # Surfaces that coincide with the shape's own are found without it.
+    scenes = [(mi.load_dict({"type": "scene", **named, "own": shape}), 2 * CLEAR)]
+    if named:
+        scenes.append((mi.load_dict({"type": "scene", **named}), -CLEAR))
     rng = generator(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
     sample = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
     size = 1 + dr.max(dr.abs(sample.p))
     gap = mi.Float(dr.inf)
     for sign in (1, -1):
         direction = mi.Vector3f(sample.n) * sign
-        for among, first in ((others, -CLEAR), (scene, 2 * CLEAR)):
+        for among, first in scenes:
             ray = mi.Ray3f(sample.p + direction * (first * size), direction)
             ray.maxt = (_MITSUBA - first) * size
             met = among.ray_intersect(ray)

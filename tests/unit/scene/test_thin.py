@@ -25,7 +25,8 @@ def wire(radius: float, bsdf: str = MATT, z: float = 380, more: str = "") -> str
 
 
 def ball(radius: float) -> str:
-    return f'<shape type="sphere"><point name="center" x="0" y="0" z="380"/><float name="radius" value="{radius}"/></shape>'
+    return f"""<shape type="sphere"><point name="center" x="0" y="0" z="380"/>
+        <float name="radius" value="{radius}"/></shape>"""
 
 
 @pytest.fixture
