@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mitsim.capture.bench import Bench
+from mitsim.core.arguments import checked
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
@@ -65,6 +66,7 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
     return first, second
 
 
+@checked
 def open_bench(
     scene: Path | str,
     variant: str = DEFAULT_VARIANT,

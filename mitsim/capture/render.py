@@ -16,7 +16,8 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.planning import make_plan
-from mitsim.capture.request import FEWEST_PASSES, REFERENCE, check_samples
+from mitsim.capture.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
@@ -66,6 +67,7 @@ class Rendered:
         """What the command line reports, but for the file's name."""
         return {**self.facts, "mean": float(self.mean.mean()), "mc_error": self.mc_error, "warnings": self.warnings}
 
+    @checked
     def save(self, path: Path | str) -> Path:
         """Write the frame and its error to the OpenEXR file ``path``, which is replaced; returns it.
 
@@ -211,6 +213,7 @@ def render(
     """
     job = job or Job()
     check_samples(estimator, spp)
+    check_accuracy(accuracy)
     warnings: tuple[str, ...] = ()
     started = time.perf_counter()
     if estimator == REFERENCE:
