@@ -110,7 +110,17 @@ def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
 
 
 def standing(nodes: Sequence[mi.parser.SceneNode], at: int = 0, merged: bool = True) -> Iterator[int]:
-    """Numbers of the nodes below ``at`` that stand in the world: of what is ``merged`` into one shape, each part."""
+    """Numbers of the nodes that stand in the world.
+
+    Parameters
+    ----------
+    nodes
+        of a tree, the root first.
+    at
+        number of the node that they are below.
+    merged
+        give each part of what is merged into one shape, in place of the whole.
+    """
     props = nodes[at].props
     for name in props.keys():  # noqa: SIM118 - Properties is no dict
         if props.type(name) != _Type.ResolvedReference:
@@ -129,7 +139,15 @@ def _is(node: mi.parser.SceneNode, kind: str) -> bool:
 
 
 def placed(props: mi.Properties, centred: bool = True) -> FloatArray:
-    """(4, 4) to the world, from its centre where it has one and is ``centred``."""
+    """(4, 4) from an object to the world.
+
+    Parameters
+    ----------
+    props
+        of the object.
+    centred
+        from about its ``center``, ``p0`` or ``position``, where it has one.
+    """
     name = _CENTRES.get(props.plugin_name(), "position")
     matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
     return matrix @ _shift(props[name]) if centred and name in props else matrix

@@ -201,7 +201,15 @@ class Passage:
         return self.onward(si, direction) if self.transmits else si.spawn_ray(direction)
 
     def leaving_to(self, si: mi.SurfaceInteraction3f, target: mi.Point3f) -> mi.Ray3f:
-        """The same to a ``target``, short of it."""
+        """The ray of :meth:`leaving` that ends short of a ``target``.
+
+        Parameters
+        ----------
+        si
+            points of surfaces.
+        target
+            points that the rays lead to.
+        """
         ray = si.spawn_ray_to(target)
         if self.transmits:
             direction = dr.normalize(target - si.p)
