@@ -175,13 +175,22 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     plugins.register()
     loaded = load_scene(path, defines, **options)
-    factored, reference = contacts(loaded.scene, loaded.shapes)
+    estimators = ("the factored estimator", "the reference")
+    found = zip(contacts(loaded.scene), estimators, strict=True)
+    factored, reference = (each and _in_contact(loaded, each.shape, *each.words(name)) for each, name in found)
     if factored is not None and options.get("needs_projector", True):
         raise factored
     unfit = replace(
         loaded.unfit, factored=loaded.unfit.factored or factored, reference=loaded.unfit.reference or reference
     )
     return replace(loaded, unfit=unfit)
+
+
+def _in_contact(loaded: LoadedScene, shape: int, got: str, rule: str) -> MitsimError:
+    """The refusal of a scene whose ``shape`` is in contact with another."""
+    if loaded.shapes:
+        return loaded.shapes[shape].refusal("shape", got, rule)
+    return MitsimError(f"{loaded.path}: shape {shape}: got {got}; {rule}")
 
 
 def _text(value: object) -> str:

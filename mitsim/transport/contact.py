@@ -8,14 +8,13 @@ of this room :data:`mitsim.transport.passage.CLEAR`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.outline import Tag
 from mitsim.transport.passage import CLEAR, lets_through
 from mitsim.transport.sampling import generator
 
@@ -30,26 +29,35 @@ _MOST = 16
 """Surfaces that are looked at; with more of them contacts of the others are not found."""
 
 
-def contacts(scene: mi.Scene, tags: Sequence[Tag]) -> tuple[MitsimError | None, MitsimError | None]:
-    """Why the factored estimator and the reference must not be given a ``scene``; None where they may.
+@dataclass(frozen=True)
+class Contact:
+    """Number of a shape that lets light through, its distance [mm] to what stands too close, and the least allowed."""
 
-    Parameters
-    ----------
-    scene
-        as loaded.
-    tags
-        of its shapes, in their order, or none.
-    """
+    shape: int
+    gap: float
+    least: float
+
+    def words(self, estimator: str) -> tuple[str, str]:
+        """What was found, and what an ``estimator`` allows."""
+        rule = (
+            f"{estimator} sees what stands at least {self.least:.2g} mm from a surface that lets light through; leave a "
+            "gap of air, or take one surface with the material of both"
+        )
+        return f"another surface at a distance of {self.gap:.2g} mm", rule
+
+
+def contacts(scene: mi.Scene) -> tuple[Contact | None, Contact | None]:
+    """Why the factored estimator and the reference must not be given a ``scene``; None where they may."""
     shapes = [shape for shape in scene.shapes() if shape.bsdf() is not None]
     clear = [shape for shape in shapes if lets_through(shape.bsdf())]
-    found: list[MitsimError | None] = [None, None]
+    found: list[Contact | None] = [None, None]
     for shape in clear[:_MOST]:
         gap, size = _gaps(shape, [other for other in shapes if other is not shape and _close(shape, other)])
         at = np.argsort(gap / size)[_FEWEST - 1]
         for which, limit in enumerate((_OWN, _MITSUBA)):
             if found[which] is None and gap[at] < limit * size[at]:
                 index = list(scene.shapes()).index(shape)
-                found[which] = _refusal(index, tags, float(gap[at]), float(limit * size[at]), which)
+                found[which] = Contact(index, float(gap[at]), float(limit * size[at]))
     return found[0], found[1]
 
 
@@ -82,15 +90,3 @@ def _gaps(shape: mi.Shape, others: Sequence[mi.Shape]) -> tuple[FloatArray, Floa
             gap = dr.minimum(gap, dr.select(parallel, dr.abs(met.t + first * size), dr.inf))
     dr.eval(gap, size)
     return np.array(gap, dtype=np.float64), np.array(size, dtype=np.float64)
-
-
-def _refusal(index: int, tags: Sequence[Tag], gap: float, least: float, which: int) -> MitsimError:
-    estimator = ("the factored estimator", "the reference")[which]
-    got = f"another surface at a distance of {gap:.2g} mm"
-    rule = (
-        f"{estimator} sees what stands at least {least:.2g} mm from a surface that lets light through; leave a gap of "
-        "air, or take one surface with the material of both"
-    )
-    if tags:
-        return tags[index].refusal("shape", got, rule)
-    return MitsimError(f"shape {index}: got {got}; {rule}")
