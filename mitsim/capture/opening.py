@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mitsim.rig.profile import MaskProfile
     from mitsim.rig.projector import ProjectorModel
     from mitsim.scene.load import LoadedScene
+    from mitsim.transport.contact import Contact
 
 _PITCH_TOLERANCE = 1e-3
 """Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
@@ -175,9 +176,9 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     plugins.register()
     loaded = load_scene(path, defines, **options)
-    estimators = ("the factored estimator", "the reference")
-    found = zip(contacts(loaded.scene), estimators, strict=True)
-    factored, reference = (each and _in_contact(loaded, each.shape, *each.words(name)) for each, name in found)
+    of_factored, of_reference = contacts(loaded.scene)
+    factored = _in_contact(loaded, of_factored, "the factored estimator")
+    reference = _in_contact(loaded, of_reference, "the reference")
     if factored is not None and options.get("needs_projector", True):
         raise factored
     unfit = replace(
@@ -186,11 +187,14 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     return replace(loaded, unfit=unfit)
 
 
-def _in_contact(loaded: LoadedScene, shape: int, got: str, rule: str) -> MitsimError:
-    """The refusal of a scene whose ``shape`` is in contact with another."""
+def _in_contact(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:
+    """The refusal of a scene with a ``contact`` by an ``estimator``."""
+    if contact is None:
+        return None
+    got, rule = contact.words(estimator)
     if loaded.shapes:
-        return loaded.shapes[shape].refusal("shape", got, rule)
-    return MitsimError(f"{loaded.path}: shape {shape}: got {got}; {rule}")
+        return loaded.shapes[contact.shape].refusal("shape", got, rule)
+    return MitsimError(f"{loaded.path}: shape {contact.shape}: got {got}; {rule}")
 
 
 def _text(value: object) -> str:

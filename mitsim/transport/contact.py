@@ -40,8 +40,8 @@ class Contact:
     def words(self, estimator: str) -> tuple[str, str]:
         """What was found, and what an ``estimator`` allows."""
         rule = (
-            f"{estimator} sees what stands at least {self.least:.2g} mm from a surface that lets light through; leave a "
-            "gap of air, or take one surface with the material of both"
+            f"{estimator} sees what stands at least {self.least:.2g} mm from a surface that lets light through; leave "
+            "a gap of air, or take one surface with the material of both"
         )
         return f"another surface at a distance of {self.gap:.2g} mm", rule
 
