@@ -13,8 +13,10 @@ from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.outline import Tag
+from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
+from mitsim.scene.thin import holding_thin_cylinders
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
@@ -84,9 +86,11 @@ def load_scene(
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
-    with looking_beside(checked.outline):
+    moved = move_to_camera(checked.outline, checked.state)
+    with holding_thin_cylinders(checked.outline, checked.state), looking_beside(checked.outline):
         scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
+    check_meshes(moved, scene)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')

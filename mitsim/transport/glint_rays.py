@@ -19,7 +19,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.coordinates import rows_columns, turn_and_origin
 from mitsim.transport.host import channels, per_lane, vectors
-from mitsim.transport.passage import Passage
+from mitsim.transport.passage import CLEAR, Passage, transmits
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 
 IntArray = npt.NDArray[np.int64]
@@ -111,6 +111,7 @@ class GlintRays:
             surfaces that a ray may meet between the two.
         """
         self._scene, self._max_depth = scene, max_depth
+        self._clear = CLEAR if transmits(scene) else _OFFSET
         self._wavelengths = wavelength_sets(projector.lines)
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
@@ -186,7 +187,7 @@ class GlintRays:
             traced = vectors(si.to_world(sample.wo), count)[chosen]
             direction = _redirected(rays.direction[chosen], normal[chosen], kind[chosen], eta[chosen], traced)
             slope = np.abs((direction * geometric[chosen]).sum(axis=1))
-            clear = _OFFSET * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
+            clear = self._clear * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
             reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
             code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
             straight = lobe.kind == int(mi.BSDFFlags.Null)
