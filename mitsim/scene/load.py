@@ -13,6 +13,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.outline import Tag
+from mitsim.scene.mesh_lamps import emit_by_faces
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
 
@@ -31,7 +32,8 @@ class LoadedScene:
     whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
     estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
     several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
-    differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way.
+    differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
+    ``notes`` say what was changed of the scene to render it rightly.
     """
 
     path: Path
@@ -48,6 +50,7 @@ class LoadedScene:
     small_lamps: tuple[tuple[mi.Emitter, Tag], ...]
     coloured: tuple[Tag, ...]
     parting: tuple[Tag, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -83,6 +86,7 @@ def load_scene(
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
     with looking_beside(checked.outline):
+        notes = emit_by_faces(checked)
         scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
@@ -108,7 +112,7 @@ def load_scene(
     shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
     lit = tuple(zip(small, checked.small_lamps, strict=True))
-    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit, checked.coloured, checked.parting
+    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit, checked.coloured, checked.parting, notes
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
