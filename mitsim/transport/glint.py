@@ -22,11 +22,17 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.glint import Beams
 from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.glint_rays import Crossings, GlintRays, IntArray, Mask, delta_bsdfs
+from mitsim.transport.glint_rays import Chains, Crossings, GlintRays, IntArray, Mask, delta_bsdfs
+from mitsim.transport.glint_search import first_squares
 from mitsim.transport.projector import ProjectorOptics
 
-_UNIT = 2**10
-"""Lattice points a projector pixel's side, the finest division: a pixel of 1000 sensor pixels still ends at one."""
+_UNIT = 2**20
+"""Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
+through 0.1 um."""
+_DIVISIONS = 2**10
+"""Parts a side that squares of the first grid are divided into at most: a pixel of 1000 sensor pixels ends at one."""
+_AT_ONCE = 2**18
+"""Squares that are looked at together, some hundreds of MB."""
 _COARSE = 128
 """Least number of coarse beams along the window's side: a mirror of a hundredth of the window is seen."""
 _TOLERANCE = 0.02
@@ -83,22 +89,39 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
 def _of(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], float]:
     """Beams of the pixels of a window of ``n`` a side, and what was left unresolved."""
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
-    line = np.arange(0, n * _UNIT + 1, step)
-    row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
-    crossings = tracer.follow(np.stack([row, column], axis=1) / _UNIT)
-    low_row, low_column = (axis.ravel() for axis in np.meshgrid(line[:-1], line[:-1], indexing="ij"))
-    first = np.arange(len(line) - 1)
-    neighbours = np.array([[0, 1], [len(line), len(line) + 1]])
-    corner = (first[:, None] * len(line) + first).ravel()[:, None, None] + neighbours
     parts, unresolved = [], 0.0
-    for chain in np.unique(crossings.chain):
-        nodes = _nodes(crossings, chain, row.size)
-        squares = nodes.take(corner)
-        chosen = _near(squares, squares, geometry)
-        beams, lost = _refine(tracer, chain, low_row[chosen], low_column[chosen], step, n, geometry)
-        parts += beams
-        unresolved += lost
+    for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _UNIT, step, _DIVISIONS):
+        for first in range(0, len(row), _AT_ONCE):
+            chosen = slice(first, first + _AT_ONCE)
+            beams, lost = _search(tracer, row[chosen], column[chosen], size, n, geometry)
+            parts += beams
+            unresolved += lost
     return parts, unresolved
+
+
+def _search(
+    tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
+) -> tuple[list[Beams], float]:
+    """Beams of all chains in squares of the lattice (first row and column, ``size``), and the flux not resolved."""
+    crossings, place = _traced(tracer, row, column, np.array([0, size]))
+    # Squares that a chain has a corner of, one for each chain; corners (row, column) by the ray that they are.
+    chains, number = np.unique(crossings.chain, return_inverse=True)
+    order = np.argsort(place.ravel(), kind="stable")
+    corner_of = place.ravel()[order]
+    first, last = (np.searchsorted(corner_of, crossings.ray, side=side) for side in ("left", "right"))
+    touched = order[_ranges(first, last)] // 4
+    pairs = np.unique(np.repeat(number, last - first) * len(row) + touched)
+    chain, square = np.divmod(pairs, len(row))
+    nodes = _nodes(crossings, chains[chain], place[square])
+    chosen = _near(nodes, nodes, geometry)
+    square, chain = square[chosen], chain[chosen]
+    return _refine(tracer, chains[chain], row[square], column[square], size, n, geometry)
+
+
+def _ranges(first: IntArray, last: IntArray) -> IntArray:
+    """All whole numbers from each ``first`` to before its ``last``, one range behind another."""
+    counts = last - first
+    return np.asarray(np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,34 +141,54 @@ class _Nodes:
         return self.take((slice(None), slice(i, i + 2), slice(j, j + 2)))
 
 
-def _nodes(crossings: Crossings, chain: np.uint64, count: int) -> _Nodes:
-    """The crossings of one chain, by number of the ray."""
-    mine = crossings.chain == chain
-    ray = crossings.ray[mine]
-    valid = np.zeros(count, dtype=bool)
-    valid[ray] = True
-    nodes = _Nodes(valid, np.full((count, 2), np.nan), np.full((count, 2), np.nan), np.zeros(count))
-    nodes.sensor[ray], nodes.tangent[ray] = crossings.sensor[mine], crossings.tangent[mine]
-    nodes.throughput[ray] = crossings.throughput[mine]
-    return nodes
+def _traced(
+    tracer: GlintRays, row: IntArray, column: IntArray, steps: IntArray
+) -> tuple[Crossings, IntArray]:
+    """Rays through the points of squares at ``steps`` from their first corner, shared ones traced once; and which ray
+    (q, k, k) each point is."""
+    rows, columns = np.broadcast_arrays(row[:, None, None] + steps[:, None], column[:, None, None] + steps)
+    line, number = np.unique(columns, return_inverse=True)
+    key, place = np.unique(rows.ravel() * len(line) + number.ravel(), return_inverse=True)
+    row, number = np.divmod(key, max(1, len(line)))
+    return tracer.follow(np.stack([row, line[number]], axis=1) / _UNIT), place.reshape(rows.shape)
+
+
+def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
+    """What is known at rays ``place`` (q, ., .) of squares of one ``chain`` (q,) each."""
+    chains, number = np.unique(crossings.chain, return_inverse=True)
+    rays = int(max(place.max(initial=0), crossings.ray.max(initial=0))) + 1
+    key = number * rays + crossings.ray
+    order = np.argsort(key, kind="stable")
+    mine = np.searchsorted(chains, chain)
+    known = mine < len(chains)
+    known[known] = chains[mine[known]] == chain[known]
+    wanted = np.where(known, mine, len(chains))[:, None, None] * rays + place
+    # The last of equal ones.
+    at = np.searchsorted(key[order], wanted, side="right") - 1
+    at = order[np.maximum(at, 0)] if len(order) else np.zeros(wanted.shape, np.int64)
+    valid = (key[at] == wanted) if len(order) else np.zeros(wanted.shape, bool)
+    if not len(order):
+        return _Nodes(valid, *(np.full((*wanted.shape, 2), np.nan) for _ in range(2)), np.zeros(wanted.shape))
+    pairs = (np.where(valid[..., None], values[at], np.nan) for values in (crossings.sensor, crossings.tangent))
+    return _Nodes(valid, *pairs, np.where(valid, crossings.throughput[at], 0))
 
 
 def _refine(
-    tracer: GlintRays, chain: np.uint64, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
+    tracer: GlintRays, chain: Chains, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], float]:
-    """Beams of one chain inside squares of the lattice (first row and column, ``size``), and the flux not resolved."""
+    """Beams inside squares of the lattice (chain, first row and column, ``size``), and the flux not resolved."""
     parts: list[Beams] = []
-    unresolved = 0.0
+    unresolved, finest = 0.0, max(1, size // _DIVISIONS)
     pitch = min(geometry.pitches)
     while len(row):
         half = size // 2
-        nodes = _trace_squares(tracer, chain, row, column, half)
+        nodes = _nodes_of(tracer, chain, row, column, half)
         extent = _extent(nodes)
         whole = nodes.valid.all(axis=(1, 2))
         smooth = (_departure(nodes.sensor) < _TOLERANCE * pitch) & (extent < geometry.half_width)
         even = _departure(nodes.throughput[..., None]) <= _SHADES * nodes.throughput.max(axis=(1, 2))
         done = whole & (smooth | (extent < _SMALL * pitch)) & (even | (extent < _RIM * pitch))
-        lost = ~done & ((half == 1) | (~whole & (extent > 0) & (extent < _RIM * pitch)))
+        lost = ~done & ((half == finest) | (~whole & (extent > 0) & (extent < _RIM * pitch)))
         share = nodes.throughput.mean(axis=(1, 2)) * _fluxes(tracer, row, column, size, n)
         unresolved += float(share[lost & _near(nodes, nodes, geometry)].sum())
         for i, j in np.ndindex(2, 2):
@@ -156,20 +199,16 @@ def _refine(
         following = []
         for i, j in np.ndindex(2, 2):
             goes_on = ~done & ~lost & _near(nodes.quarter(i, j), nodes, geometry)
-            following.append((row[goes_on] + i * half, column[goes_on] + j * half))
-        row, column = (np.concatenate(part) for part in zip(*following, strict=True))
+            following.append((chain[goes_on], row[goes_on] + i * half, column[goes_on] + j * half))
+        chain, row, column = (np.concatenate(part) for part in zip(*following, strict=True))
         size = half
     return parts, unresolved
 
 
-def _trace_squares(tracer: GlintRays, chain: np.uint64, row: IntArray, column: IntArray, half: int) -> _Nodes:
-    """Nodes (q, 3, 3) at corners, edge middles and centre of squares; shared points are traced once."""
-    step = half * np.arange(3)
-    rows, columns = np.broadcast_arrays(row[:, None, None] + step[:, None], column[:, None, None] + step)
-    stride = int(columns.max()) + 1
-    key, place = np.unique((rows * stride + columns).ravel(), return_inverse=True)
-    crossings = tracer.follow(np.stack(np.divmod(key, stride), axis=1) / _UNIT)
-    return _nodes(crossings, chain, len(key)).take(place.reshape(rows.shape))
+def _nodes_of(tracer: GlintRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
+    """Nodes (q, 3, 3) at corners, edge middles and centre of squares."""
+    crossings, place = _traced(tracer, row, column, half * np.arange(3))
+    return _nodes(crossings, chain, place)
 
 
 def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
