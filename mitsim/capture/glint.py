@@ -52,7 +52,8 @@ class Glint:
         """The mask for a virtual source at the beams' mean depth and direction."""
         if spectrum is None:
             return geometric_samplers(geometry)
-        near = float(np.mean(self.beams.inverse_depth))
+        wide = self.beams.wide
+        near = float(np.mean(self.beams.inverse_depth[wide])) if wide.any() else 0.0
         depth = 1 / near if near > 0 else math.inf
         tau = np.average(self.beams.tangent.mean(axis=(1, 2)), axis=0, weights=self.beams.delivered)
         return wave_samplers(geometry, spectrum, depth, (float(tau[0]), float(tau[1])))

@@ -12,6 +12,7 @@ so a beam holds that times its area on this plane.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,8 @@ _RIM = 0.5
 
 Half a pixel, which a frame does not resolve; each halving doubles the beams along every rim.
 """
+_SHARES = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
+"""Part of a square that each of its 3 x 3 nodes stands for (trapezoidal rule)."""
 _MARGIN = 0.02
 """Sine by which the field stop is widened when squares are left out: 1 degree, more than a square's rays curve."""
 
@@ -78,31 +81,31 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
         raise MitsimError(f"max_depth of glints is {max_depth}; give at least 1")
     if not has_mirrors(scene):
         return _joined([], 0.0)
-    parts, unresolved = [], 0.0
+    parts, variance = [], 0.0
     for each in projector.apart:
-        beams, lost = _of(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
+        beams, error = _of(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
         parts += beams
-        unresolved += lost
-    return _joined(parts, unresolved)
+        variance += error
+    return _joined(parts, variance)
 
 
 def _of(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], float]:
-    """Beams of the pixels of a window of ``n`` a side, and what was left unresolved."""
+    """Beams of the pixels of a window of ``n`` a side, and the variance of their flux."""
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
-    parts, unresolved = [], 0.0
+    parts, variance = [], 0.0
     for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _UNIT, step, _DIVISIONS):
         for first in range(0, len(row), _AT_ONCE):
             chosen = slice(first, first + _AT_ONCE)
-            beams, lost = _search(tracer, row[chosen], column[chosen], size, n, geometry)
+            beams, error = _search(tracer, row[chosen], column[chosen], size, n, geometry)
             parts += beams
-            unresolved += lost
-    return parts, unresolved
+            variance += error
+    return parts, variance
 
 
 def _search(
     tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], float]:
-    """Beams of all chains in squares of the lattice (first row and column, ``size``), and the flux not resolved."""
+    """The same of all chains in squares of the lattice (first row and column, ``size``)."""
     crossings, place = _traced(tracer, row, column, np.array([0, size]))
     # Squares that a chain has a corner of, one for each chain; corners (row, column) by the ray that they are.
     chains, number = np.unique(crossings.chain, return_inverse=True)
@@ -176,9 +179,9 @@ def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
 def _refine(
     tracer: GlintRays, chain: Chains, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], float]:
-    """Beams inside squares of the lattice (chain, first row and column, ``size``), and the flux not resolved."""
+    """Beams inside squares of the lattice (chain, first row and column, ``size``), and the variance of their flux."""
     parts: list[Beams] = []
-    unresolved, finest = 0.0, max(1, size // _DIVISIONS)
+    variance, finest = 0.0, max(1, size // _DIVISIONS)
     pitch = min(geometry.pitches)
     while len(row):
         half = size // 2
@@ -189,8 +192,10 @@ def _refine(
         even = _departure(nodes.throughput[..., None]) <= _SHADES * nodes.throughput.max(axis=(1, 2))
         done = whole & (smooth | (extent < _SMALL * pitch)) & (even | (extent < _RIM * pitch))
         lost = ~done & ((half == finest) | (~whole & (extent > 0) & (extent < _RIM * pitch)))
-        share = nodes.throughput.mean(axis=(1, 2)) * _fluxes(tracer, row, column, size, n)
-        unresolved += float(share[lost & _near(nodes, nodes, geometry)].sum())
+        cut = row[lost], column[lost]
+        points, error = _points(nodes.take(lost), _fluxes(tracer, *cut, size, n), _pixel(*cut, n), geometry)
+        parts.append(points)
+        variance += error
         for i, j in np.ndindex(2, 2):
             corners = nodes.quarter(i, j).take(done)
             at = row[done] + i * half, column[done] + j * half
@@ -202,7 +207,23 @@ def _refine(
             following.append((chain[goes_on], row[goes_on] + i * half, column[goes_on] + j * half))
         chain, row, column = (np.concatenate(part) for part in zip(*following, strict=True))
         size = half
-    return parts, unresolved
+    return parts, variance
+
+
+def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> tuple[Beams, float]:
+    """Squares that are not divided further as beams without extent, one at each node (q, 3, 3) that meets the sensor.
+
+    A node stands for its part of the square's ``flux`` (q,): of an edge's squares that is right in the mean, and the
+    second number is what their sum may be off by, as if each were all or nothing.
+    """
+    seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
+    seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
+    light = _SHARES * nodes.throughput * flux[:, None, None]
+    square, i, j = np.nonzero(seen)
+    corners = (np.broadcast_to(v[square, i, j][:, None, None], (len(square), 2, 2, 2)) for v in (nodes.sensor, nodes.tangent))
+    whole = np.ones((len(square), 2, 2))
+    beams = Beams(pixel[square], light[square, i, j], *corners, whole, 0.0)
+    return beams, float(np.square(np.where(seen, light, 0).sum(axis=(1, 2))).sum())
 
 
 def _nodes_of(tracer: GlintRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
@@ -269,9 +290,9 @@ def _pixel(row: IntArray, column: IntArray, n: int) -> IntArray:
     return (row // _UNIT) * n + column // _UNIT
 
 
-def _joined(parts: list[Beams], unresolved: float) -> Beams:
+def _joined(parts: list[Beams], variance: float) -> Beams:
     pair = np.zeros((0, 2, 2, 2))
     none = Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0)
     names = ("pixel", "flux", "sensor", "tangent", "throughput")
     arrays = {name: np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names}
-    return Beams(**arrays, unresolved=unresolved)
+    return Beams(**arrays, unresolved=math.sqrt(variance))
