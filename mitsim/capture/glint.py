@@ -45,6 +45,15 @@ class Glint:
             self._frames[key] = self._form(labels, geometry, spectrum)
         return self._frames[key]
 
+    def irradiance(self, geometry: CameraGeometry) -> tuple[float, float]:
+        """Mean irradiance on the sensor without its mask, and what of it lacks or may be off in each pixel [W m^-2]."""
+        beams = self.beams
+        area, pixels = math.prod(geometry.pitches), math.prod(geometry.frame_shape)
+        met = (np.abs(beams.sensor.mean(axis=(1, 2))) < geometry.half_width).all(axis=1)
+        # Points that edges leave lie in single pixels: their rms over all of them.
+        unsure = math.hypot(beams.unresolved, beams.error * math.sqrt(pixels))
+        return float(beams.delivered[met].sum()) / area / pixels, unsure / area / pixels
+
     def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
         return glint_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
 

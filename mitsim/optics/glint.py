@@ -51,6 +51,8 @@ class Beams:
     throughput
         (q, 2, 2) part of the light left at each corner.
     unresolved
+        flux on the sensor that is in no beam, because where it lands was not found out.
+    error
         standard error of the flux on the sensor, from beams that an edge cuts and that were not divided further: these
         are points.
     """
@@ -61,6 +63,7 @@ class Beams:
     tangent: FloatArray
     throughput: FloatArray
     unresolved: float
+    error: float = 0.0
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -91,13 +94,14 @@ class GlintFrames(ClassFrames):
         (p,) projector pixels whose light meets the sensor, behind the mask or not.
     flux
         flux on the sensor without the mask, all classes at full power [W m^-2 mm^2].
-    unresolved
-        standard error of the flux on the sensor, from what edges cut; same unit.
+    unresolved, error
+        flux that is left out, and the standard error of what is not, from what edges cut; same unit.
     """
 
     lit_pixels: IntArray
     flux: float
     unresolved: float
+    error: float
 
 
 def glint_frames(
@@ -143,7 +147,7 @@ def glint_frames(
     used = np.isin(classes, labels[lit])
     area = math.prod(geometry.active_sides)
     return GlintFrames(
-        classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved
+        classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved, beams.error
     )
 
 

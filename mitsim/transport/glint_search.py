@@ -22,7 +22,7 @@ from mitsim.transport.projector import PinholeRays
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 _ACROSS_BALL = 0.25
-"""Step of the finer grid in radii of a ball, disk or wire: some 50 rays meet a ball, of half of which all neighbours do."""
+"""Step of the finer grid in radii of a ball, disk or wire: some 50 rays meet a ball."""
 _ACROSS_FACE = 1 / 3
 """The same in heights of a flat facet: its inscribed circle, of two thirds, holds a point of any such grid."""
 _ACROSS_SMOOTH = 1.0

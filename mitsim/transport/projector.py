@@ -280,9 +280,7 @@ class PinholeRays:
         local = np.linalg.solve(self._map.turn, (places - self.origin).T)
         depth, canvas = local[2], self._projector.canvas
         with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = (
-                (local[i] / depth - axis[1]) / axis[0] for i, axis in enumerate((self._map.x, self._map.y))
-            )
+            u, v = ((local[i] / depth - axis[1]) / axis[0] for i, axis in enumerate((self._map.x, self._map.y)))
         row = v * canvas[0] - self._projector.first_row
         return np.stack([row, u * canvas[1] - self._projector.first_column], axis=1), depth
 

@@ -243,8 +243,8 @@ def test_a_mirror_that_shows_the_projector_to_part_of_the_sensor(variant: str) -
     # Sensor x meets the mirror at (60 + x) / 2: dark where x < 0, columns of s > 0.
     expected = REFLECTANCE * light * (u < 0)
     assert relative(found.irradiance[0], expected) < 1e-3
-    assert found.irradiance[0].sum() + found.unresolved / PITCH**2 / 2 == pytest.approx(expected.sum(), rel=2e-3)
-    assert found.unresolved < 5e-3 * found.flux
+    assert found.irradiance[0].sum() == pytest.approx(expected.sum(), rel=2e-4)
+    assert found.unresolved == 0 and found.error < 2e-4 * found.flux
 
 
 def test_a_mirror_out_of_view_gives_nothing(variant: str) -> None:
