@@ -30,9 +30,11 @@ from mitsim.transport.projector import ProjectorOptics
 _UNIT = 2**24
 """Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
 through 0.1 um."""
-_DIVISIONS = 2**10
-"""Parts a side that squares of the first grid are divided into at most: a pixel of 1000 sensor pixels ends at one. What
-one small ball sends to the next and on to the sensor needs more: it is counted, not resolved."""
+_DIVISIONS = 2**14
+"""Parts a side that squares of the first grid are divided into at most: a rim in a projector pixel of 300 sensor
+pixels is found to a 20th of one."""
+_DEEPER = 2**4
+"""How much finer that is than squares whose light may land anywhere are divided: those are left out, and counted."""
 _MOST = 2**16
 """Squares of one size beyond which none is divided further: some 3 s; fifty wires have as many."""
 _AT_ONCE = 2**18
@@ -208,12 +210,13 @@ def _refine(
         done = whole & (smooth | (extent < _SMALL * pitch)) & (even | (extent < _PAINT * pitch))
         spread = _spread(nodes, spread)
         edge = ~whole & (spread[:, 0] < _RIM * pitch)
-        lost = ~done & (edge | (half == finest) | (len(row) > _MOST))
+        # Light that small balls send to each other is faint, and its place is known too late.
+        unknown = (half <= finest * _DEEPER) & (spread[:, 0] > pitch)
+        lost = ~done & (edge | unknown | (half == finest) | (len(row) > _MOST))
         flux, pixel = stands_for * _fluxes(tracer, row, column, size, n), _pixel(row, column, n)
         points = _points(nodes.take(lost), flux[lost], pixel[lost], geometry)
-        if half == finest and len(row) <= _MOST:
-            # Its place on the sensor is not known, and points of that light would be worse than none.
-            kept = np.isin(points.number, np.flatnonzero(edge[lost]))
+        if len(row) <= _MOST:
+            kept = ~unknown[lost][points.number]
             unresolved += float(points.beams.flux[~kept].sum())
             points = points.take(kept)
         parts.append(points.beams)
