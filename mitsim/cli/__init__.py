@@ -7,6 +7,7 @@ Errors of the library speak of arguments; :func:`~mitsim.cli.options.spoken` wri
 from __future__ import annotations
 
 import errno
+import signal
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -62,8 +63,8 @@ from mitsim.cli.options import (
 )
 from mitsim.cli.screen import finish, print_plan
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import MitsimError
-from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, stopped
+from mitsim.core.errors import MitsimError, printable
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, stopped
 
 app = typer.Typer(
     name="mitsim",
@@ -78,9 +79,14 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def run() -> None:
-    """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused, 128 + n ended by signal n."""
+    """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused or failed, 128 + n ended by
+    signal n."""
     try:
         code = app(standalone_mode=False)
+    except SystemExit as ended:
+        if ended.code == 1:  # click's for a reader that went away
+            sys.exit(128 + signal.SIGPIPE)
+        raise
     except MitsimError as error:
         _fail(spoken(error))
     except (typer.Abort, KeyboardInterrupt):
@@ -90,13 +96,13 @@ def run() -> None:
     except OSError as error:
         # What no check foresees: a full disk, a name too long, a file taken away. Other errors are faults of ours.
         if error.filename is None and error.errno not in _NO_ROOM:
-            raise
+            end_uncaught(error)
         _fail(f"{error.filename or 'output'}: {error.strerror}; choose another place")
     except Exception as error:
         # Usage errors of click (wherever typer keeps it) carry their own one-line message.
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
             _fail(_usage(error))
-        raise
+        end_uncaught(error)
     if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
         end_stopped()
     sys.exit(code if isinstance(code, int) else 0)
@@ -117,7 +123,7 @@ def _usage(error: Any) -> str:
 def _fail(message: str) -> None:
     if stopped():
         end_stopped()  # what an interrupt became on its way, as of a module that was being imported
-    print(f"mitsim: {' '.join(message.split())}", file=sys.stderr)
+    print(f"mitsim: {' '.join(printable(message).split())}", file=sys.stderr)
     sys.exit(2)
 
 
@@ -294,7 +300,10 @@ def render(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
     estimator: Annotated[str, typer.Option(help="reference or factored")] = "reference",
-    spp: Annotated[int, typer.Option(help="samples a pixel of the reference")] = 64,
+    spp: Annotated[
+        int | None,
+        typer.Option(help="samples a pixel of the reference", show_default="the scene's sample_count, or 64"),
+    ] = None,
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
     projector: Projector = None,
@@ -309,18 +318,20 @@ def render(
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
     from mitsim.capture.request import check_samples
-    from mitsim.core.output import prepare_output
+    from mitsim.core.output import check_apart, check_output, output_file
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
     request = request_of(accuracy=accuracy, seed=seed, effects=effects)
     check_samples(estimator, spp)
+    check_output(output, overwrite=True, kind="file")
     method: Any = estimator
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
-        place = prepare_output(output, overwrite=True, kind="file")
         bench = bench_of(scene, variant, None, projector, define, outside, for_render=True)
-        frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
-        payload = {**frame.summary(), "output": str(frame.save(place))}
+        check_apart(output, bench.loaded.files)
+        with output_file(output, overwrite=True) as place:
+            frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
+            payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
         f"{payload['seconds']:.2f} s: {payload['output']}",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -292,16 +293,17 @@ class Wanted:
         as_json
             one JSON object instead of text.
         """
-        from mitsim.core.output import whole_file
+        from mitsim.core.output import output_file, whole_file
         from mitsim.rig.recipe import recipe_text
         from mitsim.study.calibration_plan import plan_calibration
 
-        found = plan_calibration(bench, self.psnr, self.patterns, recipe, **request, job=job)
-        lines = found.lines()
-        if self.output is not None:
-            with whole_file(self.output) as part:
-                part.write_text(recipe_text(found.recipe), encoding="utf-8")
-            lines.append(f"Recipe: {self.output}")
+        with nullcontext() if self.output is None else output_file(self.output):
+            found = plan_calibration(bench, self.psnr, self.patterns, recipe, **request, job=job)
+            lines = found.lines()
+            if self.output is not None:
+                with whole_file(self.output) as part:
+                    part.write_text(recipe_text(found.recipe), encoding="utf-8")
+                lines.append(f"Recipe: {self.output}")
         payload = {**found.payload(), "output": None if self.output is None else str(self.output)}
         return finish(as_json, payload, lines, found.warnings)
 

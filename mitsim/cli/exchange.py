@@ -225,14 +225,16 @@ def transport(
     quiet: Quiet = False,
 ) -> int:
     """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
-    from mitsim.core.output import prepare_output
+    from mitsim.core.configuration import locate
+    from mitsim.core.output import check_apart, output_file
 
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
-    prepare_output(output, overwrite, "file")
     check_shown([patterns], scene, define, outside)
-    with job_of(quiet or as_json, max_seconds, max_memory) as job:
+    with job_of(quiet or as_json, max_seconds, max_memory) as job, output_file(output, overwrite) as output:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
+        devices = (locate(each, "calibration", ".toml") for each in (camera, projector) if each)
+        check_apart(output, (*bench.loaded.files, *devices))
         light = bench.light(request.pop("patterns"), job, **request)
         with job.clock.stage("write"):
             light.save(output)

@@ -71,7 +71,7 @@ def sense(
     from mitsim.capture.request import Exposure
     from mitsim.capture.sensing import check_ending, check_f_number, check_image, check_wavelength
     from mitsim.core.configuration import locate
-    from mitsim.core.output import prepare_output
+    from mitsim.core.output import check_apart, output_file
     from mitsim.core.seeds import check_root
     from mitsim.rig.sensor import load_sensor
 
@@ -86,14 +86,15 @@ def sense(
         check_f_number(f_number)
     check_root(seed)
     check_image(image)
-    place = prepare_output(output, overwrite=True, kind="file")
-    from mitsim.capture.sense import irradiance_behind_lens, read_image
-    from mitsim.capture.sense import sense as run_sense
+    check_apart(output, [image])
+    with output_file(output, overwrite=True) as place:
+        from mitsim.capture.sense import irradiance_behind_lens, read_image
+        from mitsim.capture.sense import sense as run_sense
 
-    light, notes = read_image(image, channel)
-    light = light * scale if f_number is None else irradiance_behind_lens(light * scale, f_number)
-    frame = run_sense(light, sensor, asked, seed, wavelength, notes)
-    payload = {**frame.summary(), "output": str(frame.save(place))}
+        light, notes = read_image(image, channel)
+        light = light * scale if f_number is None else irradiance_behind_lens(light * scale, f_number)
+        frame = run_sense(light, sensor, asked, seed, wavelength, notes)
+        payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{sensor.name}: {payload['shape'][0]}x{payload['shape'][1]} pixels, exposure {frame.exposure_s:.3g} s, "
         f"mean {payload['mean_dn']:.5g} DN, largest {payload['largest_dn']:.5g}: {payload['output']}",
