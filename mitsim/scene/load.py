@@ -33,8 +33,8 @@ class LoadedScene:
     estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
     several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
     differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
-    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed of
-    the scene to render it rightly.
+    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
+    of the scene to render it rightly.
     """
 
     path: Path

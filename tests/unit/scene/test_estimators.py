@@ -182,7 +182,7 @@ def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
     assert matt.unfit.instances is None and not matt.mirrors and matt.glossy
 
 
-FLAT = '<texture type="checkerboard" name="{}"/>'
+FLAT = '<texture type="bitmap" name="{}"><string name="filename" value="small_projector.png"/></texture>'
 BUMPS = {"normalmap": FLAT.format("normalmap"), "bumpmap": FLAT.format("arbitrary")}
 HOLE = '<bsdf type="mask"><float name="opacity" value="0.3"/>{}</bsdf>'
 MATT = '<bsdf type="diffuse"/>'
