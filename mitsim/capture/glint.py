@@ -46,7 +46,13 @@ class Glint:
         return self._frames[key]
 
     def irradiance(self, geometry: CameraGeometry) -> tuple[float, float]:
-        """Mean irradiance on the sensor without its mask, and what of it lacks or may be off in each pixel [W m^-2]."""
+        """Mean irradiance on the sensor without its mask, and what of it lacks or may be off in each pixel [W m^-2].
+
+        Parameters
+        ----------
+        geometry
+            the camera.
+        """
         beams = self.beams
         area, pixels = math.prod(geometry.pitches), math.prod(geometry.frame_shape)
         met = (np.abs(beams.sensor.mean(axis=(1, 2))) < geometry.half_width).all(axis=1)

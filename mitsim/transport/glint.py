@@ -129,7 +129,7 @@ def _search(
     spread = _spread(nodes, np.full((len(square), 2), np.inf))
     chosen = _near(nodes, spread, geometry)
     square, chain = square[chosen], chain[chosen]
-    return _refine(tracer, chains[chain], row[square], column[square], spread[chosen], size, n, geometry)
+    return _refine(tracer, (chains[chain], row[square], column[square], spread[chosen]), size, n, geometry)
 
 
 def _ranges(first: IntArray, last: IntArray) -> IntArray:
@@ -187,15 +187,13 @@ def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
 
 def _refine(
     tracer: GlintRays,
-    chain: Chains,
-    row: IntArray,
-    column: IntArray,
-    spread: FloatArray,
+    squares: tuple[Chains, IntArray, IntArray, FloatArray],
     size: int,
     n: int,
     geometry: CameraGeometry,
 ) -> tuple[list[Beams], FloatArray]:
-    """The same inside squares of one chain (q,) each, ``spread`` (q, 2) as :func:`_spread` tells it."""
+    """The same inside ``squares``: chain, first row and column (q,), and :func:`_spread` (q, 2) of each."""
+    chain, row, column, spread = squares
     parts: list[Beams] = []
     unresolved = variance = 0.0
     finest = max(1, size // _DIVISIONS)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mitsim.capture.losses import known_losses
@@ -182,13 +183,22 @@ def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
     assert matt.unfit.instances is None and not matt.mirrors and matt.glossy
 
 
-FLAT = '<texture type="bitmap" name="{}"><string name="filename" value="small_projector.png"/></texture>'
-BUMPS = {"normalmap": FLAT.format("normalmap"), "bumpmap": FLAT.format("arbitrary")}
+FLAT = '<texture type="bitmap" name="{}"><string name="filename" value="flat.png"/></texture>'
+BUMPS = {"normalmap": FLAT.format("normalmap"), "bumpmap": FLAT.format("arbitrary").replace("flat", "small_projector")}
 HOLE = '<bsdf type="mask"><float name="opacity" value="0.3"/>{}</bsdf>'
 MATT = '<bsdf type="diffuse"/>'
 BLEND = f'<bsdf type="blendbsdf"><float name="weight" value="0.5"/>{HOLE.format(MATT)}{MATT}</bsdf>'
 
 
+@pytest.fixture
+def flat(small_scene: Write) -> None:
+    """A picture of a surface without bumps, beside the scene."""
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((4, 4, 3), 128, np.uint8)).write(str(small_scene().parent / "flat.png"))
+
+
+@pytest.mark.usefixtures("flat")
 @pytest.mark.parametrize("bumps", BUMPS)
 @pytest.mark.parametrize(
     ("inner", "at_fault"),
@@ -217,6 +227,7 @@ def test_what_light_passes_is_not_hidden_under_bumps(small_scene: Write, bumps: 
     open_bench(small_scene(extra=f'<shape type="disk">{turned}{BEHIND}', **VOLPATH), "llvm_ad_mono")
 
 
+@pytest.mark.usefixtures("flat")
 def test_hidden_holes_that_no_shape_has_are_no_matter(small_scene: Write) -> None:
     extra = f'<bsdf type="normalmap" id="unused">{BUMPS["normalmap"]}{HOLE.format(MATT)}</bsdf>'
     open_bench(small_scene(extra=extra), "llvm_ad_mono")
