@@ -350,7 +350,8 @@ def render(
             payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
-        f"{payload['seconds']:.2f} s: {payload['output']}"
+        f"{payload['seconds']:.2f} s: {payload['output']}",
+        *payload["notes"],
     ]
     return finish(as_json, payload, lines, frame.warnings)
 

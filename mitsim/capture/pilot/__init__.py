@@ -229,6 +229,16 @@ class Look:
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
+    def _unsure_glint(self, other: float) -> float:
+        """Part of all light that comes over mirrors alone and is in no frame, or may be in the wrong pixels.
+
+        ``other``: irradiance of all other light [W m^-2].
+        """
+        if not self.bench.loaded.mirrors:
+            return 0.0
+        found, unsure = self.bench.glint.irradiance(self.bench.geometry)
+        return unsure / (other + found + unsure) if unsure else 0.0
+
     @cached_property
     def evidence(self) -> Evidence:
         """What has been found."""
@@ -258,6 +268,7 @@ class Look:
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
+            glint=self._unsure_glint(found),
             mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
