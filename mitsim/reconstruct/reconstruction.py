@@ -133,6 +133,8 @@ def reconstruct(
         inputs=asked,
         focus=depth,
         predicted=cost,
+        objective=getattr(solution, "objective", None),
+        relative_gap=getattr(solution, "relative_gap", None),
     )
 
 
