@@ -49,8 +49,8 @@ _SQUARES = ("row_noise", "dsnu", "prnu")
 """Figures that are found as variances, which may be below zero, and shown as their roots."""
 _BIASED, _MISLEADS = 0.5, 1.0
 """Standard errors by which the procedure's own bias by the ADC moves a figure, from which it is held against what is
-expected of it, and from which it is flagged: with less, nineteen of twenty found figures are still within three standard
-errors of the value set, and more."""
+expected of it, and from which it is flagged: with less, 98 of 100 found figures are still within three standard errors
+of the value set."""
 _DITHERED = 0.8
 """Noise of reading [DN] below which rounding is named as the cause: above, it is white to 1e-5."""
 _CUT = 1e-3
