@@ -109,7 +109,7 @@ def reconstruct(
     if beside:
         image = beside.inside(image)
         uncertainties = uncertainties and Uncertainty(
-            {name: beside.inside(values) for name, values in uncertainties.sources.items()}
+            {name: beside.inside(values) for name, values in uncertainties.sources.items()}, uncertainties.bias_factor
         )
     return Reconstruction(
         image=image,
