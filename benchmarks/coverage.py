@@ -149,7 +149,7 @@ def closed_form(result: Path, seeds: int, families: list[str], fractions: list[f
         """A mask (1 + m m^T) / 2, whose constant term is centred away."""
 
         def light(self, shown: np.ndarray) -> np.ndarray:
-            return (shown.sum() * self.left.mean() ** 2 + super().light(shown)) / 2
+            return (shown.sum() * np.abs(self.left).max() ** 2 + super().light(shown)) / 2
 
         def calibrated(self, seed: int, error: float = 2e-3) -> Factors:
             found = super().calibrated(seed, error)

@@ -34,8 +34,10 @@ those with which most images are covered to 90 % without the stated uncertainty 
 uniform light, dots:4, dots:7 and hadamard:4, at 0.003 to 0.05 of the full well (docs/physics.md, uncertainty)."""
 _CERTAIN = 100.0
 """Data of a group that count in full; more only tell how far a scene is from stationary, a tenth in amplitude."""
-_MEAN_VARIANCE = 25.0
-"""Variance of the logarithm of the squared mean, about that of the image: as good as unknown."""
+_GREY, _GREY_VARIANCE = 0.35, 1.0
+"""Mean reflectance of a scene before it is seen, and the variance of the logarithm of its square: 0.2 to 0.6 within one
+standard deviation. Where lambda takes even the mean away (a FlatCam without its constant term, little light) the image
+is black, and this is all that is known."""
 _STEPS, _STILL = 60, 1e-4
 """Most steps of Newton's method, and the log-likelihood below which a step ends it: 10 to 30 are taken."""
 _FARTHEST = 3.0
@@ -101,9 +103,9 @@ def scene_spectrum(
     fall = np.exp2(_FALL * place)
     pixels, bright = octaves[0].size, max(abs(mean), 1e-300)
     contrast = np.square(_CONTRAST * bright) * pixels / float(fall @ octaves[1:].sum(axis=(1, 2)))
-    usual = np.log(np.concatenate([[pixels * bright**2], fall * contrast]))
+    usual = np.log(np.concatenate([[pixels * _GREY**2], fall * contrast]))
     spread = np.zeros((len(usual), len(usual)))
-    spread[0, 0] = _MEAN_VARIANCE
+    spread[0, 0] = _GREY_VARIANCE
     spread[1:, 1:] = _DEPARTURE**2 * np.exp(-np.abs(place[:, None] - place) / _MEMORY)
     return Spectrum(*_likeliest(told, counts, found, usual, np.asarray(np.linalg.inv(spread), np.float64)), shares)
 
