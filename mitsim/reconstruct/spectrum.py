@@ -65,6 +65,11 @@ class Spectrum:
         """(r, r') mean square of each coefficient."""
         return np.asarray(np.tensordot(np.exp(self.log_power), self.shares, axes=1))
 
+    @property
+    def of_mean(self) -> FloatArray:
+        """(r, r') the part of :attr:`energy` that is the image's mean."""
+        return np.asarray(np.exp(self.log_power[0]) * self.shares[0])
+
     def spread(self, weights: FloatArray) -> float:
         """Variance of the logarithm of the sum of all coefficients' mean squares times ``weights`` (r, r')."""
         parts = np.exp(self.log_power) * np.tensordot(self.shares, weights, axes=2)

@@ -222,8 +222,8 @@ class Propagation:
         """(n, n') mean square of what lambda takes away of the image of a ``problem``, whose data have the stated
         ``variance`` where no more data than unknowns tell it; and the factor, either way, that its root is known to.
 
-        A coefficient's mean square is told by its datum and by the scene's spectrum, each as well as it knows. Detail
-        is lost where there is detail: its place is told by what lambda would take away of the image itself.
+        A coefficient's mean square is told by its datum and by the scene's spectrum, each as well as it knows. A mean
+        is lost everywhere, detail where there is detail: its place is told by what lambda would take away of the image.
         """
         told_by_data = problem.data_count > np.count_nonzero(problem.sigma)
         noise = coefficient_noise(problem) if told_by_data else variance
@@ -243,10 +243,13 @@ class Propagation:
         energy = spectrum.energy * np.exp(_CAUTION * spread)
         part = seen_part(energy)
         told = np.divide(part * problem.projected, self._sigma, out=np.zeros_like(power), where=power > 0)
-        everywhere = self._seen(np.square(lost) * (np.square(told) + energy * (1 - part)))
+        squares = np.square(lost) * (np.square(told) + energy * (1 - part))
+        of_mean = np.square(lost) * (1 - part) * spectrum.of_mean * np.exp(_CAUTION * spread)
+        even, detail = self._seen(of_mean), self._seen(squares - of_mean)
         seen = np.square(self.model.prepared.image(lost * estimate))
         near = gaussian_filter(seen, _NEAR, mode="nearest")
-        return everywhere * near / near.mean() if near.any() else everywhere, float(np.exp(np.sqrt(spread) / 2))
+        placed = detail * near / near.mean() if near.any() else detail
+        return even + placed, float(np.exp(np.sqrt(spread) / 2))
 
     def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, n') variances of an ``image`` by ``noise`` of the left factor, and of the right one."""

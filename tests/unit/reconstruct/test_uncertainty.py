@@ -233,6 +233,20 @@ def test_what_lambda_takes_away() -> None:
     assert not Propagation(sums.model, 0.0).of_regularisation(problem, 0.0)[0].any()
 
 
+@pytest.mark.parametrize(("patterns", "peak"), [("hadamard:4", 80.0), ("hadamard:4", 500.0), ("uniform", 80.0)])
+def test_little_light_is_neither_covered_badly_nor_overstated(patterns: str, peak: float) -> None:
+    """64 x 64 pixels and 80 electrons, so that lambda takes most detail: stated are 0.6 to 2 times the error, and 90 %
+    are inside. (A power law of the coefficients' rank: 2.6, 1.6 and 6.3 times the error.)"""
+    side = shadow(n=64)
+    seen = Bench(side, side, peak=peak)
+    truth = picture(1, 64)
+    image = reconstruct(seen.run(patterns, truth, 1), seen.calibrated(1))
+    assert image.uncertainty is not None
+    error = image.image - truth
+    ratio = np.sqrt(np.square(image.uncertainty).mean() / np.square(error).mean())
+    assert 0.6 < ratio < 2 and np.mean(np.abs(error) < 1.96 * image.uncertainty) > 0.9
+
+
 def test_what_lambda_takes_away_of_as_many_data_as_unknowns() -> None:
     """8 x 8 pixels under 2 x 2 patterns leave no data to tell the noise: the mean of the frames' stated variance is
     taken; their sum would change the answer by percents. (Planted: their sum.)"""
