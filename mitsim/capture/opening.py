@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mitsim.capture.bench import Bench
+from mitsim.core.arguments import checked
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
@@ -65,6 +66,7 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
     return first, second
 
 
+@checked
 def open_bench(
     scene: Path | str,
     variant: str = DEFAULT_VARIANT,
@@ -121,7 +123,8 @@ def open_bench(
         try:
             sensor.efficiency(light.effective_wavelength_nm)
         except MitsimError as error:
-            raise MitsimError(f"camera {sensor_path}: {error}") from None
+            pitch = f"{sensor.superpixel_pitch_um * 1e-3:g}"
+            raise MitsimError(f"camera {sensor_path}: {error}; its scene has a pixel_pitch of {pitch} mm") from None
     # Only now, with all else checked: the renderer takes a second to import.
     loaded = _loaded(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
     row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning

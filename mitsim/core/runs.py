@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify
@@ -227,6 +228,7 @@ class Capture:
             **{name: getattr(manifest, name) for name in known},
         }
 
+    @checked
     def save(self, folder: Path | str) -> Path:
         """Write the RUN folder that `mitsim capture` writes, to a new or empty ``folder``; returns it.
 
@@ -290,6 +292,7 @@ class Capture:
         return stack
 
 
+@checked
 def load_run(folder: Path | str) -> Capture:
     """The capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
     return Capture(read_manifest(Path(folder), RunManifest), Path(folder))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
@@ -39,6 +40,7 @@ _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "satur
 percent, level and end are settings, true to a digital number."""
 
 
+@checked
 def calibrate_frames(
     folder: Path | str | SessionFrames,
     output: Path | str | None = None,

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Measurement
 from mitsim.core.parallel import single_threaded_blas
@@ -35,6 +36,7 @@ from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
 
 @single_threaded_blas()
+@checked
 def reconstruct(
     shots: Capture,
     factors: Factors,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
@@ -135,6 +136,7 @@ class Reconstruction:
             "predicted_memory_bytes": self.predicted and self.predicted.memory_bytes,
         }
 
+    @checked
     def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:
         """Write image.exr, image.png (for display), result.json, and where known uncertainty.exr and depth.exr.
 
@@ -155,6 +157,7 @@ class Reconstruction:
         with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
             return self.write(place, more)
 
+    @checked
     def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`); ``more``
         are further entries of result.json."""

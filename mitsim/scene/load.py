@@ -31,7 +31,8 @@ class LoadedScene:
     whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
     estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
     several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
-    differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way.
+    differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
+    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class LoadedScene:
     small_lamps: tuple[tuple[mi.Emitter, Tag], ...]
     coloured: tuple[Tag, ...]
     parting: tuple[Tag, ...] = ()
+    samples: int | None = None
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -78,7 +80,7 @@ def load_scene(
     MitsimError
         one line that names the file for anything wrong with it.
     """
-    checked = check_file(path, defines or {}, outside)
+    checked = check_file(path, defines or {}, outside, mi.variant())
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
@@ -108,7 +110,15 @@ def load_scene(
     shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
     lit = tuple(zip(small, checked.small_lamps, strict=True))
-    facts = *_polished(scene, checked.unfit), checked.unfit, shapes, lit, checked.coloured, checked.parting
+    facts = (
+        *_polished(scene, checked.unfit),
+        checked.unfit,
+        shapes,
+        lit,
+        checked.coloured,
+        checked.parting,
+        checked.samples,
+    )
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
     lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")

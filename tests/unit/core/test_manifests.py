@@ -112,7 +112,10 @@ def test_a_reader_takes_every_camera_that_a_writer_takes(field: str) -> None:
 
 def test_patterns_that_no_reader_takes_are_refused_before_work() -> None:
     """257 x 257 dots, or a projector of 5000 pixels, made a RUN folder that `reconstruct` refused."""
-    family = parse_patterns("dots:257", 300)
+    with pytest.raises(MitsimError, match=rf"patterns 'dots:257': are 66049 shots; a run has at most {MOST_SHOTS}"):
+        parse_patterns("dots:257", 300)
+    dots = np.eye(300, 257, dtype=np.int8)
+    family = PatternFamily("dots:257", dots, dots)
     with pytest.raises(MitsimError, match=rf"patterns 'dots:257': captures: .* at most {MOST_SHOTS}"):
         Patterns.of(family, ["a.exr"] * 257**2)
     row = np.ones((MOST_PIXELS + 1, 1), dtype=np.int8)
