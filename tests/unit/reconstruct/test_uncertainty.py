@@ -183,9 +183,6 @@ def stationary(n: int, fall: float, seed: int) -> np.ndarray:
 def test_the_spectrum_tells_the_energy_of_what_is_not_seen(patterns: str, fall: float) -> None:
     """32 x 32 pixels, noise over half of the coefficients: what the image without the coefficients below the
     noise lacks is known to a factor of 1.5 in amplitude in the mean of six scenes, beside what is said in each.
-
-    (Planted: the fall of what is usual by 2 more; squares of the basis for those of its dual; noise of twice the
-    variance.)
     """
     patterns, _, prior = patterns.partition(" ")
     family, side = parse_patterns(patterns, 32, 0), shadow(n=32)
