@@ -123,7 +123,7 @@ def reconstruct(
     if beside:
         image = beside.inside(image)
         uncertainties = uncertainties and Uncertainty(
-            {name: beside.inside(values) for name, values in uncertainties.sources.items()}
+            {name: beside.inside(values) for name, values in uncertainties.sources.items()}, uncertainties.bias_factor
         )
     return Reconstruction(
         image=image,
@@ -147,6 +147,8 @@ def reconstruct(
         inputs=asked,
         focus=depth,
         predicted=cost,
+        objective=getattr(solution, "objective", None),
+        relative_gap=getattr(solution, "relative_gap", None),
     )
 
 
