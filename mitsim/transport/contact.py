@@ -79,14 +79,17 @@ def _gaps(shape: mi.Shape, others: Sequence[mi.Shape]) -> tuple[FloatArray, Floa
     rng = generator(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
     sample = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
     size = 1 + dr.max(dr.abs(sample.p))
+    # A disk in its own plane has one normal for all points. Of a single direction for many rays Dr.Jit 1.5.0 writes a
+    # kernel that LLVM cannot parse, and ends the process.
+    normal = mi.Vector3f(sample.n) + 0 * sample.p
     gap = mi.Float(dr.inf)
     for sign in (1, -1):
-        direction = mi.Vector3f(sample.n) * sign
+        direction = normal * sign
         for among, first in scenes:
             ray = mi.Ray3f(sample.p + direction * (first * size), direction)
             ray.maxt = (_MITSUBA - first) * size
             met = among.ray_intersect(ray)
-            parallel = met.is_valid() & (dr.abs(dr.dot(met.n, sample.n)) > _PARALLEL)
+            parallel = met.is_valid() & (dr.abs(dr.dot(met.n, normal)) > _PARALLEL)
             gap = dr.minimum(gap, dr.select(parallel, dr.abs(met.t + first * size), dr.inf))
     dr.eval(gap, size)
     return np.array(gap, dtype=np.float64), np.array(size, dtype=np.float64)
