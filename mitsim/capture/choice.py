@@ -402,7 +402,9 @@ class _Table:
         forming, left = self.evidence.forming, np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
         margin = _MARGIN if tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
         target = np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * self.accuracy)
-        return target if math.isinf(self.evidence.hits) else target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
+        return (
+            target if math.isinf(self.evidence.hits) else target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
+        )
 
     @cached_property
     def _prices(self) -> dict[str, FloatArray]:

@@ -1,4 +1,4 @@
-"""Cards smaller than a projector pixel against the closed form: few rays meet them, so they are counted, not assumed.
+"""Cards smaller than a projector pixel against the closed form: few rays meet them, and their number tells the error.
 
 The projector lights a plane at z with pi * scale / z^2 all over its window; a card of area A and albedo rho on the axis
 sends rho / pi of that, times A cos / z^2, to the sensor.
@@ -33,7 +33,7 @@ def card(width: float, height: float, x: float = 0.0, y: float = 0.0, turned: fl
     faces = math.cos(off + towards) / math.cos(towards)
     at_camera = (1 + (x * x + y * y) / Z**2) ** -2
     xml = f"""<shape type="rectangle"><transform name="to_world"><scale x="{width / 2}" y="{height / 2}"/>
-    <rotate y="1" angle="{180 - turned}"/> <translate x="{x}" y="{y}" z="{Z}"/></transform>
+    <rotate y="1" angle="{180 + turned}"/> <translate x="{x}" y="{y}" z="{Z}"/></transform>
     <bsdf type="diffuse"><spectrum name="reflectance" value="{ALBEDO}"/></bsdf></shape>"""
     return xml, PER_AREA * width * height * math.cos(off) * faces * at_camera
 
@@ -59,8 +59,44 @@ def scene(small_scene: Callable[..., Path], *cards: tuple[str, float], behind: s
     return path, sum(each for _, each in cards)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_card_of_a_millimetre(small_scene: Callable[..., Path], variant: str, seed: int) -> None:
-    error, bound = off(*scene(small_scene, card(0.5, 0.5, 2, -3)), seed)
-    print(error, bound)
+@pytest.mark.parametrize(
+    ("side", "place", "seed"), [(0.7, (1, 2), 2), pytest.param(0.36, (1, 1), 0, marks=pytest.mark.slow)]
+)
+def test_a_card_that_few_rays_meet(
+    small_scene: Callable[..., Path], variant: str, side: float, place: tuple[int, int], seed: int
+) -> None:
+    """Where the pilot's looks meet it equally often, as the first, and where groups hardly differ.
+
+    (Planted: no count of hits. The first card came out black with an error of 2.8e-6 stated, the second 2.4e-2 off
+    where 2.0e-2 was stated.)
+    """
+    error, bound = off(*scene(small_scene, card(side, side, *place)), seed, 3e-2)
     assert error < bound
+
+
+def test_a_card_that_no_look_can_count_on_is_refused(small_scene: Callable[..., Path], variant: str) -> None:
+    with pytest.raises(MitsimError, match="too small for the projector's light: all that it lights fills"):
+        off(*scene(small_scene, card(0.2, 0.2, 1, 1)), 0)
+
+
+CARDS = {
+    "one": [card(0.5, 0.5, 2, -3)],
+    "two": [card(0.6, 0.6, -20, 5), card(0.9, 0.5, 17, -12)],
+    "turned": [card(1.2, 0.8, turned=50)],
+    "rod": [card(0.1, 9, 3, 2)],
+    "before black": [card(0.7, 0.7, 3, 3)],
+}
+
+
+@pytest.mark.slow
+def test_cards_are_within_what_is_stated(small_scene: Callable[..., Path], variant: str) -> None:
+    """Twenty runs at 1e-2: each within it, and all but two at most within their bound (95 %: three or more beyond it in
+    one of 13 such tests, and seeds are fixed)."""
+    beyond = []
+    for name, cards in CARDS.items():
+        for seed in range(4):
+            error, bound = off(*scene(small_scene, *cards, behind=BLACK if name == "before black" else ""), seed)
+            assert error < 1e-2, (name, seed)
+            beyond += [(name, seed, error, bound)] if error > bound else []
+    print(beyond)
+    assert len(beyond) <= 2, beyond
