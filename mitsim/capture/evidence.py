@@ -359,6 +359,8 @@ class Evidence:
         what is followed takes at several anchors beyond its mean, from either side (paths: to one of them).
     raster
         what a shadow on a raster leaves of the frames, without diffraction and with it (:class:`Drawn`).
+    hits
+        rays that bring all direct light if each projector pixel sends one, where these are few; else infinite.
     """
 
     depth: float
@@ -385,6 +387,7 @@ class Evidence:
     occluded: tuple[int, ...] = ()
     occluded_light: Effort = field(default_factory=lambda: Effort.none())
     raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
+    hits: float = math.inf
 
     def forms(self, waves: bool) -> tuple[int, ...]:
         """Raster cells along a pixel that frames may be formed of, 0 for a sum of terms; with ``waves`` or not."""

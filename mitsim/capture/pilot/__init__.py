@@ -23,6 +23,7 @@ from mitsim.capture.pilot.sharp import sharp_pixels
 from mitsim.capture.pilot.switched import SwitchedEffects
 from mitsim.capture.prices import FIXED, Numbers, forming_seconds
 from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
@@ -118,9 +119,10 @@ class Look:
         own = integer(seed, "pilot", "sharp")
         apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
         self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
-        sample = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+        sample, self._hits = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors), math.inf
         if not bench.loaded.mirrors and not self._sharp.irradiance:
             sample = _enough(sample, hits, bench)
+            self._hits = hits if hits < _FEWEST_HITS else math.inf
         self.samples = dict.fromkeys(STAGES, sample)
         self.occluded: OccludedLight | None = None
         for stage in STAGES:
@@ -278,6 +280,7 @@ class Look:
             occluded=self._base.occluded,
             occluded_light=self.occluded.effort(light) if self.occluded else Effort.none(),
             raster=self._raster,
+            hits=self._hits,
         )
 
 
@@ -335,15 +338,16 @@ def _left_out(simulation: Simulation, seed: int) -> LeftOut:
 
 
 def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float, float]:
-    """Where light is seen, 1 / mean(1/z) [mm], how much of it, and how many rays bring some if each pixel sends one.
+    """Where light is seen, 1 / mean(1/z) [mm], how much of it, and how many rays bring it if each pixel sends one.
 
-    From one ray of each projector pixel, or, where hardly one meets what the camera sees, from more.
+    From one ray of each projector pixel, or, where hardly one meets what the camera sees, from more. Rays count by
+    their light, as so many equal ones.
     """
     bench, own = simulation.bench, integer(seed, "pilot", "depth")
     enough = min(_FEWEST_HITS, simulation.bench.n**2 / 4)
     first, samples = 0, 1
     deposits = simulation.direct.trace(own)
-    while len(deposits.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
+    while _equal(deposits.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
         if _MORE * (first + samples) * bench.n**2 > _MOST_RAYS:
             break
         first, samples = first + samples, (_MORE - 1) * (first + samples)
@@ -363,4 +367,10 @@ def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[
     # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.
     flat = abs(mean * bench.geometry.scene_distance - 1) < _ALIGNED
     depth = bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean
-    return depth, total, np.count_nonzero(deposits.value) / samples
+    return depth, total, _equal(deposits.value) / samples
+
+
+def _equal(values: FloatArray) -> float:
+    """How many equal ``values`` would scatter as much about their sum as these."""
+    squares = float(np.square(values, dtype=np.float64).sum())
+    return float(values.sum(dtype=np.float64)) ** 2 / squares if squares else 0.0
