@@ -149,7 +149,8 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
     """``noise`` (r, r') of a ``problem``, raised by the part of it that both halves of the sensor agree on.
 
     By octaves of sigma: what little exceeds the noise stands, at small sigma, for a scene of any brightness. Where that
-    is brighter than the mean of all octaves before, there is noise alone, there and in all octaves beyond.
+    is brighter than the mean of all octaves before, there is noise alone, there and in all octaves beyond; unless one
+    of these is clearly seen, as the brightness is behind a mask whose constant term is centred away.
     """
     measured = problem.sigma > 0
     sigma, found = problem.sigma[measured], noise[measured]
@@ -162,7 +163,9 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
     power = np.divide(np.maximum(data - level, 0.0), square, out=np.zeros_like(square), where=square > 0)
     before = np.cumsum(sizes * power) / np.cumsum(sizes)
     faint = (data < _FAINT * level) & (sizes >= _FEWEST)
+    clear = np.flatnonzero((data >= _FAINT * level) & (sizes >= _FEWEST))
     doubtful = faint[1:] & (power[1:] > before[:-1])
+    doubtful[: clear.max(initial=0)] = False
     if not doubtful.any():
         return noise
     beyond = octave > int(np.argmax(doubtful))

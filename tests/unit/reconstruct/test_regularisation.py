@@ -190,6 +190,16 @@ def test_noise_is_found_behind_an_octave_without_data():
     np.testing.assert_allclose(coefficient_noise(problem), np.where(sigma == 1, 1.0, 1.9))
 
 
+def test_a_faint_octave_before_one_that_is_seen_is_no_noise():
+    """Data of 1.2, 1.9 and 12 times the noise, octave by octave: a centred mask in little light, whose small sigma hold
+    the brightness. (Planted: noise beyond the second octave, which made such images black.)"""
+    sigma = np.concatenate([np.ones(64), np.full(64, 0.4), np.full(64, 0.2)]).reshape(12, 16)
+    data = np.sqrt(np.select([sigma == 1, sigma == 0.4], [1.2, 1.9], 12.0))
+    halves = SimpleNamespace(typical=1.0, excess=np.zeros(sigma.shape))
+    problem = DiagonalProblem(sigma, data, float(np.square(data).sum()) + 1000.0, 1192, halves)
+    np.testing.assert_allclose(coefficient_noise(problem), 1.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("patterns", ["uniform", "dots:2"])
 def test_a_mask_near_the_sensor_leaves_an_image(patterns):
