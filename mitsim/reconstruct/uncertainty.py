@@ -118,8 +118,8 @@ class Uncertainty:
             return ""
         return (
             f"Lambda takes away more of the image ({lost:.1e} rms of reflectance, as the uncertainty has it) than it "
-            f"leaves ({left:.1e}), so what is dark may be lost, not dark; expose longer, take more patterns or shots, or "
-            "give a smaller lambda."
+            f"leaves ({left:.1e}), so what is dark may be lost; expose longer, take more patterns or shots, or give a "
+            "smaller lambda."
         )
 
     def __str__(self) -> str:
