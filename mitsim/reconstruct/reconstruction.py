@@ -118,13 +118,14 @@ def reconstruct(
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status
-    flags = (*status.flags, *((depth.doubt,) if depth and depth.doubt else ()), *_flags(shots, factors))
     image = solution.image
     if beside:
         image = beside.inside(image)
         uncertainties = uncertainties and Uncertainty(
             {name: beside.inside(values) for name, values in uncertainties.sources.items()}, uncertainties.bias_factor
         )
+    doubts = (depth.doubt if depth else "", uncertainties.loss(image) if uncertainties else "")
+    flags = (*status.flags, *(doubt for doubt in doubts if doubt), *_flags(shots, factors))
     return Reconstruction(
         image=image,
         lam=solution.lam,

@@ -111,6 +111,17 @@ class Uncertainty:
         lost = self.budget.get("regularisation_bias", 0.0)
         return self.bias_factor > _EXTRAPOLATED and 2 * lost**2 > _rms(self.total) ** 2
 
+    def loss(self, image: FloatArray) -> str:
+        """A sentence where lambda takes away more of an ``image`` (n, n') than it leaves; otherwise empty."""
+        lost, left = self.budget.get("regularisation_bias", 0.0), _rms(image)
+        if lost <= left:
+            return ""
+        return (
+            f"Lambda takes away more of the image ({lost:.1e} rms of reflectance, as the uncertainty has it) than it "
+            f"leaves ({left:.1e}), so what is dark may be lost; expose longer, take more patterns or shots, or give a "
+            "smaller lambda."
+        )
+
     def __str__(self) -> str:
         parts = sorted(((value, name) for name, value in self.budget.items() if value), reverse=True)
         by_source = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for value, name in parts)

@@ -244,6 +244,20 @@ def test_little_light_is_neither_covered_badly_nor_overstated(patterns: str, pea
     assert 0.6 < ratio < 2 and np.mean(np.abs(error) < 1.96 * image.uncertainty) > 0.9
 
 
+@pytest.mark.parametrize(("lam", "lost"), [("auto", False), (1e3, True)])
+def test_an_image_of_which_lambda_takes_most_is_flagged(lam: float, lost: bool) -> None:
+    """80 electrons and 64 Hadamard patterns: dim, but an image, unless lambda is a thousand times the largest sigma^2.
+    (Planted: never flagged; flagged from a tenth of what is left.)"""
+    side = shadow(n=32)
+    seen = Bench(side, side, peak=80.0)
+    shots, factors = seen.run("hadamard:4", picture(1, 32), 1), seen.calibrated(1)
+    sums = accumulated(shots, factors)
+    lam = lam if isinstance(lam, str) else lam * sums.prepared.problem(sums.frames).scale
+    image = reconstruct(shots, factors, lam)
+    assert ("Lambda takes away more" in str(image.status)) is lost
+    assert image.ok is not lost
+
+
 def test_what_lambda_takes_away_of_as_many_data_as_unknowns() -> None:
     """8 x 8 pixels under 2 x 2 patterns leave no data to tell the noise: the mean of the frames' stated variance is
     taken; their sum would change the answer by percents. (Planted: their sum.)"""
