@@ -152,7 +152,7 @@ def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
     simulation = Simulation(bench, chosen.settings)
     timed = _timed(evidence, simulation, look.lighting.labels, look.seed)
     plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
-    if simulation.from_camera is None or not bench.loaded.glossy:
+    if simulation.from_camera is None or evidence.sharp is None:
         return plan
     more = _of_heavy_paths(look, accuracy, timed, chosen.settings, switches)
     return plan.taking(transport=plan.predicted["transport"] + more) if more else plan

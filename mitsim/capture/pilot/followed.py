@@ -99,7 +99,7 @@ class FollowedLight:
         return indirect, camera
 
     def with_more(self, light: float, samples: int) -> Effort:
-        """That of what is followed from the camera, by looks of so many ``samples`` of their own; ``light`` as there."""
+        """That of what is followed from the camera, by looks of so many ``samples``; ``light`` as for those."""
         simulation = self._simulation(followed_anchors=_FEW_ANCHORS)
         tracer = simulation.at_anchors[1]
         if tracer is None or not self.changes or not light:
