@@ -46,6 +46,10 @@ ten glossy balls of alpha 0.02 need a million to tell their noise to a factor of
 _HEAVIER = 1.25
 """Tracing that takes so many times as long as planned is told; less is what predictions are good to."""
 
+_STOPPED_LATE = 1.5
+"""Samples that heavy paths take over those that their noise asks for: sampling stops by a bound that lies further above
+it than that of light paths, and rounds overshoot (the glossy balls: 1.1, 1.7 and 2.1 by three seeds of looks)."""
+
 _FIELDS = MappingProxyType(
     {
         "sharp": "sharp_light",
@@ -152,6 +156,9 @@ def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
     simulation = Simulation(bench, chosen.settings)
     timed = _timed(evidence, simulation, look.lighting.labels, look.seed)
     plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
+    if simulation.physics.mirrors:
+        # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
+        plan = plan.taking(optics=plan.predicted["optics"] + bench.glint.seconds)
     if simulation.from_camera is None or evidence.sharp is None:
         return plan
     more = _of_heavy_paths(look, accuracy, timed, chosen.settings, switches)
@@ -182,7 +189,7 @@ def _of_heavy_paths(
         if needed <= max(_HEAVIER * already, before):
             break
         paths *= _MORE
-    return max(needed - already, 0.0) if needed > _HEAVIER * already else 0.0
+    return _STOPPED_LATE * needed - already if needed > _HEAVIER * already else 0.0
 
 
 def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
