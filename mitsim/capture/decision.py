@@ -215,9 +215,9 @@ class _Words:
         kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
         among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         rule = (
-            f"{self.evidence.glint:.2g} of the light comes over the scene's mirrors and curved glass alone ({among}; this "
-            "is the first), in beams too fine to be placed on the sensor: it is left out, or in the wrong pixels; use "
-            " fewer or larger ones, move them apart, or make them rough"
+            f"{self.evidence.glint:.2g} of the light comes over the scene's mirrors and curved glass alone ({among}; "
+            "this is the first), in beams too fine to be placed on the sensor: it is left out, or in the wrong pixels; "
+            "use fewer or larger ones, move them apart, or make them rough"
         )
         return str(mirrors[0].refusal("shape", repr(mirrors[0].attributes.get("type", "")), rule))
 
