@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 import numpy as np
 
@@ -18,10 +19,18 @@ _KEPT = 4
 
 
 class Glint:
-    """Frames made from ``beams``; the last few are kept, because forming them takes as long as tracing does."""
+    """Frames made from ``beams``; the last few are kept, because forming them takes as long as tracing does.
+
+    Attributes
+    ----------
+    beams
+        of the scene.
+    seconds
+        that forming frames of all of them took last; 0 before.
+    """
 
     def __init__(self, beams: Beams) -> None:
-        self.beams = beams
+        self.beams, self.seconds = beams, 0.0
         self._frames: dict[tuple[bytes, CameraGeometry, Spectrum | None], ClassFrames] = {}
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
@@ -61,7 +70,10 @@ class Glint:
         return float(beams.delivered[met].sum()) / area / pixels, unsure / area / pixels
 
     def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
-        return glint_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
+        started = time.perf_counter()
+        found = glint_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
+        self.seconds = time.perf_counter() - started
+        return found
 
     def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SeparableTerm]:
         """The mask for a virtual source at the beams' mean depth and direction."""
