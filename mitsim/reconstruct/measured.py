@@ -23,9 +23,10 @@ from mitsim.core.output import output_folder
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.resources import workers
 from mitsim.core.versions import versions
-from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
+from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.ladder import Chosen, Ladder
+from mitsim.reconstruct.session_faults import Checked, checked
 from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.rig.order import SIDES, UNIFORM, Half, Side
@@ -37,6 +38,8 @@ _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
 """What both state, and from which relative and absolute difference they contradict: published gains are good to a few
 percent, level and end are settings, true to a digital number."""
+_CLIPPED = 2e-3
+"""Part of a frame's pixels at its largest number that are no chance: of noisy ones a few are."""
 
 
 def calibrate_frames(
@@ -111,7 +114,7 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
     _check_sizes(session)
     readings = _Readings(session)
     for side, index in chosen:
-        rate, variance = readings.response(side, index)
+        rate, variance, _ = readings.response(side, index)
         if readings.saturated:
             raise MitsimError(
                 f"frames {session.folder}: {min(readings.saturated)} has pixels at the full well or the ADC's end; "
@@ -123,8 +126,9 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
 def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
     listed = session.listed
     readings = _Readings(session)
-    estimate, noise = _estimate(readings, job)
+    estimate, noise, found = _estimate(readings, job)
     warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
+    warnings += found.warnings(session.frame_name)
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
@@ -140,6 +144,8 @@ def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) 
         "phi_error": None,
         "predicted_phi_error": error,
         "response_noise": noise,
+        "faults": found.listed(session.frame_name),
+        "lamp": found.lamp.listed(),
         "condition": estimate.condition,
         "exposure_s": listed.digital.exposure_s,
         "saturated_frames": len(readings.saturated),
@@ -228,8 +234,9 @@ class _Readings:
     session: SessionFrames
     saturated: set[str] = field(default_factory=set)
 
-    def response(self, side: Side, index: int) -> tuple[FloatArray, float]:
-        """Response (rows, columns) to a +-1 pattern [electrons/s], and its mean noise variance.
+    def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
+        """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
+        frames (rows, columns); None where it is not their difference.
 
         Parameters
         ----------
@@ -240,7 +247,7 @@ class _Readings:
         if self.session.pairs:
             negative = self._merged((side, index, -1))
             light = positive.rate + negative.rate
-            return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots
+            return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots, light
         uniform = self._uniform[side]
         response = 2 * positive.rate - uniform.rate
         variance = 4 * positive.variance + uniform.variance
@@ -254,7 +261,7 @@ class _Readings:
                 dark = self._dark_of[side][exposure]
                 response -= weight * dark.rate
                 variance += weight**2 * dark.variance
-        return response, variance
+        return response, variance, None
 
     @cached_property
     def _uniform(self) -> dict[Side, _Reading]:
@@ -292,6 +299,15 @@ class _Readings:
             for side, ladder in self._ladders.items()
         }
 
+    def clipped(self, half: Half) -> bool:
+        """Whether many pixels of a frame share its largest number."""
+        for exposure in range(len(self.session.listed.exposure_ladder)):
+            for frame in self.session.repeated(half, exposure):
+                values = read_image(self.session.folder / frame.file, self.session.wanted)
+                if np.count_nonzero(values == values.max()) > _CLIPPED * values.size:
+                    return True
+        return False
+
     def _merged(self, half: Half) -> _Reading:
         """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
@@ -318,21 +334,48 @@ class _Readings:
 
 
 @single_threaded_blas()
-def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None]:
-    """Factors, and the rms noise of the responses [electrons/s] where the list states the sensor's."""
+def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Checked]:
+    """Factors, the rms noise of the responses [electrons/s] where the list states the sensor's, and which frames are
+    wrong."""
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
-    count = signs.shape[1]
+    sums, variances = _sums(readings, signs.shape[1], job)
+    found = checked(sums, signs, session.order, readings.clipped)
+    if wrong := found.wrong_uniform():
+        sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
+        found = checked(sums, signs, session.order, readings.clipped)
+    noise = float(np.sqrt(np.mean(variances))) if session.listed.digital.noise_is_stated else None
+    with job.clock.stage("estimate"):
+        return found.estimate(signs, noise), noise, found
+
+
+def _sums(
+    readings: _Readings, count: int, job: Job, uniform: Side | None = None
+) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
+    """Sums over all responses, and the noise variance of each.
+
+    Parameters
+    ----------
+    readings, job
+        as for :func:`_estimate`.
+    count
+        patterns of a side.
+    uniform
+        the side whose first response is the uniform one; None: the mean of both.
+    """
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
-    sums = stripe_sums(first[0][0], first[1][0], count, session.listed.centre)
-    variances = [variance for _, variance in first]
+    (left, *_), (right, *_) = first
+    alone = None if uniform is None else (left, right)[SIDES.index(uniform)]
+    lights = [light for *_, light in first]
+    sums = stripe_sums(left, right, count, readings.session.listed.centre, alone, lights)
+    variances = [variance for _, variance, _ in first]
     step = 4 * workers()
     for side, own in zip(SIDES, sums, strict=True):
 
         def looked(index: int, side: Side = side, own: StripeSums = own) -> tuple[Seen, float]:
-            response, variance = readings.response(side, index)
-            return own.seen(response, index), variance
+            response, variance, light = readings.response(side, index)
+            return own.seen(response, index, light), variance
 
         for start in range(1, count, step):
             with job.clock.stage("frames"):
@@ -341,6 +384,4 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None]:
                 own.put(seen)
                 variances.append(variance)
             job.progress(f"{side} stripes", own.done / count)
-    noise = float(np.sqrt(np.mean(variances))) if session.listed.digital.noise_is_stated else None
-    with job.clock.stage("estimate"):
-        return factors_of_sums(*sums, signs, noise), noise
+    return sums, variances
