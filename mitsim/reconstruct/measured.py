@@ -38,8 +38,8 @@ _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
 """What both state, and from which relative and absolute difference they contradict: published gains are good to a few
 percent, level and end are settings, true to a digital number."""
-_CLIPPED = 2e-3
-"""Part of a frame's pixels at its largest number that are no chance: of noisy ones a few are."""
+_CLIPPED, _FEW = 2e-3, 10
+"""Part of a frame's pixels, and how many, at its largest number that are no chance: of noisy ones a few are."""
 
 
 def calibrate_frames(
@@ -304,7 +304,7 @@ class _Readings:
         for exposure in range(len(self.session.listed.exposure_ladder)):
             for frame in self.session.repeated(half, exposure):
                 values = read_image(self.session.folder / frame.file, self.session.wanted)
-                if np.count_nonzero(values == values.max()) > _CLIPPED * values.size:
+                if np.count_nonzero(values == values.max()) > max(_CLIPPED * values.size, _FEW):
                     return True
         return False
 

@@ -387,6 +387,8 @@ class _Side:
                 if self.sums.pairs is None:
                     return self._doubt(flip)
                 self.change(flip, -self.vectors[:, flip])
+                if self._turned(flip):
+                    return True
                 self._add(flip, "exchanged", "has its two frames exchanged", "they count in their right order")
                 return True
             first, second = self.vectors[:, one].copy(), self.vectors[:, other].copy()
@@ -404,6 +406,18 @@ class _Side:
         deviations[alone] = 0.0
         worst = int(np.argmax(deviations))
         return bool(deviations[worst] > _FAR**2) and self._doubt(worst)
+
+    def _turned(self, index: int) -> bool:
+        """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
+        for place, fault in enumerate(self.faults):
+            if fault.index == index and fault.sign is not None:
+                other, detail = fault.other, fault.detail
+                if other is not None and other[:2] == (self.side, index):
+                    other = self.side, index, fault.sign
+                    detail = f"repeats {frame_words(other)}"
+                self.faults[place] = replace(fault, sign=-fault.sign, detail=detail, other=other)
+                return True
+        return False
 
     def _doubt(self, index: int) -> bool:
         """Leave a pattern out that does not fit the others."""
@@ -466,6 +480,7 @@ class _Pairs:
         self.pairs = [own.sums.pairs for own in sides if own.sums.pairs is not None]
         self.count = sides[0].sums.done
         places = {half: place for place, half in enumerate(order)}
+        self.before = dict(zip(order[1:], order, strict=False))
         span = max(len(order) - 1, 1)
         self.times = np.array(
             [[places[own.side, index, sign] / span for sign in (1, -1)] for own in sides for index in range(self.count)]
@@ -555,7 +570,7 @@ class _Pairs:
         costs = []
         for number, own in enumerate(self.sides):
             inside = slice(number * self.count, (number + 1) * self.count)
-            size = float(np.sum(np.square(own.vectors[:, good[inside]])))
+            size = max(float(np.sum(np.square(own.vectors[:, good[inside]]))), 1e-300)
             moved = np.sum(np.square(own.vectors * (trend[inside] - 1))[:, good[inside]])
             # Each frame's own power: half of it scales the response, half adds the uniform frame to it.
             added = good[inside].sum() * np.square(self.lights[number]).sum() / 2 * flicker**2
@@ -731,7 +746,7 @@ class _Pairs:
         names.append((float(np.square(shown.all - part * expected.all).mean()), *_dim(part), None))
         names += self._lost(shown, expected)
         names += self._repeats(number, index, sign, shown)
-        names += self._shifted(shown, expected)
+        names += self._shifted(number, shown, expected)
         rest, kind, detail, other = min(names, key=lambda one: one[0])
         if rest > max(_FITS, _EXPLAINED * whole):
             return rest, "wrong", "is not what the other frame of its pair foretells", None
@@ -772,22 +787,34 @@ class _Pairs:
                         away[index] = np.inf
                 if signed < 0:
                     away[0] = np.inf  # dark, as a black frame is
+                if place != number:
+                    before = self.before.get((self.sides[number].side, index, sign))
+                    away[np.arange(self.count) != (before[1] if before and before[0] == own.side else -1)] = np.inf
                 nearest = int(np.argmin(away))
                 other: Half = (own.side, nearest, signed)
                 yield float(away[nearest]) / numbers, "repeated", f"repeats {frame_words(other)}", other
 
-    @staticmethod
-    def _shifted(shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
+    def _shifted(
+        self, number: int, shown: _Shown, expected: _Shown
+    ) -> Iterator[tuple[float, str, str, Half | None]]:
         """A frame that is moved by some rows or columns."""
         for axis, word in ((0, "rows"), (1, "columns")):
-            seen, whole = shown.parts[axis], expected.parts[axis]
-            still = np.square(shown.parts[1 - axis] - expected.parts[1 - axis]).mean()
-            for shift in range(-_SHIFTS, _SHIFTS + 1):
-                if shift == 0 or len(seen) < 4 * _SHIFTS:
-                    continue
-                inner = slice(_SHIFTS, len(seen) - _SHIFTS)
-                moved = np.square(seen - np.roll(whole, shift))[inner].mean()
-                yield float((moved + still) / 2), "shifted", f"is shifted by {abs(shift)} of its {word}", None
+            length = len(shown.parts[axis])
+            if length < 4 * _SHIFTS:
+                continue
+            inner = slice(_SHIFTS, length - _SHIFTS)
+            still = np.square(shown.parts[1 - axis] - expected.parts[1 - axis])
+            vector, whole = shown.parts[2], expected.parts[2]
+            # Across its stripes a frame's vector moves; along them it becomes shorter.
+            part = float(np.dot(vector, whole)) / max(float(np.dot(whole, whole)), 1e-300)
+            scaled = np.square(vector - part * whole)
+            for shift in (*range(-_SHIFTS, 0), *range(1, _SHIFTS + 1)):
+                moved = np.square(shown.parts[axis] - np.roll(expected.parts[axis], shift))[inner]
+                third = scaled
+                if axis == number and len(vector) == length:
+                    third = np.square(vector - np.roll(whole, shift))[inner]
+                rest = float(np.concatenate([moved, still, third]).mean())
+                yield rest, "shifted", f"is shifted by {abs(shift)} of its {word}", None
 
 
 _ROUNDING = 1e-6
